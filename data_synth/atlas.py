@@ -1,0 +1,167 @@
+"""Atlas folders: any tree of NIfTI volumes with masks, read as normalised RAS volumes at one voxel size."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform, gaussian_filter
+
+from g3r.acquisition.images import load_mask, load_volume
+from g3r.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+IMAGE_NAMES = ("t2", "T2", "T2w", "image", "volume", "truth")
+MASK_ENDINGS = ("_mask", "-mask")
+EXTENSIONS = (".nii.gz", ".nii")
+
+
+@dataclass(frozen=True)
+class AtlasSubject:
+    """Where a subject's files are; `name` is its path relative to the atlas folder, with `/`."""
+
+    name: str
+    image: Path
+    mask: Path
+
+
+@dataclass(frozen=True)
+class TruthVolume:
+    """A volume to be sliced: data f32 [I, J, K] (99.5th percentile in the mask is 1, zero outside), mask, affine."""
+
+    name: str
+    data: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    affine: NDArray[np.float64]
+
+
+def find_subjects(
+    folder: str | Path, include: Sequence[str] = (), exclude: Sequence[str] = ()
+) -> list[AtlasSubject]:
+    """Volumes with masks below a folder, by name.
+
+    Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or X-mask.nii.gz.
+
+    Args:
+        folder: the root of the tree.
+        include: glob patterns of which one must match; none takes all. A pattern is compared with the
+            subject's path relative to the folder and with the last part of that path.
+        exclude: glob patterns of which none may match.
+
+    Raises:
+        InputError: no such folder, or no subject in it that the patterns let through.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; expected a tree of NIfTI volumes with masks")
+    found = {}
+    for extension in EXTENSIONS:
+        for mask in sorted(root.rglob(f"*mask{extension}")):
+            image, name = _image_of(mask, extension, root)
+            if image is not None and name not in found:
+                found[name] = AtlasSubject(name, image, mask)
+    if not found:
+        raise InputError(
+            f"{root}: no volume with a mask found; expected SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, "
+            "or X.nii.gz with X_mask.nii.gz"
+        )
+    chosen = [
+        found[name]
+        for name in sorted(found)
+        if (not include or _matches(name, include)) and not _matches(name, exclude)
+    ]
+    if not chosen:
+        raise InputError(
+            f"{root}: none of {len(found)} subjects (such as {min(found)}) passes include {list(include)} "
+            f"and exclude {list(exclude)}; change the patterns"
+        )
+    return chosen
+
+
+def load_subject(subject: AtlasSubject, spacing_mm: float) -> TruthVolume:
+    """Read a subject: canonical axes (RAS, as near as its header allows), one voxel size, normalised, masked.
+
+    Raises:
+        InputError: unreadable files, a mask of another grid, an empty mask, or an image without contrast.
+    """
+    volume = load_volume(subject.image)
+    mask = load_mask(subject.mask, volume)
+    data = np.nan_to_num(volume.data)
+    turn = nib.orientations.io_orientation(volume.affine)
+    affine = volume.affine @ nib.orientations.inv_ornt_aff(turn, data.shape)
+    data = nib.orientations.apply_orientation(data, turn)
+    mask = nib.orientations.apply_orientation(mask, turn).astype(bool)
+
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if np.abs(spacing - spacing_mm).max() > 1e-3:
+        data, mask, affine = _resampled(data, mask, affine, spacing, spacing_mm)
+        if not mask.any():
+            raise InputError(f"{subject.mask}: mask is empty at {spacing_mm:g} mm; use a finer spacing")
+    bright = float(np.percentile(data[mask], 99.5))
+    if not bright > 0:
+        raise InputError(f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image")
+    data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
+    return TruthVolume(subject.name, data, mask, affine)
+
+
+def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
+    """The volume cut, or padded with zeros, to its mask's bounding box plus a margin."""
+    inside = np.argwhere(volume.mask)
+    low, high = inside.min(0), inside.max(0) + 1
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    affine = volume.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ (low - margin_voxels)
+    return TruthVolume(
+        volume.name, np.pad(volume.data[box], margin_voxels), np.pad(volume.mask[box], margin_voxels), affine
+    )
+
+
+def _image_of(mask: Path, extension: str, root: Path) -> tuple[Path | None, str]:
+    """The image a mask belongs to and the subject's name, or None."""
+    stem = mask.name[: -len(extension)]
+    if stem == "mask":
+        for name in IMAGE_NAMES:
+            image = mask.with_name(name + extension)
+            if image.exists():
+                place = mask.parent.relative_to(root).as_posix()
+                return image, mask.parent.resolve().name if place == "." else place
+        return None, ""
+    for ending in MASK_ENDINGS:
+        if stem.endswith(ending):
+            image = mask.with_name(stem[: -len(ending)] + extension)
+            if image.exists():
+                return image, (mask.parent / stem[: -len(ending)]).relative_to(root).as_posix()
+    return None, ""
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch(name, p) or fnmatch(name.rsplit("/", 1)[-1], p) for p in patterns)
+
+
+def _resampled(
+    data: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    affine: NDArray[np.float64],
+    spacing: NDArray[np.float64],
+    spacing_mm: float,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float64]]:
+    """Cubic splines onto cubic voxels with the same axes; what is finer than a new voxel is smoothed first."""
+    step = spacing_mm / spacing  # old voxels per new voxel
+    shape = np.maximum(np.floor((np.array(data.shape) - 1) / step).astype(int) + 1, 1)
+    start = ((np.array(data.shape) - 1) - (shape - 1) * step) / 2
+    sigma = 0.42 * np.sqrt(np.maximum(step**2 - 1, 0))  # FWHM of a voxel, old and new, in quadrature
+    smooth = gaussian_filter(data, sigma) if sigma.any() else data
+    new = affine_transform(smooth, step, start, tuple(shape), order=3, mode="nearest")
+    inside = affine_transform(mask.astype(np.float32), step, start, tuple(shape), order=1) > 0.5
+    result = affine.copy()
+    result[:3, :3] = affine[:3, :3] * step
+    result[:3, 3] = affine[:3, :3] @ start + affine[:3, 3]
+    logger.debug("resampled from %s to %.2f mm", np.round(spacing, 3), spacing_mm)
+    return new.astype(np.float32), inside, result

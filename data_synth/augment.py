@@ -1,0 +1,51 @@
+"""Variation of a truth volume before it is sliced. The only file that names torchio's transforms."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torchio as tio
+
+from data_synth.atlas import TruthVolume
+
+
+def augmentation() -> tio.Compose:
+    """Left-right flips, small affine and elastic deformations, and changes of contrast and brightness."""
+    return tio.Compose(
+        [
+            tio.RandomFlip(axes=("LR",), flip_probability=0.5),
+            tio.OneOf(
+                {
+                    tio.RandomAffine(
+                        scales=0.08, degrees=15, translation=0, image_interpolation="bspline", default_pad_value=0
+                    ): 0.6,
+                    tio.RandomAffineElasticDeformation(
+                        affine_kwargs={"scales": 0.08, "degrees": 15, "translation": 0, "default_pad_value": 0},
+                        elastic_kwargs={"num_control_points": 7, "max_displacement": 4.0, "locked_borders": 2},
+                    ): 0.4,
+                }
+            ),
+            tio.RandomGamma(log_gamma=(-0.35, 0.35), p=0.8),
+            tio.RandomBiasField(coefficients=0.15, order=2, p=0.4),
+        ]
+    )
+
+
+def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Generator) -> TruthVolume:
+    """The volume after a random transform; zero outside its (moved) mask, 99.5th percentile 1.
+
+    torchio draws from torch's global generator; it is seeded from `rng` here and put back afterwards.
+    """
+    subject = tio.Subject(
+        image=tio.ScalarImage(tensor=torch.from_numpy(volume.data)[None], affine=volume.affine),
+        mask=tio.LabelMap(tensor=torch.from_numpy(volume.mask.astype(np.uint8))[None], affine=volume.affine),
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng.integers(2**62)))
+        result = transform(subject)
+    mask = result["mask"].data[0].numpy() > 0
+    if mask.sum() < 0.3 * volume.mask.sum():  # pushed out of the grid: rather no variation than no head
+        return volume
+    data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
+    data /= max(float(np.percentile(data[mask], 99.5)), 1e-6)
+    return TruthVolume(volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine))

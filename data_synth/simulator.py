@@ -1,0 +1,297 @@
+"""From a volume to stacks of slices of a moving head, with the true pose of every slice.
+
+A pixel is a weighted sum of samples of the volume, spread over the slice's profile. The volume is read by
+trilinear interpolation, which itself blurs; the sample positions are drawn together by just that much, so
+that the profile seen by the slices has the stated variance (`_profile_nodes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, zoom
+from scipy.spatial.transform import Rotation
+
+from data_synth.motion import LEVELS, MotionLevel, slice_trajectory
+from g3r.acquisition.planes import Planes
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.stacks import Stack
+from g3r.acquisition.voxel_operator import VoxelOperator, psf_nodes
+from g3r.errors import InputError
+from g3r.geometry import RigidPose, VolumeGrid
+
+Orientation = Literal["axial", "coronal", "sagittal", "random"]
+Profile = Literal["box", "gaussian"]
+
+# Columns: in-plane x, in-plane y, normal (right-handed).
+FRAMES = {
+    "axial": np.eye(3),
+    "coronal": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "sagittal": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+}
+
+FIELD_OF_VIEW_MARGIN_MM = 5.0
+"""Around the head as it lies at rest; motion may carry a part of it out of view, as it does in a scanner."""
+
+SIGNAL_REACH_VOXELS = 4
+"""Pixels further than this from the mask show nothing but noise and are not computed."""
+TRILINEAR_VARIANCE = 1.0 / 6.0
+"""Variance that trilinear reading adds on average, in squared voxels: the mean of f (1 - f) over a voxel."""
+
+
+@dataclass(frozen=True)
+class StackSettings:
+    """How one stack is taken.
+
+    Args:
+        orientation: of the slices in the head's frame.
+        resolution_mm: in-plane pixel spacing.
+        thickness_mm: slice thickness.
+        gap_mm: distance between neighbouring slices.
+        motion: how much the head moves.
+        interleave: 1 sequential, 2 every other slice first, 3 every third.
+        oblique_deg: standard deviation per axis of a tilt of the slices, known to the header.
+        profile: `box` with soft edges through the slice (what scanners aim for) or `gaussian` (the model's).
+        snr: the 99.5th percentile in the mask is 2 snr noise deviations; infinity for none.
+        bias: strength of the smooth in-plane inhomogeneity; 0 for none.
+        gain_deviation: standard deviation of the slices' log gains.
+    """
+
+    orientation: Orientation = "axial"
+    resolution_mm: float = 0.8
+    thickness_mm: float = 2.2
+    gap_mm: float = 0.0
+    motion: MotionLevel = field(default_factory=MotionLevel)
+    interleave: int = 2
+    oblique_deg: float = 0.0
+    profile: Profile = "box"
+    snr: float = 25.0
+    bias: float = 0.05
+    gain_deviation: float = 0.05
+
+    def __post_init__(self) -> None:
+        checks = {
+            "resolution": (self.resolution_mm, 0.1, 5.0),
+            "thickness": (self.thickness_mm, 0.1, 20.0),
+            "gap": (self.gap_mm, 0.0, 20.0),
+            "snr": (self.snr, 0.1, np.inf),
+            "bias": (self.bias, 0.0, 1.0),
+            "gain deviation": (self.gain_deviation, 0.0, 1.0),
+        }
+        for name, (value, low, high) in checks.items():
+            if not low <= value <= high:
+                raise InputError(f"simulated stack: {name} of {value:g}; expected {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
+class SimulatedStack:
+    """A stack and its truth.
+
+    Args:
+        stack: what a scanner would give; its header states the geometry without motion.
+        true_pose: [K] a point x of slice k by the header truly lies at R x + t.
+        gain: [K] intensity factor of each slice (drop-outs included).
+        is_void: [K] whether the slice lost its signal.
+    """
+
+    stack: Stack
+    true_pose: RigidPose
+    gain: NDArray[np.float64]
+    is_void: NDArray[np.bool_]
+
+
+def orthogonal_settings(n_stacks: int, motion: str = "none", **common: object) -> list[StackSettings]:
+    """Settings of stacks that are axial, coronal, sagittal, axial, ... and share the rest."""
+    if motion not in LEVELS:
+        raise InputError(f"motion '{motion}'; expected one of {', '.join(LEVELS)}")
+    names: tuple[Orientation, ...] = ("axial", "coronal", "sagittal")
+    return [
+        StackSettings(orientation=names[n % 3], motion=LEVELS[motion], **common)  # type: ignore[arg-type]
+        for n in range(n_stacks)
+    ]
+
+
+def simulate_stacks(
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    affine: NDArray[np.float64],
+    settings: Sequence[StackSettings],
+    rng: np.random.Generator,
+    *,
+    fine: bool = False,
+) -> list[SimulatedStack]:
+    """Take stacks of a volume.
+
+    Args:
+        volume: [I, J, K] intensities; what lies outside the mask by more than 4 voxels is not seen.
+        mask: [I, J, K] the head.
+        affine: [4, 4] RAS+ mm from index.
+        settings: one entry per stack.
+        rng: source of randomness; each stack draws from a child of its own.
+        fine: first put the volume on a grid of half the voxel size by cubic splines. Seconds slower; keeps
+            the finest detail of a volume that is hardly finer than the stacks.
+
+    Raises:
+        InputError: an empty mask, or a stack that would see nothing of the head.
+    """
+    if not mask.any():
+        raise InputError("simulation: the mask is empty; expected the head to be marked")
+    inside = np.argwhere(mask)
+    low = np.maximum(inside.min(0) - SIGNAL_REACH_VOXELS - 1, 0)
+    high = np.minimum(inside.max(0) + SIGNAL_REACH_VOXELS + 2, mask.shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    local = affine.copy()
+    local[:3, 3] = affine[:3, :3] @ low + affine[:3, 3]
+    head = _Head.of(np.asarray(volume[box], np.float32), mask[box], local, fine)
+    return [
+        _simulate_stack(head, one, child, f"stack-{number}")
+        for number, (one, child) in enumerate(zip(settings, rng.spawn(len(settings)), strict=True))
+    ]
+
+
+@dataclass(frozen=True)
+class _Head:
+    """The volume to be sliced, its mask, where signal may be, and corners of the mask in the world."""
+
+    volume: NDArray[np.float32]
+    volume_grid: VolumeGrid
+    mask: NDArray[np.float32]
+    reach: NDArray[np.float32]
+    mask_grid: VolumeGrid
+    point_mm: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+    bright: float
+
+    @classmethod
+    def of(cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool) -> _Head:
+        grid = VolumeGrid(mask.shape, affine)
+        reach = binary_dilation(mask, iterations=SIGNAL_REACH_VOXELS)
+        shell = np.argwhere(mask & ~np.roll(mask, 1, 0) | mask & ~np.roll(mask, -1, 0))
+        points = grid.world(shell[:: max(1, len(shell) // 4000)])
+        extent = grid.world(np.argwhere(mask)[::7])
+        bright = float(np.percentile(volume[mask], 99.5))
+        volume_grid = grid
+        if fine:
+            shape = [2 * n - 1 for n in volume.shape]
+            volume = zoom(volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest")
+            volume_grid = VolumeGrid(volume.shape, affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
+        return cls(
+            np.ascontiguousarray(volume, np.float32), volume_grid, mask.astype(np.float32),
+            reach.astype(np.float32), grid, points, (extent.min(0) + extent.max(0)) / 2, bright,
+        )  # fmt: skip
+
+
+def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generator, name: str) -> SimulatedStack:
+    frame = _frame(settings, rng)
+    spacing = np.array([settings.resolution_mm] * 2 + [settings.thickness_mm + settings.gap_mm])
+    local = (head.point_mm - head.center_mm) @ frame
+    half_mm = np.abs(local).max(0) + FIELD_OF_VIEW_MARGIN_MM
+    shape = np.maximum(np.ceil(2 * half_mm / spacing).astype(int), [4, 4, 2])
+    affine = np.eye(4)
+    affine[:3, :3] = frame * spacing
+    affine[:3, 3] = head.center_mm - affine[:3, :3] @ ((shape - 1) / 2)
+    n_slices = int(shape[2])
+
+    true_pose = slice_trajectory(n_slices, settings.motion, head.center_mm, settings.interleave, rng)
+    nominal = Planes(
+        np.tile(frame, (n_slices, 1, 1)),
+        np.stack([np.full(n_slices, (shape[0] - 1) / 2), np.full(n_slices, (shape[1] - 1) / 2), np.arange(n_slices)], 1)
+        @ affine[:3, :3].T + affine[:3, 3],
+        np.tile(spacing[:2], (n_slices, 1)),
+        np.tile(shape[:2], (n_slices, 1)),
+        np.tile(psf_variance_mm2(spacing[:2], settings.thickness_mm), (n_slices, 1)),
+    )  # fmt: skip
+    planes = nominal.moved(true_pose)
+    reach = _ProfileOperator(planes, head.mask_grid, None, None).forward(head.reach) > 0.01
+    seen = np.flatnonzero(reach)
+    mask = np.zeros(planes.n_pixels, bool)
+    mask[seen] = _ProfileOperator(planes, head.mask_grid, seen, None).forward(head.mask) > 0.5
+    signal = np.zeros(planes.n_pixels)
+    signal[seen] = _ProfileOperator(planes, head.volume_grid, seen, settings).forward(head.volume)
+    signal = np.maximum(signal, 0).reshape(n_slices, *shape[:2])
+
+    gain = np.exp(rng.normal(0, 1, n_slices) * settings.gain_deviation)
+    is_void = rng.random(n_slices) < settings.motion.dropout_share
+    gain = np.where(is_void, gain * rng.uniform(0.1, 0.5, n_slices), gain)
+    image = signal * gain[:, None, None] * _bias(shape[:2], settings, rng)
+    if np.isfinite(settings.snr):
+        deviation = head.bright / (2 * settings.snr)
+        noise = rng.standard_normal((2, *image.shape), dtype=np.float32) * np.float32(deviation)
+        image = np.hypot(image + noise[0], noise[1])
+    in_file = (1, 2, 0)  # planes come first here, the file has slices last
+    mask3d = mask.reshape(n_slices, *shape[:2]).transpose(in_file)
+    if not mask3d.any():
+        raise InputError(f"simulation: {name} sees nothing of the head; use less motion or another seed")
+    image = np.ascontiguousarray(image.transpose(in_file), dtype=np.float32)
+    stack = Stack(image, np.ascontiguousarray(mask3d), affine, settings.thickness_mm, name)
+    return SimulatedStack(stack, true_pose, gain, is_void)
+
+
+def _frame(settings: StackSettings, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Axes of the slices by the header: columns in-plane x, y and normal."""
+    if settings.orientation == "random":
+        return Rotation.random(rng=rng).as_matrix()
+    tilt = Rotation.from_rotvec(np.deg2rad(rng.normal(0, 1, 3) * settings.oblique_deg)).as_matrix()
+    return tilt @ FRAMES[settings.orientation]
+
+
+def _bias(shape: NDArray[np.int64], settings: StackSettings, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Smooth positive factor over the field of view, fixed for a stack as coil sensitivities are."""
+    x, y = (np.linspace(-1, 1, n) * n * settings.resolution_mm / 80 for n in shape)
+    c = rng.normal(size=5) * settings.bias
+    x, y = x[:, None], y[None, :]
+    return np.exp(c[0] * x + c[1] * y + c[2] * x * y + 0.5 * (c[3] * x**2 + c[4] * y**2))
+
+
+class _ProfileOperator(VoxelOperator):
+    """The voxel operator with the simulator's own slice profile; without settings it reads single points."""
+
+    def __init__(
+        self, planes: Planes, grid: VolumeGrid, pixel_index: NDArray[np.int64] | None, settings: StackSettings | None
+    ) -> None:
+        super().__init__(planes, grid, pixel_index, (1, 1, 1))
+        if settings is not None:
+            nodes, self.node_weight = _profile_nodes(settings, float(grid.spacing_mm.mean()))
+            self.node_mm = np.tile(nodes, (len(planes), 1, 1))
+            self.move(planes)
+
+
+def _profile_nodes(
+    settings: StackSettings, voxel_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sample positions [Q, 3] (mm in the slice's frame) and weights [Q] of the slice profile.
+
+    The variance along each axis is that of the profile less that of trilinear reading.
+    """
+    blur_mm2 = TRILINEAR_VARIANCE * voxel_mm**2
+    target = psf_variance_mm2([settings.resolution_mm] * 2, settings.thickness_mm)
+    axes = []
+    for axis in range(3):
+        reach = 5.2 * np.sqrt(target[axis])
+        # in plane the pixel is about a voxel wide, so that three positions are enough
+        n = 3 if axis < 2 else 2 * int(np.ceil(reach / max(0.6, voxel_mm) / 2)) + 1
+        if axis == 2 and settings.profile == "box":
+            nodes, weights, variance = _soft_box(n, settings.thickness_mm)
+        else:
+            nodes, weights = psf_nodes(n)
+            variance = float(target[axis])
+        axes.append((nodes * np.sqrt(max(variance - blur_mm2, 0.0)), weights))
+    grid = np.stack(np.meshgrid(*[a[0] for a in axes], indexing="ij"), -1).reshape(-1, 3)
+    return grid, np.einsum("i,j,k->ijk", *[a[1] for a in axes]).ravel()
+
+
+def _soft_box(n: int, thickness_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """A profile flat inside the slice whose edges fall over a fifth of its thickness.
+
+    Returns:
+        n nodes scaled to unit variance, their weights, and the profile's true variance in mm^2 (that of a box
+        of the thickness convolved with one of a fifth of it).
+    """
+    nodes = np.linspace(-0.6, 0.6, n + 2)[1:-1]
+    weights = np.clip((0.6 - np.abs(nodes)) / 0.2, 0.0, 1.0)
+    weights /= weights.sum()
+    return nodes / np.sqrt((weights * nodes**2).sum()), weights, thickness_mm**2 * (1 + 0.2**2) / 12

@@ -1,0 +1,269 @@
+"""Planes of pixels in space, and the slices of all stacks as one record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.geometry import RigidPose, VolumeGrid
+
+SMALLEST_SLICE_PIXELS = 12
+"""Slices with fewer masked pixels carry no pose and little image; they are left out and counted."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """K rectangular pixel grids in space.
+
+    Pixel (i, j) of plane k lies at R (u_x, u_y, 0) + t with u = (index - (shape - 1) / 2) * spacing. Pixels
+    of all planes are numbered plane after plane, inside a plane in C order (j fastest).
+
+    Args:
+        rotation: [K, 3, 3]; columns are in-plane x, in-plane y, normal; det +1.
+        center_mm: [K, 3].
+        spacing_mm: [K, 2].
+        shape: [K, 2] number of pixels along x and y.
+        psf_var_mm2: [K, 3] variances of the Gaussian PSF along the plane's axes; zero samples a volume.
+    """
+
+    rotation: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+    spacing_mm: NDArray[np.float64]
+    shape: NDArray[np.int64]
+    psf_var_mm2: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.rotation)
+        for name, trailing, dtype in (
+            ("rotation", (3, 3), np.float64),
+            ("center_mm", (3,), np.float64),
+            ("spacing_mm", (2,), np.float64),
+            ("shape", (2,), np.int64),
+            ("psf_var_mm2", (3,), np.float64),
+        ):
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if array.shape != (n, *trailing):
+                raise ValueError(f"{name} has shape {array.shape}; expected {(n, *trailing)}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+            object.__setattr__(self, name, array)
+        if n and (self.spacing_mm.min() <= 0 or self.shape.min() < 1 or self.psf_var_mm2.min() < 0):
+            raise ValueError("planes need a positive spacing and shape and a PSF variance of at least zero")
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    @cached_property
+    def offset(self) -> NDArray[np.int64]:
+        """Number of the first pixel of each plane, and the total at the end [K + 1]."""
+        return np.concatenate([[0], np.cumsum(self.shape[:, 0] * self.shape[:, 1])]).astype(np.int64)
+
+    @property
+    def n_pixels(self) -> int:
+        """Number of pixels of all planes."""
+        return int(self.offset[-1])
+
+    @property
+    def pose(self) -> RigidPose:
+        """World from the planes' own frames."""
+        return RigidPose(self.rotation, self.center_mm)
+
+    def plane_id(self) -> NDArray[np.int64]:
+        """Plane of every pixel [P]."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offset))
+
+    def pixel_uv_mm(self) -> NDArray[np.float64]:
+        """In-plane position (mm from the plane's centre) of every pixel [P, 2]."""
+        blocks = [
+            np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2 for n in shape], indexing="ij"), -1).reshape(-1, 2)
+            * spacing
+            for shape, spacing in zip(self.shape, self.spacing_mm, strict=True)
+        ]
+        return np.concatenate(blocks) if blocks else np.zeros((0, 2))
+
+    def pixel_world_mm(self, pixel: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
+        """World position [P, 3] of every pixel, or of those with the given numbers."""
+        plane, uv = self.plane_id(), self.pixel_uv_mm()
+        if pixel is not None:
+            plane, uv = plane[pixel], uv[pixel]
+        in_plane = np.einsum("pij,pj->pi", self.rotation[plane][:, :, :2], uv)
+        return in_plane + self.center_mm[plane]
+
+    def take(self, index: ArrayLike) -> Planes:
+        """The planes at an index array, a mask or a slice."""
+        return Planes(*(getattr(self, field)[index] for field in self.__dataclass_fields__))
+
+    def moved(self, pose: RigidPose) -> Planes:
+        """The planes after rigid motions [K] (or one) of the world."""
+        moved = pose @ self.pose
+        return replace(self, rotation=moved.rotation, center_mm=moved.translation_mm)
+
+    def with_pose(self, pose: RigidPose) -> Planes:
+        """The same pixel grids at other poses (world from plane)."""
+        return replace(self, rotation=pose.rotation, center_mm=pose.translation_mm)
+
+
+@dataclass(frozen=True)
+class Slices:
+    """The acquired slices of all stacks: planes with their pixels, permuted and taken as one record.
+
+    Args:
+        planes: [K] planes, cropped to the mask.
+        value: [P] float32 pixel values.
+        mask: [P] bool, pixels that count.
+        stack_id: [K] number of the stack.
+        slice_index: [K] number of the slice in its stack.
+        thickness_mm: [K].
+        header_pose: [K] poses by the file's header.
+    """
+
+    planes: Planes
+    value: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    stack_id: NDArray[np.int64]
+    slice_index: NDArray[np.int64]
+    thickness_mm: NDArray[np.float64]
+    header_pose: RigidPose
+
+    def __post_init__(self) -> None:
+        n_planes, n_pixels = len(self.planes), self.planes.n_pixels
+        for name, expected in (
+            ("value", n_pixels),
+            ("mask", n_pixels),
+            ("stack_id", n_planes),
+            ("slice_index", n_planes),
+            ("thickness_mm", n_planes),
+            ("header_pose", n_planes),
+        ):
+            if len(getattr(self, name)) != expected:
+                raise ValueError(f"{name} has {len(getattr(self, name))} entries; expected {expected}")
+
+    def __len__(self) -> int:
+        return len(self.planes)
+
+    @cached_property
+    def pixel_index(self) -> NDArray[np.int64]:
+        """Numbers of the pixels inside the mask [P']."""
+        return np.flatnonzero(self.mask)
+
+    @cached_property
+    def pixel_plane(self) -> NDArray[np.int64]:
+        """Plane of each pixel inside the mask [P']."""
+        return self.planes.plane_id()[self.pixel_index]
+
+    @cached_property
+    def masked_value(self) -> NDArray[np.float32]:
+        """Values of the pixels inside the mask [P']."""
+        return self.value[self.pixel_index]
+
+    def take(self, index: ArrayLike) -> Slices:
+        """The slices at an index array or mask, with their pixels."""
+        chosen = np.arange(len(self))[index]
+        pixels = np.concatenate(
+            [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen] or [np.zeros(0, int)]
+        )
+        return Slices(
+            self.planes.take(chosen),
+            self.value[pixels],
+            self.mask[pixels],
+            self.stack_id[chosen],
+            self.slice_index[chosen],
+            self.thickness_mm[chosen],
+            self.header_pose.take(chosen),
+        )
+
+    def with_pose(self, pose: RigidPose) -> Slices:
+        """The same slices at other poses (world from plane)."""
+        return replace(self, planes=self.planes.with_pose(pose))
+
+    def scaled(self, factor: float) -> Slices:
+        """The same slices with their values multiplied by a factor."""
+        return replace(self, value=(self.value * np.float32(factor)).astype(np.float32))
+
+    def world_from_header(self) -> RigidPose:
+        """Motion of each slice: takes a point by the file's header to where it is now estimated to be."""
+        return self.planes.pose @ self.header_pose.inverse()
+
+
+def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
+    """Cut stacks into slices, each cropped to the bounding box of its mask.
+
+    Slices whose mask has fewer than 12 pixels are left out.
+
+    Raises:
+        InputError: no stack, or none with a usable slice.
+    """
+    if not stacks:
+        raise InputError("no stack given; pass at least one")
+    rotation, center, spacing, shape, psf = [], [], [], [], []
+    values, masks, stack_id, slice_index, thickness = [], [], [], [], []
+    for number, stack in enumerate(stacks):
+        axes = stack.affine[:3, :3] / stack.spacing_mm
+        # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
+        frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+        left, _, right = np.linalg.svd(frame)
+        frame = left @ right
+        for k in range(stack.image.shape[2]):
+            inside = stack.mask[:, :, k]
+            if inside.sum() < SMALLEST_SLICE_PIXELS:
+                continue
+            rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+            box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+            middle = [(rows[0] + rows[-1]) / 2, (columns[0] + columns[-1]) / 2, k]
+            rotation.append(frame)
+            center.append(stack.grid.world(middle))
+            spacing.append(stack.spacing_mm[:2])
+            shape.append(inside[box].shape)
+            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm))
+            values.append(stack.image[(*box, k)].ravel())
+            masks.append(inside[box].ravel())
+            stack_id.append(number)
+            slice_index.append(k)
+            thickness.append(stack.thickness_mm)
+    if not rotation:
+        raise InputError(f"{stacks[0].name}: no slice with {SMALLEST_SLICE_PIXELS} masked pixels; check the masks")
+    planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
+    return Slices(
+        planes,
+        np.concatenate(values).astype(np.float32),
+        np.concatenate(masks),
+        np.array(stack_id, dtype=np.int64),
+        np.array(slice_index, dtype=np.int64),
+        np.array(thickness),
+        planes.pose,
+    )
+
+
+def volume_planes(grid: VolumeGrid) -> Planes:
+    """The K planes of a volume's third axis, without PSF; their pixels in order are data[:, :, k].
+
+    Raises:
+        ValueError: a grid whose axes are sheared.
+    """
+    spacing = grid.spacing_mm
+    axes = grid.affine[:3, :3] / spacing
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-6:
+        raise ValueError("planes need a grid with orthogonal axes")
+    frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+    n_i, n_j, n_k = grid.shape
+    index = np.stack([np.full(n_k, (n_i - 1) / 2), np.full(n_k, (n_j - 1) / 2), np.arange(n_k)], axis=1)
+    return Planes(
+        np.tile(frame, (n_k, 1, 1)),
+        grid.world(index),
+        np.tile(spacing[:2], (n_k, 1)),
+        np.tile([n_i, n_j], (n_k, 1)),
+        np.zeros((n_k, 3)),
+    )
+
+
+def volume_from_pixels(pixels: NDArray[np.float32], grid: VolumeGrid) -> NDArray[np.float32]:
+    """Pixels of `volume_planes(grid)` [P] as a volume [I, J, K]."""
+    n_i, n_j, n_k = grid.shape
+    return np.ascontiguousarray(pixels.reshape(n_k, n_i, n_j).transpose(1, 2, 0))

@@ -1,0 +1,131 @@
+"""A stack of parallel slices as it comes from the scanner, checked once when it is made."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import load_mask, load_volume
+from g3r.errors import InputError
+from g3r.geometry import VolumeGrid
+
+logger = logging.getLogger(__name__)
+
+ORTHOGONALITY_TOLERANCE = 1e-3
+"""Largest cosine between two axes of a stack; headers of scanners keep about 1e-5."""
+
+THICKNESS_RANGE_MM = (0.1, 20.0)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Parallel slices with one header.
+
+    Args:
+        image: [I, J, K] float32, arbitrary units; K counts the slices.
+        mask: [I, J, K] bool, what belongs to the brain.
+        affine: [4, 4] float64, RAS+ mm from index; left-handed and oblique ones are welcome.
+        thickness_mm: thickness of a slice; the distance of slices is in the affine and may differ.
+        name: what messages call it.
+
+    Raises:
+        InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
+            that are not finite or all the same inside the mask, a thickness outside 0.1-20 mm.
+    """
+
+    image: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    affine: NDArray[np.float64]
+    thickness_mm: float
+    name: str = "stack"
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image, dtype=np.float32)
+        mask = np.asarray(self.mask, dtype=bool)
+        affine = np.array(self.affine, dtype=np.float64)
+        if image.ndim != 3:
+            raise InputError(f"{self.name}: has shape {image.shape}; expected a 3D stack of slices")
+        if mask.shape != image.shape:
+            raise InputError(f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same")
+        if image.shape[2] < 2:
+            raise InputError(f"{self.name}: holds {image.shape[2]} slice; expected a stack of at least 2")
+        try:
+            spacing = VolumeGrid(image.shape, affine).spacing_mm
+        except ValueError as error:
+            raise InputError(f"{self.name}: bad header ({error}); fix the sform or qform") from None
+        axes = affine[:3, :3] / spacing
+        cosine = np.abs(axes.T @ axes - np.eye(3)).max()
+        if cosine > ORTHOGONALITY_TOLERANCE:
+            raise InputError(f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes")
+        low, high = THICKNESS_RANGE_MM
+        if not (np.isfinite(self.thickness_mm) and low <= self.thickness_mm <= high):
+            raise InputError(
+                f"{self.name}: slice thickness {self.thickness_mm:g} mm; expected {low:g} to {high:g} mm, "
+                "pass --thickness"
+            )
+        if not mask.any():
+            raise InputError(f"{self.name}: mask is empty; expected the brain to be marked")
+        inside = image[mask]
+        n_bad = int((~np.isfinite(inside)).sum())
+        if n_bad:
+            raise InputError(f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out")
+        if inside.min() == inside.max():
+            raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
+        object.__setattr__(self, "image", np.where(np.isfinite(image), image, np.float32(0)))
+        object.__setattr__(self, "mask", mask)
+        object.__setattr__(self, "affine", affine)
+        object.__setattr__(self, "thickness_mm", float(self.thickness_mm))
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """The voxel grid of the file (after the slices were put on the third axis)."""
+        return VolumeGrid(self.image.shape, self.affine)
+
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """In-plane pixel spacing (two numbers) and the distance of neighbouring slices [3]."""
+        return self.grid.spacing_mm
+
+
+def load_stack(
+    path: str | os.PathLike[str],
+    mask_path: str | os.PathLike[str] | None = None,
+    thickness_mm: float | None = None,
+) -> Stack:
+    """Read a stack and its mask.
+
+    The slices lie along the axis whose spacing is clearly (a tenth) above the others, else along the third;
+    image, mask and affine are permuted together so that this axis becomes the last. A slice keeps its number.
+    Without a mask every positive voxel counts. Without a thickness the distance of slices is taken, and a
+    line is logged, because a gap cannot be seen in a header.
+
+    Raises:
+        InputError: what `load_volume`, `load_mask` and `Stack` refuse.
+    """
+    volume = load_volume(path)
+    if mask_path is None:
+        mask = np.nan_to_num(volume.data) > 0
+        if not mask.any():
+            raise InputError(f"{volume.name}: no positive value; expected an image, or pass --masks")
+        logger.warning("%s: no mask given; every positive voxel is taken for brain", volume.name)
+    else:
+        mask = load_mask(mask_path, volume)
+    spacing = volume.grid.spacing_mm
+    through = int(np.argmax(spacing)) if np.max(spacing) > 1.1 * np.median(spacing) else 2
+    order = [axis for axis in range(3) if axis != through] + [through]
+    affine = volume.affine.copy()
+    affine[:3, :3] = affine[:3, order]
+    if thickness_mm is None:
+        thickness_mm = float(spacing[through])
+        logger.info("%s: thickness taken as the distance of slices, %.2f mm", volume.name, thickness_mm)
+    return Stack(
+        np.ascontiguousarray(volume.data.transpose(order)),
+        np.ascontiguousarray(mask.transpose(order)),
+        affine,
+        thickness_mm,
+        volume.name,
+    )

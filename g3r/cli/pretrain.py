@@ -1,0 +1,56 @@
+"""`g3r-pretrain`: train the prior network with LightningCLI."""
+
+import sys
+from collections.abc import Sequence
+
+_HELP = """\
+usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
+
+Train the density-gated prior network. Logs go to TensorBoard, checkpoints beside them.
+
+  fit, validate            what to do
+  --config FILE            settings; every one of them can be overridden on the command line
+  --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
+  --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit
+  --ckpt_path FILE         go on from a training checkpoint
+
+All options: g3r-pretrain fit --help      Watch: tensorboard --logdir runs
+Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.pt
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code (0 done, 2 usage, 3 bad input)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_HELP, end="")
+        return 0 if arguments else 2
+
+    from g3r.errors import G3RError
+
+    try:
+        from lightning.pytorch import LightningDataModule
+        from lightning.pytorch.cli import LightningCLI
+
+        from g3r.prior.lightning_module import PriorModule
+    except ModuleNotFoundError as error:
+        advice = "install the training extra: pip install 'g3r[train]'"
+        print(f"g3r-pretrain: {error.name} is not installed; {advice}", file=sys.stderr)
+        return 3
+    try:
+        LightningCLI(
+            PriorModule,
+            LightningDataModule,
+            subclass_mode_data=True,
+            seed_everything_default=1,
+            save_config_kwargs={"overwrite": True},  # a resumed run writes its settings again
+            args=arguments,
+        )
+    except G3RError as error:
+        print(f"g3r-pretrain: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

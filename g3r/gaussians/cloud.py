@@ -1,0 +1,113 @@
+"""The scene: a cloud of 3D Gaussians, without optimiser state and without appearance models."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from g3r.errors import InputError
+
+
+@dataclass(frozen=True)
+class GaussianCloud:
+    """V(x) = sum_j c_j exp(-(x - mu_j)^T Sigma_j^-1 (x - mu_j) / 2), Sigma = R diag(s^2) R^T (G3R Eq. 3).
+
+    Args:
+        mean_mm: [N, 3] centres relative to the origin.
+        log_scale: [N, 3] natural logarithm of the standard deviations in mm.
+        quaternion_wxyz: [N, 4] orientation; normalised on use, must not be zero.
+        peak: [N] c_j, height without any PSF; may be negative.
+        origin_mm: [3] float64 world position of the local origin. Centres are kept relative to it so that
+            float32 loses no digits when the scanner's origin is far away.
+
+    Raises:
+        ValueError: shapes that do not belong together.
+    """
+
+    mean_mm: Tensor
+    log_scale: Tensor
+    quaternion_wxyz: Tensor
+    peak: Tensor
+    origin_mm: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.mean_mm)
+        for name, shape in (
+            ("mean_mm", (n, 3)),
+            ("log_scale", (n, 3)),
+            ("quaternion_wxyz", (n, 4)),
+            ("peak", (n,)),
+        ):
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} has shape {found}; expected {shape}")
+        object.__setattr__(self, "origin_mm", np.array(self.origin_mm, dtype=np.float64).reshape(3))
+
+    def __len__(self) -> int:
+        return len(self.mean_mm)
+
+    @property
+    def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Centres, log-scales, quaternions, peaks."""
+        return self.mean_mm, self.log_scale, self.quaternion_wxyz, self.peak
+
+    def take(self, index: Tensor) -> GaussianCloud:
+        """The Gaussians at an index tensor or mask."""
+        return GaussianCloud(*(p[index] for p in self.parameters), self.origin_mm)
+
+    def detach(self) -> GaussianCloud:
+        """The same values without a graph."""
+        return GaussianCloud(*(p.detach() for p in self.parameters), self.origin_mm)
+
+    def double(self) -> GaussianCloud:
+        """The same cloud in float64."""
+        return GaussianCloud(*(p.double() for p in self.parameters), self.origin_mm)
+
+    def with_peak(self, peak: Tensor) -> GaussianCloud:
+        """The same shapes with other heights."""
+        return replace(self, peak=peak)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write as .npz with float32 arrays named like the fields (atomically)."""
+        arrays = {
+            name: getattr(self, name).detach().cpu().numpy().astype(np.float32)
+            for name in ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+        }
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays, origin_mm=self.origin_mm)
+        path = Path(path)
+        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        beside.write_bytes(buffer.getvalue())
+        os.replace(beside, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> GaussianCloud:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: not such a file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+                return cls(*(torch.from_numpy(data[name]) for name in names), data["origin_mm"])
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
+
+
+def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quaternion_wxyz, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).reshape(-1, 3, 3)

@@ -1,0 +1,119 @@
+"""Peaks by linear least squares: the model is linear in c once shapes and poses are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Planes
+from g3r.gaussians import kernels
+from g3r.gaussians.cloud import GaussianCloud
+from g3r.gaussians.pairs import CloudArrays, PairList, find_pairs
+from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
+
+
+@dataclass(frozen=True)
+class PeakSystem:
+    """The linear map from peaks [N] to pixels [P] and its exact adjoint (CPU)."""
+
+    before: tuple
+    after: tuple
+    n_gaussians: int
+    n_pixels: int
+    cut: float
+    exact: bool
+
+    @classmethod
+    def of(
+        cls,
+        cloud: GaussianCloud,
+        planes: Planes,
+        gain: NDArray[np.floating] | None = None,
+        pairs: PairList | None = None,
+        cutoff_sigma: float = CUTOFF_SIGMA,
+        amplitude: str = "exact",
+    ) -> PeakSystem:
+        """The system for the shapes of a cloud (its peaks are not read)."""
+        if pairs is None:
+            pairs = find_pairs(cloud, planes, cutoff_sigma)
+        gain = np.ones(len(planes)) if gain is None else np.asarray(gain, dtype=np.float64)
+        arrays = CloudArrays.of(cloud)
+        before, after = plane_arguments(arrays, planes, planes.center_mm - cloud.origin_mm, gain, pairs)
+        return cls(before, after, len(cloud), planes.n_pixels, cutoff_sigma**2, amplitude == "exact")
+
+    def forward(self, peak: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Pixels [P] of peaks [N]."""
+        out = np.zeros(self.n_pixels, np.float32)
+        kernels.forward(
+            *self.before, peak.astype(np.float32), *self.after, self.cut, self.exact, numba.get_num_threads(), out
+        )
+        return out
+
+    def adjoint(self, pixels: NDArray[np.float32]) -> NDArray[np.float64]:
+        """A^T of pixels [P], as [N] float64."""
+        n_workers = numba.get_num_threads()
+        buffers = np.zeros((n_workers, self.n_gaussians))
+        weight = np.ascontiguousarray(pixels, dtype=np.float32)
+        kernels.adjoint_peak(*self.before, *self.after, self.cut, self.exact, n_workers, weight, buffers)
+        return buffers.sum(0)
+
+
+def solve_peaks(
+    cloud: GaussianCloud,
+    planes: Planes,
+    target: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    *,
+    gain: NDArray[np.floating] | None = None,
+    n_iterations: int = 10,
+    damping: float = 1e-3,
+    pairs: PairList | None = None,
+    cutoff_sigma: float = CUTOFF_SIGMA,
+    amplitude: str = "exact",
+) -> GaussianCloud:
+    """The cloud with the peaks that minimise sum_p weight_p (A c - target)_p^2 + damping d ||c - c_0||^2.
+
+    Conjugate gradients on the normal equations, started at the cloud's own peaks c_0. d is the mean diagonal
+    of A^T W A as one product with a vector of ones estimates it, so that the damping is a pure number.
+
+    Args:
+        cloud: shapes, and the peaks to start from.
+        planes: K planes.
+        target: [P] pixels.
+        weight: [P] non-negative; zero leaves a pixel out.
+        gain: [K] intensity factor of each plane.
+        n_iterations: at most so many products with A and A^T.
+        damping: relative; above zero keeps Gaussians that no pixel sees where they were.
+        pairs: list from `find_pairs`.
+        cutoff_sigma: as in `render`.
+        amplitude: as in `render`.
+
+    Source: Hestenes and Stiefel (1952), in the CGLS order of operations (Bjoerck 1996, 7.4.1).
+    """
+    system = PeakSystem.of(cloud, planes, gain, pairs, cutoff_sigma, amplitude)
+    start = cloud.peak.detach().double().numpy()
+    residual = target.astype(np.float64) - system.forward(start)
+    row_sum = system.adjoint(weight * system.forward(np.ones(len(cloud), np.float32)))
+    shift = damping * float(np.abs(row_sum).mean())
+    if not shift > 0:  # no pixel sees any Gaussian
+        return cloud
+    step = np.zeros_like(start)
+    gradient = system.adjoint((weight * residual).astype(np.float32))
+    direction = gradient.copy()
+    norm = first = float(gradient @ gradient)
+    for _ in range(n_iterations):
+        if norm <= 1e-10 * first or norm == 0:
+            break
+        image = system.forward(direction).astype(np.float64)
+        length = norm / (float(weight @ image**2) + shift * float(direction @ direction))
+        step += length * direction
+        residual -= length * image
+        gradient = system.adjoint((weight * residual).astype(np.float32)) - shift * step
+        new_norm = float(gradient @ gradient)
+        direction = gradient + new_norm / norm * direction
+        norm = new_norm
+    return cloud.with_peak(torch.from_numpy((start + step).astype(np.float32)))

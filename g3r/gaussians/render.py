@@ -1,0 +1,170 @@
+"""render(cloud, planes): the one renderer, for prior fitting, slice fitting, writing and simulating."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from g3r.acquisition.planes import Planes
+from g3r.gaussians import kernels, kernels_backward
+from g3r.gaussians.cloud import GaussianCloud
+from g3r.gaussians.pairs import CloudArrays, PairList, find_pairs
+from g3r.gaussians.reference import render_reference
+from g3r.geometry import RigidPose
+
+CUTOFF_SIGMA = 3.2
+"""Gaussians end here by default; at 3.2 sigma a Gaussian has fallen to 0.6 % of its peak."""
+
+LARGEST_CUTOFF_SIGMA = 6.0
+"""The polynomial exponential holds to here (e = -18)."""
+
+AMPLITUDES = ("exact", "printed")
+
+
+def render(
+    cloud: GaussianCloud,
+    planes: Planes,
+    *,
+    twist: Tensor | None = None,
+    log_gain: Tensor | None = None,
+    backend: str = "numba",
+    amplitude: str = "exact",
+    cutoff_sigma: float = CUTOFF_SIGMA,
+    pairs: PairList | None = None,
+) -> Tensor:
+    """Pixels of planes through their PSF, differentiable in cloud, poses and gains.
+
+    y(u) = g sum_j c_j B_j exp(-d^T S_j^-1 d / 2), d = u - R^T (mu_j - t), S = R^T Sigma R + D_psf,
+    B = sqrt(|Sigma| / |S|). A plane whose PSF is zero samples the volume V(x).
+
+    Args:
+        cloud: N Gaussians.
+        planes: K planes.
+        twist: [K, 6] change of the poses: R <- R exp(w) (rad, body frame), t <- t + v (mm, world).
+        log_gain: [K] logarithm of the intensity factor of each plane.
+        backend: "numba" (CPU, gradients by moments), or "reference" (plain torch, dense, any dtype, no cut-off).
+        amplitude: "exact", or "printed" for B = 1 as G3R Eq. 5 stands in print (for comparison).
+        cutoff_sigma: where a Gaussian ends, up to 6 (numba only).
+        pairs: list from `find_pairs`, to be used again while nothing moves far (numba only).
+
+    Returns:
+        [P] pixels, plane after plane, in C order inside a plane.
+
+    Raises:
+        ValueError: an unknown backend or amplitude, or a cut-off outside (0, 6].
+
+    Source: G3R Eq. 3 and 5 with the amplitude factor (docs/method.md); gradients derived there.
+    """
+    if amplitude not in AMPLITUDES:
+        raise ValueError(f"amplitude {amplitude!r}; expected one of {AMPLITUDES}")
+    if backend == "reference":
+        return render_reference(cloud, planes, twist, log_gain, amplitude)
+    if backend != "numba":
+        raise ValueError(f"backend {backend!r}; expected 'numba' or 'reference'")
+    if not 0 < cutoff_sigma <= LARGEST_CUTOFF_SIGMA:
+        raise ValueError(f"cutoff_sigma {cutoff_sigma}; expected above 0 and at most {LARGEST_CUTOFF_SIGMA}")
+    if pairs is None:
+        pairs = find_pairs(cloud, moved_planes(planes, twist), cutoff_sigma)
+    pixels = _Render.apply(
+        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, amplitude == "exact"
+    )
+    return pixels
+
+
+def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
+    """Planes after a twist [K, 6]: R <- R exp(w), t <- t + v."""
+    if twist is None:
+        return planes
+    change = twist.detach().double().numpy()
+    rotation = planes.rotation @ Rotation.from_rotvec(change[:, :3]).as_matrix()
+    return planes.with_pose(RigidPose(rotation, planes.center_mm + change[:, 3:]))
+
+
+def plane_arguments(
+    arrays: CloudArrays, planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: PairList
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Arguments of the kernels in front of and behind the cloud's peaks."""
+    before = (arrays.mean, arrays.covariance, arrays.log_volume)
+    after = (
+        planes.rotation, center, gain, planes.psf_var_mm2, planes.shape, planes.spacing_mm, planes.offset,
+        pairs.start, pairs.gaussian,
+    )  # fmt: skip
+    return before, after
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        mean: Tensor,
+        log_scale: Tensor,
+        quaternion: Tensor,
+        peak: Tensor,
+        twist: Tensor | None,
+        log_gain: Tensor | None,
+        origin_mm: NDArray[np.float64],
+        planes: Planes,
+        pairs: PairList,
+        cutoff_sigma: float,
+        exact: bool,
+    ) -> Tensor:
+        moved = moved_planes(planes, twist)
+        gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
+        arrays = CloudArrays.of(GaussianCloud(mean, log_scale, quaternion, peak, origin_mm))
+        before, after = plane_arguments(arrays, moved, moved.center_mm - origin_mm, gain, pairs)
+        out = np.zeros(planes.n_pixels, np.float32)
+        n_workers = numba.get_num_threads()
+        kernels.forward(*before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, out)
+        ctx.saved = (arrays, before, after, cutoff_sigma, exact, n_workers, twist)
+        ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, peak, twist, log_gain)]
+        return torch.from_numpy(out).to(mean.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        arrays, before, after, cutoff_sigma, exact, n_workers, twist = ctx.saved
+        n, n_planes = len(arrays.mean), len(after[0])
+        buffers = np.zeros((n_workers, n, kernels.N_GRADIENTS))
+        plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
+        weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
+        kernels_backward.backward(
+            *before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, weight, buffers, plane_gradient
+        )
+        peak, mean = np.empty(n), np.empty((n, 3))
+        scale, quaternion = np.empty((n, 3)), np.empty((n, 4))
+        kernels_backward.shape_gradients(
+            arrays.log_scale, arrays.quaternion, buffers, peak, mean, scale, quaternion
+        )
+        pose = plane_gradient[:, :6]
+        if twist is not None:
+            # the kernels differentiate in a turn on top of the present one: exp(w + dw) = exp(w) exp(J_r dw)
+            jacobian = right_jacobian(twist.detach().double().numpy()[:, :3])
+            pose = np.concatenate([np.einsum("kji,kj->ki", jacobian, pose[:, :3]), pose[:, 3:]], axis=1)
+        arrays_out = (mean, scale, quaternion, peak, pose, plane_gradient[:, 6])
+        gradients = [
+            None if dtype is None else torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
+            for array, dtype in zip(arrays_out, ctx.like, strict=True)
+        ]
+        return (*gradients, None, None, None, None, None)
+
+
+def right_jacobian(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Right Jacobian of SO(3) [K, 3, 3]: exp(w + dw) = exp(w) exp(J_r(w) dw) to first order.
+
+    Source: Sola et al., A micro Lie theory (2018), Eq. 143. Series below 1e-4 rad, where the closed form
+    loses digits.
+    """
+    angle = np.linalg.norm(rotvec_rad, axis=1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    x, y, z = rotvec_rad.T
+    zero = np.zeros_like(x)
+    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.eye(3) - first[:, None, None] * skew + second[:, None, None] * (skew @ skew)

@@ -1,0 +1,6 @@
+"""Rigid poses, voxel grids and symmetric 3x3 algebra, all in float64. Imports nothing of ours."""
+
+from g3r.geometry.grid import VolumeGrid
+from g3r.geometry.rigid import RigidPose
+
+__all__ = ["RigidPose", "VolumeGrid"]

@@ -1,0 +1,79 @@
+"""Voxel grids: a shape and an affine, with both directions of the mapping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class VolumeGrid:
+    """A grid of voxels; an index names the voxel's centre.
+
+    Args:
+        shape: number of voxels (I, J, K).
+        affine: [4, 4], world (RAS+, mm) from index.
+
+    Raises:
+        ValueError: an empty axis, or an affine that is not finite or not invertible.
+    """
+
+    shape: tuple[int, int, int]
+    affine: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        shape = tuple(int(n) for n in self.shape)
+        affine = np.array(self.affine, dtype=np.float64)
+        if len(shape) != 3 or min(shape) < 1:
+            raise ValueError(f"grid shape {shape}; expected three positive numbers")
+        if affine.shape != (4, 4) or not np.isfinite(affine).all():
+            raise ValueError("grid affine must be a finite 4x4 matrix")
+        spacing = np.linalg.norm(affine[:3, :3], axis=0)
+        # relative to the voxel's own size, so that it has no hidden unit
+        if spacing.min() == 0 or abs(np.linalg.det(affine[:3, :3] / spacing)) < 1e-6:
+            raise ValueError("grid affine is singular")
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "affine", affine)
+
+    @classmethod
+    def isotropic(
+        cls, low_mm: ArrayLike, high_mm: ArrayLike, spacing_mm: float, margin_mm: float = 0.0
+    ) -> VolumeGrid:
+        """The axis-aligned RAS grid with cubic voxels that covers the box from low to high plus a margin."""
+        low = np.asarray(low_mm, dtype=np.float64) - margin_mm
+        high = np.asarray(high_mm, dtype=np.float64) + margin_mm
+        shape = np.maximum(np.ceil((high - low) / spacing_mm).astype(int) + 1, 1)
+        affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
+        affine[:3, 3] = (low + high) / 2 - (shape - 1) / 2 * spacing_mm
+        return cls((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """Distance of neighbouring voxels along each axis [3]."""
+        return np.linalg.norm(self.affine[:3, :3], axis=0)
+
+    @property
+    def voxel_volume_mm3(self) -> float:
+        """Volume of a voxel."""
+        return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    @property
+    def center_mm(self) -> NDArray[np.float64]:
+        """World position of the middle of the grid [3]."""
+        return self.world((np.array(self.shape) - 1) / 2)
+
+    @property
+    def index_from_world(self) -> NDArray[np.float64]:
+        """The affine [4, 4] from world to (fractional) index."""
+        return np.linalg.inv(self.affine)
+
+    def world(self, index: ArrayLike) -> NDArray[np.float64]:
+        """World positions (mm) of indices [..., 3]."""
+        return np.asarray(index, dtype=np.float64) @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def index(self, world_mm: ArrayLike) -> NDArray[np.float64]:
+        """Fractional indices of world positions [..., 3]."""
+        inverse = self.index_from_world
+        return np.asarray(world_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]

@@ -1,0 +1,112 @@
+"""Rigid motions of world space (RAS+, mm): the only place where poses are composed and inverted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+ORTHONORMALITY_TOLERANCE = 1e-6
+"""Largest accepted entry of R R^T - 1; a rotation read from text has about 1e-7."""
+
+
+@dataclass(frozen=True)
+class RigidPose:
+    """S rigid motions x -> R x + t.
+
+    Args:
+        rotation: [S, 3, 3] proper rotations (det +1).
+        translation_mm: [S, 3].
+
+    Raises:
+        ValueError: wrong shape, a value that is not finite, or a matrix that is no rotation.
+    """
+
+    rotation: NDArray[np.float64]
+    translation_mm: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation_mm, dtype=np.float64)
+        if rotation.ndim != 3 or rotation.shape[1:] != (3, 3):
+            raise ValueError(f"rotation has shape {rotation.shape}; expected [S, 3, 3]")
+        if translation.shape != (len(rotation), 3):
+            raise ValueError(f"translation_mm has shape {translation.shape}; expected [{len(rotation)}, 3]")
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+            raise ValueError("a pose holds values that are not finite")
+        defect = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
+        if defect > ORTHONORMALITY_TOLERANCE or (np.linalg.det(rotation) < 0).any():
+            raise ValueError(f"a matrix is no proper rotation (|R R^T - 1| up to {defect:.2g})")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation_mm", translation)
+
+    @classmethod
+    def identity(cls, n: int) -> RigidPose:
+        """N motions that change nothing."""
+        return cls(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3)))
+
+    @classmethod
+    def from_rotvec(cls, rotvec_rad: ArrayLike, translation_mm: ArrayLike) -> RigidPose:
+        """Motions from rotation vectors [S, 3] (axis times angle, rad) and translations [S, 3]."""
+        return cls(rotation_matrix(rotvec_rad), np.asarray(translation_mm, dtype=np.float64))
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __matmul__(self, other: RigidPose) -> RigidPose:
+        """Composition: `a @ b` applies b first. A single motion is broadcast over the other's S."""
+        rotation = self.rotation @ other.rotation
+        turned = (self.rotation @ other.translation_mm[..., None])[..., 0]
+        return RigidPose(orthonormal(rotation), turned + self.translation_mm)
+
+    def inverse(self) -> RigidPose:
+        """The motions that undo these."""
+        transposed = self.rotation.transpose(0, 2, 1)
+        return RigidPose(transposed, -(transposed @ self.translation_mm[..., None])[..., 0])
+
+    def apply(self, points_mm: ArrayLike) -> NDArray[np.float64]:
+        """Move points [S, ..., 3] (mm), the s-th block by the s-th motion."""
+        points = np.asarray(points_mm, dtype=np.float64)
+        middle = (1,) * (points.ndim - 2)
+        shift = self.translation_mm.reshape(len(self), *middle, 3)
+        return np.einsum("sij,s...j->s...i", self.rotation, points) + shift
+
+    def rotvec_rad(self) -> NDArray[np.float64]:
+        """Rotation vectors [S, 3] (rad), angle in [0, pi]."""
+        return Rotation.from_matrix(self.rotation).as_rotvec()
+
+    def take(self, index: ArrayLike) -> RigidPose:
+        """The motions at an index array, a mask or a slice."""
+        return RigidPose(self.rotation[index], self.translation_mm[index])
+
+
+def rotation_matrix(rotvec_rad: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (rad)."""
+    vectors = np.asarray(rotvec_rad, dtype=np.float64)
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return matrices.reshape(*vectors.shape[:-1], 3, 3)
+
+
+def orthonormal(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotations nearest to [S, 3, 3] nearly orthonormal matrices (polar factor by SVD)."""
+    left, _, right = np.linalg.svd(matrix)
+    sign = np.sign(np.linalg.det(left @ right))
+    left[..., :, 2] *= sign[..., None]
+    return left @ right
+
+
+def fit_rigid(
+    source_mm: NDArray[np.float64], target_mm: NDArray[np.float64], weight: NDArray[np.float64] | None = None
+) -> RigidPose:
+    """The one motion that brings points [P, 3] nearest to others in (weighted) least squares.
+
+    Source: Kabsch, Acta Cryst. A32 (1976).
+    """
+    weight = np.ones(len(source_mm)) if weight is None else weight
+    source_mean = np.average(source_mm, axis=0, weights=weight)
+    target_mean = np.average(target_mm, axis=0, weights=weight)
+    covariance = ((target_mm - target_mean) * weight[:, None]).T @ (source_mm - source_mean)
+    rotation = orthonormal(covariance[None])
+    return RigidPose(rotation, (target_mean - rotation[0] @ source_mean)[None])

@@ -1,0 +1,93 @@
+"""Whole-volume estimation of the structural prior, in one go or in tiles."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.errors import NumericalError
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+
+MAX_WHOLE_VOXELS = 16_000_000
+"""Above this the volume is cut into tiles: the network needs about 0.27 GB of memory per million voxels."""
+TILE_VOXELS = 160
+HALO_VOXELS = 64
+
+
+def estimate_prior(
+    network: DensityGatedPriorNetwork,
+    v_coarse: NDArray[np.float32],
+    m_rho: NDArray[np.float32],
+    *,
+    max_whole_voxels: int = MAX_WHOLE_VOXELS,
+    tile_voxels: int = TILE_VOXELS,
+    halo_voxels: int = HALO_VOXELS,
+) -> NDArray[np.float32]:
+    """Return V_prior for a whole volume (Eq. 7).
+
+    Args:
+        network: from `load_prior`, on any device; its mode is left as it is.
+        v_coarse: [I, J, K], already divided by `g3r.acquisition.scatter.normalisation_scale`.
+        m_rho: [I, J, K], dimensionless density M >= 0.
+        max_whole_voxels: larger volumes are cut into tiles.
+        tile_voxels: edge length of a tile without its halo; rounded up to the network's stride.
+        halo_voxels: how far a tile looks beyond its edge; rounded up likewise.
+
+    Returns:
+        V_prior, float32 [I, J, K], in the units of `v_coarse`.
+
+    Raises:
+        ValueError: the two volumes are not 3D of one shape, or a tile has no voxels.
+        NumericalError: the result is not finite.
+
+    Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
+        the whole volume, and no layer has statistics of its own. What differs is only what lies beyond the
+        halo: nothing from `ResidualRefiner.receptive_radius_voxels` on (exact up to rounding), below 1e-3 of
+        the intensity scale from 64 voxels on (tests/prior/test_inference.py).
+    """
+    if v_coarse.ndim != 3 or v_coarse.shape != m_rho.shape or min(v_coarse.shape) < 1:
+        raise ValueError(f"expected two 3D volumes of one shape; got {v_coarse.shape} and {m_rho.shape}")
+    if tile_voxels < 1 or halo_voxels < 0:
+        raise ValueError(f"a tile needs voxels and a halo of at least 0; got {tile_voxels=}, {halo_voxels=}")
+    stride = network.refiner.stride
+    whole = v_coarse.size <= max_whole_voxels
+    edge = max(v_coarse.shape) if whole else _round_up(tile_voxels, stride)
+    halo = 0 if whole else _round_up(halo_voxels, stride)
+    device = next(network.parameters()).device
+
+    prior = np.empty(v_coarse.shape, np.float32)
+    with torch.inference_mode():
+        for core, seen in _tiles(v_coarse.shape, edge, halo):
+            inputs = [
+                torch.from_numpy(np.ascontiguousarray(volume[seen], np.float32)).to(device)[None, None]
+                for volume in (v_coarse, m_rho)
+            ]
+            inside = tuple(
+                slice(wanted.start - given.start, wanted.stop - given.start)
+                for wanted, given in zip(core, seen, strict=True)
+            )
+            prior[core] = network(*inputs)[0, 0].float().cpu().numpy()[inside]
+    if not np.isfinite(prior).all():
+        raise NumericalError("the prior network returned NaN or infinity; check the stacks' intensities")
+    return prior
+
+
+def _round_up(value: int, multiple: int) -> int:
+    """Return the smallest multiple that is not below the value."""
+    return -(-value // multiple) * multiple
+
+
+def _tiles(
+    shape: tuple[int, ...], edge: int, halo: int
+) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+    """Yield (voxels a tile writes, voxels it sees); the first parts cover the volume once."""
+    for corner in np.ndindex(*[-(-extent // edge) for extent in shape]):
+        start = [index * edge for index in corner]
+        stop = [min(begin + edge, extent) for begin, extent in zip(start, shape, strict=True)]
+        core = tuple(slice(begin, end) for begin, end in zip(start, stop, strict=True))
+        seen = tuple(
+            slice(max(begin - halo, 0), min(end + halo, extent))
+            for begin, end, extent in zip(start, stop, shape, strict=True)
+        )
+        yield core, seen

@@ -1,0 +1,334 @@
+"""Training of the prior network. The only file of `g3r.prior` that imports Lightning."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+from torch.nn import functional
+from torchmetrics.functional.image import (
+    peak_signal_noise_ratio,
+    structural_similarity_index_measure,
+)
+
+from g3r.errors import InputError
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.gate import DensityGate, confidence_from_density
+
+Batch = Mapping[str, Tensor]
+"""{"coarse", "density", "truth", "mask"}, each float32 [B, 1, I, J, K]; intensities by "p99-coarse-v1"."""
+
+EXPORT_KEY = "g3r_prior"
+"""Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
+NETWORK_PREFIX = "network."
+
+_MASK_MARGIN_VOXELS = 3
+
+
+class PriorModule(LightningModule):
+    """Supervised training of V_prior against the true volume.
+
+    Loss: mean absolute error, weighted 1 in the brain mask grown by 3 voxels and `background_weight`
+    elsewhere. The background must count, because with no density the gate is fully open there and nothing
+    else would keep the network from inventing tissue; it must not count fully, because most voxels of a
+    patch are background, where zero is an easy answer.
+
+    The learning rate warms up over `warmup_steps`, then follows half a cosine to 1 % by the budget that
+    runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run given 70 minutes ends
+    annealed, however fast the machine.
+
+    Args:
+        channels: see `ResidualRefiner`.
+        units: see `ResidualRefiner`.
+        tail_channels: see `ResidualRefiner`.
+        alpha: gate at high density.
+        beta: gate at zero density.
+        use_gate: False sets G = 1 (an ablation).
+        use_density: False hides the density from F (an ablation).
+        learning_rate: peak rate of AdamW.
+        weight_decay: of AdamW.
+        warmup_steps: steps of linear warm-up.
+        background_weight: loss weight outside the grown mask, 0 to 1.
+        augment_orientation: turn and mirror each training batch by a random symmetry of the cube, so that
+            the prior does not depend on the orientation in which a subject is reconstructed.
+        voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
+
+    Raises:
+        ValueError: from the network, or a rate or weight out of range.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[int] = (32, 64, 96),
+        units: Sequence[int] = (1, 2, 3),
+        tail_channels: int = 8,
+        alpha: float = 0.05,
+        beta: float = 1.0,
+        use_gate: bool = True,
+        use_density: bool = True,
+        learning_rate: float = 1e-3,
+        weight_decay: float = 1e-4,
+        warmup_steps: int = 100,
+        background_weight: float = 0.1,
+        augment_orientation: bool = True,
+        voxel_mm: float | None = None,
+    ) -> None:
+        super().__init__()
+        if not (learning_rate > 0 and weight_decay >= 0 and 0 <= background_weight <= 1):
+            raise ValueError(f"got {learning_rate=}, {weight_decay=}, {background_weight=}")
+        self.save_hyperparameters()
+        self.network = DensityGatedPriorNetwork(
+            channels, units, tail_channels, alpha, beta, use_gate, use_density
+        ).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.learning_rate = learning_rate
+        self.weight_decay = weight_decay
+        self.warmup_steps = warmup_steps
+        self.background_weight = background_weight
+        self.augment_orientation = augment_orientation
+        self.voxel_mm = voxel_mm
+        self._training_data = "not recorded"
+        self._total_steps = math.inf
+        self._timer: Timer | None = None
+        self._panel: Tensor | None = None
+        self._pace = _Pace()
+
+    def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
+        """Return V_prior; see `DensityGatedPriorNetwork.forward`."""
+        return self.network(v_coarse, m_rho)
+
+    # ---- training -------------------------------------------------------------------------------------
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the weighted L1 error of one batch and log it beside V_coarse's."""
+        if self.augment_orientation:
+            batch = random_cube_symmetry(batch)
+        weight = loss_weight(batch["mask"], self.background_weight)
+        loss = weighted_l1(self(batch["coarse"], batch["density"]), batch["truth"], weight)
+        n_samples = batch["truth"].shape[0]
+        self.log("train/l1_prior", loss, prog_bar=True, batch_size=n_samples)
+        coarse_loss = weighted_l1(batch["coarse"], batch["truth"], weight)
+        self.log("train/l1_coarse", coarse_loss, batch_size=n_samples)
+        return loss
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Note when the data arrived."""
+        self._pace.start_batch()
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """Log samples per second and the share of time spent waiting for data."""
+        self._pace.end_batch(batch["truth"].shape[0])
+        every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
+        if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
+            samples_per_second, waiting = self._pace.read_and_reset()
+            self.log("train/samples_per_second", samples_per_second, prog_bar=True)
+            self.log("train/waiting_for_data", waiting)
+
+    def on_train_epoch_start(self) -> None:
+        """Forget the time spent in validation."""
+        self._pace = _Pace()
+
+    def configure_optimizers(self) -> Any:
+        """Return AdamW with warm-up and a cosine over the trainer's budget."""
+        optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay
+        )
+        total = self.trainer.estimated_stepping_batches
+        self._total_steps = float(total) if total > 0 else math.inf
+        self._timer = next((c for c in self.trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate_factor)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step", "name": "train/learning_rate"},
+        }
+
+    def _rate_factor(self, step: int) -> float:
+        """Return the learning rate's factor at a step, in (0, 1]."""
+        progress = step / self._total_steps
+        if self._timer is not None:
+            elapsed, remaining = self._timer.time_elapsed(), self._timer.time_remaining()
+            if remaining is not None and elapsed > 0:
+                progress = max(progress, elapsed / (elapsed + max(remaining, 0.0)))
+        return min((step + 1) / (self.warmup_steps + 1), 1.0) * cosine_factor(progress)
+
+    # ---- validation -----------------------------------------------------------------------------------
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Log L1, PSNR (dB) and SSIM in the mask, for the prior and for V_coarse as the baseline."""
+        coarse, truth, mask = batch["coarse"], batch["truth"], batch["mask"] > 0.5
+        prior = self(coarse, batch["density"]).to(truth.dtype)
+        weight = loss_weight(batch["mask"], self.background_weight)
+        for name, volume in (("prior", prior), ("coarse", coarse)):
+            scores = {"l1": [float(weighted_l1(volume, truth, weight))]}
+            for metric, values in scores_in_mask(volume, truth, mask).items():
+                scores[metric] = values
+            for metric, values in scores.items():
+                if values:
+                    mean = sum(values) / len(values)
+                    self.log(f"val/{metric}_{name}", mean, batch_size=len(values), prog_bar=metric == "psnr")
+        if batch_idx == 0:
+            self._panel = panel(batch, prior, self.network.gate)
+
+    def on_validation_epoch_end(self) -> None:
+        """Send the row of images to TensorBoard, if that is the logger."""
+        for logger in self.loggers:
+            if isinstance(logger, TensorBoardLogger) and self._panel is not None:
+                logger.experiment.add_image(
+                    "val/coarse density gate prior truth error",
+                    self._panel,
+                    global_step=self.global_step,
+                    dataformats="HW",
+                )
+
+    # ---- what an export needs -------------------------------------------------------------------------
+
+    def on_fit_start(self) -> None:
+        """Take the voxel size and a description from the data module.
+
+        Raises:
+            InputError: the voxel size is not known, or differs from the data's.
+        """
+        data = getattr(self.trainer, "datamodule", None)
+        settings = dict(getattr(data, "hparams", None) or {})
+        spacing_mm = settings.get("spacing_mm", getattr(data, "spacing_mm", None))
+        if self.voxel_mm is None:
+            if spacing_mm is None:
+                raise InputError(
+                    "model.voxel_mm: not given, and the data module has no spacing_mm; pass either"
+                )
+            self.voxel_mm = float(spacing_mm)
+        elif spacing_mm is not None and abs(self.voxel_mm - float(spacing_mm)) > 1e-3:
+            raise InputError(
+                f"model.voxel_mm: {self.voxel_mm} mm, but the data are made at {spacing_mm} mm; leave it out"
+            )
+        self._training_data = describe_data(data, settings)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the description from which `g3r-export` makes a prior checkpoint, in plain values only."""
+        metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
+        checkpoint[EXPORT_KEY] = {
+            "network_arguments": self.network.arguments(),
+            "voxel_mm": self.voxel_mm,
+            "training_data": self._training_data,
+            "optimiser_steps": int(self.global_step),
+            "validation": {name: value for name, value in metrics.items() if name.startswith("val/")},
+        }
+
+
+class _Pace:
+    """Samples per second, and the share of the time in which training waits for data."""
+
+    def __init__(self) -> None:
+        self._since = self._arrived = self._ended = time.monotonic()
+        self._n_samples = 0
+        self._waited_seconds = 0.0
+
+    def start_batch(self) -> None:
+        self._arrived = time.monotonic()
+        self._waited_seconds += self._arrived - self._ended
+
+    def end_batch(self, n_samples: int) -> None:
+        self._ended = time.monotonic()
+        self._n_samples += n_samples
+
+    def read_and_reset(self) -> tuple[float, float]:
+        seconds = max(self._ended - self._since, 1e-9)
+        result = self._n_samples / seconds, min(self._waited_seconds / seconds, 1.0)
+        self._since, self._n_samples, self._waited_seconds = self._ended, 0, 0.0
+        return result
+
+
+def cosine_factor(progress: float, final: float = 0.01) -> float:
+    """Return half a cosine from 1 at progress 0 to `final` at progress 1 and beyond."""
+    return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+
+
+def loss_weight(mask: Tensor, background_weight: float) -> Tensor:
+    """Return 1 within 3 voxels (per axis) of the mask and `background_weight` elsewhere, [B, 1, I, J, K]."""
+    grown = mask
+    size = 2 * _MASK_MARGIN_VOXELS + 1
+    for axis in range(3):  # a cube is the maximum along one axis after the other
+        kernel = [size if other == axis else 1 for other in range(3)]
+        grown = functional.max_pool3d(grown, kernel, stride=1, padding=[width // 2 for width in kernel])
+    return background_weight + (1.0 - background_weight) * (grown > 0.5).to(mask.dtype)
+
+
+def weighted_l1(volume: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    """Return sum(w |V - truth|) / sum(w), a scalar."""
+    return (weight * (volume - truth).abs()).sum() / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+
+
+def random_cube_symmetry(batch: Batch) -> dict[str, Tensor]:
+    """Return the batch mirrored and turned by one random symmetry of its grid (48 of a cube).
+
+    Axes are exchanged only among those of equal extent, so the shape stays the same. The random numbers are
+    torch's global ones, which Lightning seeds.
+    """
+    shape = batch["truth"].shape[2:]
+    order = torch.randperm(3).tolist()
+    if [shape[axis] for axis in order] != list(shape):
+        order = [0, 1, 2]
+    mirrored = [2 + axis for axis in range(3) if torch.rand(()) < 0.5]
+    dims = [0, 1, *[2 + axis for axis in order]]
+    return {name: value.permute(dims).flip(mirrored).contiguous() for name, value in batch.items()}
+
+
+def scores_in_mask(volume: Tensor, truth: Tensor, mask: Tensor) -> dict[str, list[float]]:
+    """Return PSNR (dB) and SSIM per sample, over the mask, for a data range of 1 (the 99th percentile).
+
+    Samples with an empty mask are left out; SSIM also where an extent is below its window of 11 voxels.
+    """
+    scores: dict[str, list[float]] = {"psnr": [], "ssim": []}
+    for one, true, inside in zip(volume.float(), truth.float(), mask, strict=True):
+        if not bool(inside.any()):
+            continue
+        psnr = peak_signal_noise_ratio(one[inside], true[inside], data_range=1.0)
+        scores["psnr"].append(float(psnr))
+        if min(one.shape[1:]) >= 11:
+            _, local = structural_similarity_index_measure(
+                one[None], true[None], data_range=1.0, return_full_image=True
+            )
+            scores["ssim"].append(float(local[0][inside].mean()))
+    return scores
+
+
+def panel(batch: Batch, prior: Tensor, gate: DensityGate) -> Tensor:
+    """Return coarse, density, gate, prior, truth and error side by side, [H, W] in [0, 1].
+
+    The section is the one with the most brain of the batch's first sample. Density is shown as
+    c = 1 - exp(-M), the error as 4 |prior - truth|.
+    """
+    volumes = {name: value[0, 0].detach().float().cpu() for name, value in batch.items()}
+    section = int((volumes["mask"] > 0.5).sum((0, 1)).argmax())
+    truth, density, shown = volumes["truth"], volumes["density"], prior[0, 0].detach().float().cpu()
+    row = [
+        volumes["coarse"],
+        confidence_from_density(density),
+        gate(density),
+        shown,
+        truth,
+        4.0 * (shown - truth).abs(),
+    ]
+    # Columns follow i (the patient's right), rows follow j upwards (anterior).
+    return torch.cat([image[:, :, section].T.flip(0) for image in row], 1).clamp(0.0, 1.0)
+
+
+def describe_data(data: object, settings: Mapping[str, Any]) -> str:
+    """Return the data module and its settings in one line, with folders by name only.
+
+    The line ends up in files that are passed on; where the data lay on this machine is nobody's business.
+    """
+    if data is None:
+        return "not recorded"
+    plain = {
+        name: Path(value).name if isinstance(value, (str, Path)) and "/" in str(value) else value
+        for name, value in settings.items()
+        if not name.startswith("_")
+    }
+    listed = ", ".join(f"{name}={value}" for name, value in plain.items())
+    return f"{type(data).__module__}.{type(data).__qualname__}({listed})"

@@ -1,0 +1,179 @@
+"""F of Eq. 7: the residual network that refines a coarse volume, made of MONAI blocks."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from monai.networks.blocks import Convolution, ResidualUnit, SubpixelUpsample
+from monai.networks.utils import pixelunshuffle
+from torch import Tensor, nn
+from torch.nn import functional
+
+from g3r.prior.gate import confidence_from_density
+
+# No normalisation layer anywhere: instance statistics would make a voxel's value depend on how the volume
+# was cut into tiles, and on how much empty background a patch has.
+_LEAKY_SLOPE = 0.1
+_BLOCK: dict[str, Any] = {
+    "adn_ordering": "A",
+    "act": ("LEAKYRELU", {"negative_slope": _LEAKY_SLOPE}),
+    "norm": None,
+}
+
+
+class ResidualRefiner(nn.Module):
+    """A 3D residual network F(V_coarse, M_rho) that is cheap on a CPU.
+
+    The full-resolution grid is where a CPU spends its time, so it is left at once: 2x2x2 voxels become
+    channels (space to depth), a U-shape of residual units works at 1/2, 1/4, 1/8 ... resolution, a
+    sub-pixel step comes back, and two light convolutions at full resolution see the input again.
+
+    The density enters as c = 1 - exp(-M) rather than as M: M is unbounded (hundreds under an output grid
+    much finer than the slices), c lies in [0, 1], has slope 1 at 0, and is what the gate uses.
+
+    The last convolution starts at zero, so training starts from V_coarse.
+
+    Args:
+        channels: feature channels at 1/2, 1/4, ... resolution; at least one level. Multiples of 16 are
+            fastest on CPUs with 512-bit vectors.
+        units: residual units (two 3x3x3 convolutions each) per level and direction; one number per level.
+        tail_channels: feature channels at full resolution.
+        use_density: False leaves c out (an ablation); the signature of `forward` stays the same.
+
+    Raises:
+        ValueError: no level, different numbers of levels, or a count below 1.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[int] = (32, 64, 96),
+        units: Sequence[int] = (1, 2, 3),
+        tail_channels: int = 8,
+        use_density: bool = True,
+    ) -> None:
+        super().__init__()
+        if not channels or len(channels) != len(units) or min(*channels, *units, tail_channels) < 1:
+            raise ValueError(
+                "ResidualRefiner needs one positive entry per level; "
+                f"got {channels=}, {units=}, {tail_channels=}"
+            )
+        self.channels = tuple(int(value) for value in channels)
+        self.units = tuple(int(value) for value in units)
+        self.tail_channels = int(tail_channels)
+        self.use_density = bool(use_density)
+        self.stride = 2 ** len(self.channels)
+        in_channels = 2 if use_density else 1
+
+        self.stem = Convolution(3, 8 * in_channels, self.channels[0], **_BLOCK)
+        self.encoder = nn.ModuleList()
+        self.down = nn.ModuleList()
+        self.decoder = nn.ModuleList()
+        self.up = nn.ModuleList()
+        for level, (width, count) in enumerate(zip(self.channels, self.units, strict=True)):
+            self.encoder.append(_residual_units(width, count))
+            if level + 1 < len(self.channels):
+                deeper = self.channels[level + 1]
+                self.down.append(Convolution(3, width, deeper, strides=2, **_BLOCK))
+                self.up.append(_subpixel_upsample(deeper, width))
+                self.decoder.append(_residual_units(width, count))
+        self.to_full = _subpixel_upsample(self.channels[0], self.tail_channels)
+        self.tail = Convolution(3, self.tail_channels + in_channels, self.tail_channels, **_BLOCK)
+        self.head = nn.Conv3d(self.tail_channels, 1, kernel_size=3, padding=1)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """Scale the weights so that activations keep their size, and F starts at exactly zero."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv3d):
+                nn.init.kaiming_normal_(module.weight, a=_LEAKY_SLOPE)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        n_units = sum(self.units) + sum(self.units[:-1])
+        for module in self.modules():
+            if isinstance(module, ResidualUnit):
+                # Without normalisation each unit would double the variance; n of them together add about 1.
+                with torch.no_grad():
+                    module.conv[-1].conv.weight.mul_(1.0 / math.sqrt(n_units))  # type: ignore[union-attr, operator]
+            elif isinstance(module, SubpixelUpsample):
+                _tie_subpixels(module.conv_block, factor=8)
+        nn.init.zeros_(self.head.weight)  # its bias is zero already
+
+    @property
+    def receptive_radius_voxels(self) -> int:
+        """How far, in full-resolution voxels, a change of the input can reach in the output."""
+        radius = 2  # the two convolutions at full resolution
+        for level, count in enumerate(self.units):
+            per_voxel = 2 ** (level + 1)
+            is_deepest = level + 1 == len(self.units)
+            entry_and_units = 1 + 2 * count * (1 if is_deepest else 2)
+            radius += per_voxel * entry_and_units
+            # Being resampled, a voxel also stands for its whole block.
+            radius += per_voxel
+        return radius
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments as plain Python values, for a checkpoint."""
+        return {
+            "channels": list(self.channels),
+            "units": list(self.units),
+            "tail_channels": self.tail_channels,
+            "use_density": self.use_density,
+        }
+
+    def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
+        """Return the ungated residual F.
+
+        Args:
+            v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
+            m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
+
+        Returns:
+            [B, 1, I, J, K]; any size works, it is padded with zeros at the far end inside.
+        """
+        inputs = torch.cat([v_coarse, confidence_from_density(m_rho)], 1) if self.use_density else v_coarse
+        size = inputs.shape[2:]
+        far_end = [padding for extent in reversed(size) for padding in (0, -extent % self.stride)]
+        inputs = functional.pad(inputs, far_end)
+
+        features = self.stem(_channels_last(pixelunshuffle(inputs, 3, 2)))
+        skips = []
+        for encode, down in zip(self.encoder[:-1], self.down, strict=True):
+            features = encode(features)
+            skips.append(features)
+            features = down(features)
+        features = self.encoder[-1](features)
+        for up, decode in zip(reversed(self.up), reversed(self.decoder), strict=True):
+            features = decode(_channels_last(up(features)) + skips.pop())
+        features = torch.cat([self.to_full(features), inputs], 1)
+        residual = self.head(self.tail(_channels_last(features)))
+        return residual[:, :, : size[0], : size[1], : size[2]]
+
+
+def _residual_units(width: int, count: int) -> nn.Sequential:
+    """Return `count` residual units with a linear shortcut and no activation after the sum."""
+    units = [ResidualUnit(3, width, width, last_conv_only=True, **_BLOCK) for _ in range(count)]
+    return nn.Sequential(*units)
+
+
+def _subpixel_upsample(in_channels: int, out_channels: int) -> SubpixelUpsample:
+    """Return a doubling of the resolution: 1x1x1 convolution to 8 times the channels, then rearrangement.
+
+    The neighbourhood is looked at by the convolutions before and after; a 3x3x3 kernel here would hold
+    half of all the weights. No averaging afterwards (MONAI's `apply_pad_pool`): it shifts by half a voxel.
+    """
+    to_subpixels = nn.Conv3d(in_channels, 8 * out_channels, kernel_size=1)
+    return SubpixelUpsample(
+        3, in_channels, out_channels, scale_factor=2, conv_block=to_subpixels, apply_pad_pool=False
+    )
+
+
+def _tie_subpixels(conv: nn.Conv3d, factor: int) -> None:
+    """Give the `factor` sub-pixels of each output channel equal weights (no checkerboard at the start)."""
+    with torch.no_grad():
+        conv.weight.copy_(conv.weight[::factor].repeat_interleave(factor, dim=0))
+
+
+def _channels_last(features: Tensor) -> Tensor:
+    """Return the same values with channels innermost, where CPU convolutions are up to twice as fast."""
+    return features.contiguous(memory_format=torch.channels_last_3d)
