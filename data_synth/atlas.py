@@ -85,28 +85,34 @@ def find_subjects(
     return chosen
 
 
-def load_subject(subject: AtlasSubject, spacing_mm: float) -> TruthVolume:
+def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume:
     """Read a subject: canonical axes (RAS, as near as its header allows), one voxel size, normalised, masked.
+
+    Args:
+        subject: its files.
+        spacing_mm: isotropic voxel size; None keeps the file's own grid.
 
     Raises:
         InputError: unreadable files, a mask of another grid, an empty mask, or an image without contrast.
     """
     volume = load_volume(subject.image)
     mask = load_mask(subject.mask, volume)
-    data = np.nan_to_num(volume.data)
+    data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
     turn = nib.orientations.io_orientation(volume.affine)
     affine = volume.affine @ nib.orientations.inv_ornt_aff(turn, data.shape)
     data = nib.orientations.apply_orientation(data, turn)
     mask = nib.orientations.apply_orientation(mask, turn).astype(bool)
 
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if np.abs(spacing - spacing_mm).max() > 1e-3:
+    if spacing_mm is not None and np.abs(spacing - spacing_mm).max() > 1e-3:
         data, mask, affine = _resampled(data, mask, affine, spacing, spacing_mm)
         if not mask.any():
             raise InputError(f"{subject.mask}: mask is empty at {spacing_mm:g} mm; use a finer spacing")
     bright = float(np.percentile(data[mask], 99.5))
     if not bright > 0:
-        raise InputError(f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image")
+        raise InputError(
+            f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image"
+        )
     data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
     return TruthVolume(subject.name, data, mask, affine)
 

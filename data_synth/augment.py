@@ -17,11 +17,24 @@ def augmentation() -> tio.Compose:
             tio.OneOf(
                 {
                     tio.RandomAffine(
-                        scales=0.08, degrees=15, translation=0, image_interpolation="bspline", default_pad_value=0
+                        scales=0.08,
+                        degrees=15,
+                        translation=0,
+                        image_interpolation="bspline",
+                        default_pad_value=0,
                     ): 0.6,
                     tio.RandomAffineElasticDeformation(
-                        affine_kwargs={"scales": 0.08, "degrees": 15, "translation": 0, "default_pad_value": 0},
-                        elastic_kwargs={"num_control_points": 7, "max_displacement": 4.0, "locked_borders": 2},
+                        affine_kwargs={
+                            "scales": 0.08,
+                            "degrees": 15,
+                            "translation": 0,
+                            "default_pad_value": 0,
+                        },
+                        elastic_kwargs={
+                            "num_control_points": 7,
+                            "max_displacement": 4.0,
+                            "locked_borders": 2,
+                        },
                     ): 0.4,
                 }
             ),
@@ -48,4 +61,6 @@ def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Genera
         return volume
     data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
     data /= max(float(np.percentile(data[mask], 99.5)), 1e-6)
-    return TruthVolume(volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine))
+    return TruthVolume(
+        volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine)
+    )

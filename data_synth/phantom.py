@@ -133,9 +133,7 @@ def fetal_brain_phantom(
     ]
     grid = np.meshgrid(*axes, indexing="ij", sparse=True)
     bend = 0.015 * body.a  # individual shape: the coordinates are warped a little before anything is drawn
-    x, y, z = (
-        axis + np.float32(bend) * smooth_noise(shape, 0.45 * body.a, spacing_mm, rng) for axis in grid
-    )
+    x, y, z = (axis + np.float32(bend) * smooth_noise(shape, 0.45 * body.a, spacing_mm, rng) for axis in grid)
     t2, labels, mask = _draw(body, (x, y, z), spacing_mm, rng)
     return Phantom(t2, labels, mask, affine)
 
@@ -221,9 +219,7 @@ def _folded_surface(
     arch = np.sqrt((y / np.float32(0.50 * b)) ** 2 + ((z + np.float32(0.02 * a)) / np.float32(0.37 * a)) ** 2)
     depth_left = (arch - 1) * np.float32(0.40 * a)
     open_mm = np.float32(0.2 + 0.1 * body.csf)
-    surface = intersection(
-        cerebrum, np.sqrt(side**2 + np.minimum(depth_left, 0) ** 2) - open_mm, 0.05 * a
-    )
+    surface = intersection(cerebrum, np.sqrt(side**2 + np.minimum(depth_left, 0) ** 2) - open_mm, 0.05 * a)
     # Sylvian fissure: an oblique sheet above the temporal lobe, going in as far as the insula.
     lift = (y - np.float32(0.05 * b)) / np.float32(b)  # the fissure rises towards the back
     slit = z + np.float32(0.16 * a) + np.float32(a) * (0.55 * lift - 0.5 * lift**2)
@@ -260,10 +256,14 @@ def _folded_surface(
         noise = wave_field(u, wavelength, 0.25, 14, rng)
         noise += np.float32(weight) * wave_field(own, wavelength, 0.25, 10, rng)
         away = sheet_distance(noise, spacing_mm, 1.1 / wavelength)
-        local = np.float32(depth) * np.clip(0.75 + 0.45 * wave_field(u, 1.5 * wavelength, 0.3, 8, rng), 0, 1.3)
+        local = np.float32(depth) * np.clip(
+            0.75 + 0.45 * wave_field(u, 1.5 * wavelength, 0.3, 8, rng), 0, 1.3
+        )
         local *= allowed
         below = np.maximum(cerebrum - local, 0)
-        valley = np.sqrt(away**2 + below**2) - np.float32((0.25 + 0.1 * body.csf) * min(1, depth / 4)) * allowed
+        valley = (
+            np.sqrt(away**2 + below**2) - np.float32((0.25 + 0.1 * body.csf) * min(1, depth / 4)) * allowed
+        )
         surface = intersection(surface, valley, 2.5)
     return surface
 

@@ -105,5 +105,7 @@ def smooth_noise(
     lattice = gaussian_filter(rng.normal(size=small), 1.0, mode="wrap")
     lattice /= lattice.std()
     coefficient = spline_filter(lattice, 3)
-    index = np.meshgrid(*(np.arange(n, dtype=np.float32) / step + 1 for n in shape), indexing="ij", sparse=False)
+    index = np.meshgrid(
+        *(np.arange(n, dtype=np.float32) / step + 1 for n in shape), indexing="ij", sparse=False
+    )
     return map_coordinates(coefficient, index, order=3, prefilter=False, output=np.float32)

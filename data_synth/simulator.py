@@ -167,7 +167,9 @@ class _Head:
     bright: float
 
     @classmethod
-    def of(cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool) -> _Head:
+    def of(
+        cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool
+    ) -> _Head:
         grid = VolumeGrid(mask.shape, affine)
         reach = binary_dilation(mask, iterations=SIGNAL_REACH_VOXELS)
         shell = np.argwhere(mask & ~np.roll(mask, 1, 0) | mask & ~np.roll(mask, -1, 0))
@@ -177,7 +179,9 @@ class _Head:
         volume_grid = grid
         if fine:
             shape = [2 * n - 1 for n in volume.shape]
-            volume = zoom(volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest")
+            volume = zoom(
+                volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest"
+            )
             volume_grid = VolumeGrid(volume.shape, affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
         return cls(
             np.ascontiguousarray(volume, np.float32), volume_grid, mask.astype(np.float32),
@@ -185,7 +189,9 @@ class _Head:
         )  # fmt: skip
 
 
-def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generator, name: str) -> SimulatedStack:
+def _simulate_stack(
+    head: _Head, settings: StackSettings, rng: np.random.Generator, name: str
+) -> SimulatedStack:
     frame = _frame(settings, rng)
     spacing = np.array([settings.resolution_mm] * 2 + [settings.thickness_mm + settings.gap_mm])
     local = (head.point_mm - head.center_mm) @ frame
@@ -251,7 +257,11 @@ class _ProfileOperator(VoxelOperator):
     """The voxel operator with the simulator's own slice profile; without settings it reads single points."""
 
     def __init__(
-        self, planes: Planes, grid: VolumeGrid, pixel_index: NDArray[np.int64] | None, settings: StackSettings | None
+        self,
+        planes: Planes,
+        grid: VolumeGrid,
+        pixel_index: NDArray[np.int64] | None,
+        settings: StackSettings | None,
     ) -> None:
         super().__init__(planes, grid, pixel_index, (1, 1, 1))
         if settings is not None:

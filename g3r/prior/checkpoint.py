@@ -154,9 +154,10 @@ def _read(path: Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; expected a prior checkpoint; {_ANOTHER_FILE}") from error
-    except OSError as error:
+    except (IsADirectoryError, PermissionError) as error:
         raise InputError(f"{path}: cannot be read ({_one_line(error)}); {_ANOTHER_FILE}") from error
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, LookupError) as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, OSError) as error:
+        # torch.load says "damaged" in many types; what the file begins with tells which advice helps.
         with path.open("rb") as stream:
             is_zip = stream.read(2) == b"PK"
         if is_zip:

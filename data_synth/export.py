@@ -1,0 +1,122 @@
+"""Simulated stacks as a folder of NIfTI files with their true poses, written whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from data_synth.atlas import TruthVolume
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.images import save_volume
+from g3r.errors import InputError
+
+
+def save_simulation(
+    folder: Path,
+    truth: TruthVolume,
+    stacks: Sequence[SimulatedStack],
+    record: Mapping[str, object],
+    *,
+    replace: bool = False,
+) -> None:
+    """Write a simulated subject.
+
+    Files: `stack-N.nii.gz` (int16) and `mask-N.nii.gz`, `truth.nii.gz` and `truth-mask.nii.gz`, `poses.tsv`
+    (a row per slice: `stack slice rx ry rz tx ty tz gain void`; a point at x by the file's header truly lies at
+    R x + t), `poses.json` (a list of `stack`, `slice`, `rotation` [3, 3], `center` [3]: the point at (x, y) mm
+    from the middle of the pixel grid truly lies at rotation (x, y, 0) + center), `simulation.json` (`record`).
+
+    Args:
+        folder: output folder.
+        truth: the volume that was sliced.
+        stacks: what was made of it.
+        record: settings, to be kept with the data.
+        replace: whether a folder that holds files already may be replaced.
+
+    Raises:
+        InputError: the folder exists and is not empty (without `replace`), or cannot be written.
+    """
+    check_output(folder, replace=replace)
+    beside: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        beside.chmod(0o755)  # mkdtemp makes it private, an ordinary folder is not
+        _write(beside, truth, stacks, record)
+        _put_in_place(beside, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --output") from None
+    finally:
+        if beside is not None:
+            shutil.rmtree(beside, ignore_errors=True)
+
+
+def check_output(folder: Path, *, replace: bool) -> None:
+    """Refuse an output that is a file, or a folder with content unless it may be replaced.
+
+    A folder to be replaced must look like an earlier simulation: nothing else is ever deleted.
+
+    Raises:
+        InputError: see above.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+    content = [entry.name for entry in folder.iterdir()]
+    if content and not replace:
+        raise InputError(f"{folder}: is not empty; pass --force to replace it, or choose another --output")
+    if content and "poses.tsv" not in content:
+        raise InputError(f"{folder}: holds something else than a simulation; choose another --output")
+
+
+def _put_in_place(beside: Path, folder: Path) -> None:
+    """Rename the finished folder; an old one steps aside first and comes back should that fail."""
+    if not folder.exists():
+        os.replace(beside, folder)
+        return
+    old = folder.with_name(f".{folder.name}.old.{os.getpid()}")
+    os.replace(folder, old)
+    try:
+        os.replace(beside, folder)
+    except OSError:
+        os.replace(old, folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _write(
+    folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], record: Mapping[str, object]
+) -> None:
+    save_volume(folder / "truth.nii.gz", truth.data, truth.affine)
+    save_volume(folder / "truth-mask.nii.gz", truth.mask, truth.affine)
+    centers = []
+    with (folder / "poses.tsv").open("w", newline="") as file:
+        table = csv.writer(file, delimiter="\t", lineterminator="\n")
+        table.writerow("stack slice rx ry rz tx ty tz gain void".split())
+        for number, one in enumerate(stacks):
+            stack = one.stack
+            counts = np.clip(np.rint(stack.image), np.iinfo(np.int16).min, np.iinfo(np.int16).max)
+            save_volume(folder / f"stack-{number}.nii.gz", counts.astype(np.int16), stack.affine)
+            save_volume(folder / f"mask-{number}.nii.gz", stack.mask, stack.affine)
+            frame = stack.affine[:3, :3] / stack.spacing_mm
+            n_i, n_j, n_k = stack.image.shape
+            rotvec, pose = one.true_pose.rotvec_rad(), one.true_pose
+            for k in range(n_k):
+                motion = [f"{v:.9g}" for v in (*rotvec[k], *pose.translation_mm[k])]
+                table.writerow([number, k, *motion, f"{one.gain[k]:.6g}", int(one.is_void[k])])
+                header_center = stack.grid.world([(n_i - 1) / 2, (n_j - 1) / 2, k])
+                center = pose.rotation[k] @ header_center + pose.translation_mm[k]
+                rotation = pose.rotation[k] @ frame
+                centers.append(
+                    {"stack": number, "slice": k, "rotation": rotation.tolist(), "center": center.tolist()}
+                )
+    (folder / "poses.json").write_text(json.dumps(centers) + "\n")
+    (folder / "simulation.json").write_text(json.dumps(record, indent=2) + "\n")

@@ -1,0 +1,137 @@
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+from g3r.prior import DensityGatedPriorNetwork, ResidualRefiner
+
+SMALL = {"channels": (8, 8, 8), "units": (1, 1, 1), "tail_channels": 4}
+
+
+@pytest.fixture
+def volumes():
+    generator = torch.Generator().manual_seed(0)
+    v_coarse = torch.rand(2, 1, 16, 16, 16, generator=generator)
+    return v_coarse, 3 * torch.rand(v_coarse.shape, generator=generator)
+
+
+def awaken(network):
+    """Give the zero-initialised last convolution weights, so that F does something."""
+    torch.manual_seed(1)
+    nn.init.normal_(network.refiner.head.weight, std=0.02)
+    return network.eval()
+
+
+class Stub(nn.Module):
+    """An F with known values: V + 10 M."""
+
+    def forward(self, v_coarse, m_rho):
+        return v_coarse + 10 * m_rho
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(0.05, 1.0), (0.0, 0.5), (1.0, 1.0)])
+def test_equation_7_with_a_known_residual(volumes, alpha, beta):
+    v_coarse, m_rho = (volume.double() for volume in volumes)
+    network = DensityGatedPriorNetwork(**SMALL, alpha=alpha, beta=beta)
+    network.refiner = Stub()
+    c = 1 - torch.exp(-m_rho)
+    expected = v_coarse + (alpha * c + beta * (1 - c)) * (v_coarse + 10 * m_rho)
+    torch.testing.assert_close(network(v_coarse, m_rho), expected, rtol=1e-14, atol=1e-14)
+
+
+def test_gate_can_be_left_out(volumes):
+    v_coarse, m_rho = volumes
+    network = DensityGatedPriorNetwork(**SMALL, use_gate=False)
+    network.refiner = Stub()
+    torch.testing.assert_close(network(v_coarse, m_rho), 2 * v_coarse + 10 * m_rho)
+
+
+def test_training_starts_from_the_coarse_volume(volumes):
+    assert torch.equal(DensityGatedPriorNetwork(**SMALL)(*volumes), volumes[0])
+
+
+@pytest.mark.parametrize("use_density", [True, False])
+def test_residual_depends_on_density_only_if_it_may(volumes, use_density):
+    v_coarse, m_rho = volumes
+    refiner = awaken(DensityGatedPriorNetwork(**SMALL, use_density=use_density)).refiner
+    same = torch.equal(refiner(v_coarse, m_rho), refiner(v_coarse, 0 * m_rho))
+    assert same is not use_density
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 9, 13), (8, 8, 8), (3, 33, 17), (24, 1, 25)])
+def test_any_shape_works(shape):
+    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    v_coarse = torch.rand(1, 1, *shape)
+    prior = network(v_coarse, torch.ones_like(v_coarse))
+    assert prior.shape == v_coarse.shape
+    assert bool(prior.isfinite().all())
+
+
+def test_one_level_works(volumes):
+    network = awaken(DensityGatedPriorNetwork(channels=(8,), units=(1,), tail_channels=4))
+    assert not torch.equal(network(*volumes), volumes[0])
+
+
+def test_samples_of_a_batch_do_not_see_each_other(volumes):
+    v_coarse, m_rho = volumes
+    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    alone, together = network(v_coarse[:1], m_rho[:1]), network(v_coarse, m_rho)[:1]
+    # Rounding of float32 sums of a few hundred terms of size 1; batch statistics would show at 1e-2.
+    torch.testing.assert_close(alone, together, rtol=0, atol=2e-5)
+
+
+def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes):
+    v_coarse = volumes[0].clone().requires_grad_()
+    m_rho = torch.zeros_like(v_coarse)
+    m_rho[:, :, :8] = 1e6
+    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    network(v_coarse, m_rho).square().sum().backward()
+    gradients = [v_coarse.grad, *[parameter.grad for parameter in network.parameters()]]
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
+
+
+def test_activations_keep_their_size_at_the_start():
+    """Without normalisation, the initial scale is all there is."""
+    torch.manual_seed(0)
+    refiner = ResidualRefiner()
+    seen = []
+    for units in [*refiner.encoder, *refiner.decoder]:
+        units.register_forward_hook(lambda module, inputs, output: seen.append(float(output.detach().std())))
+    refiner(torch.rand(1, 1, 32, 32, 32), torch.rand(1, 1, 32, 32, 32))
+    assert 0.2 < min(seen) <= max(seen) < 5.0, seen
+
+
+def test_default_network_is_small_enough_to_ship():
+    n_bytes = sum(4 * parameter.numel() for parameter in DensityGatedPriorNetwork().parameters())
+    assert n_bytes < 20e6
+
+
+def test_receptive_radius_is_an_upper_bound():
+    refiner = awaken(DensityGatedPriorNetwork(**SMALL)).refiner
+    extent, center = 160, 80
+    v_coarse = torch.rand(1, 1, extent, 8, 8).requires_grad_()
+    refiner(v_coarse, torch.ones_like(v_coarse))[0, 0, center].sum().backward()
+    reached = v_coarse.grad.abs().sum((0, 1, 3, 4)).nonzero().flatten()
+    reach = max(center - int(reached.min()), int(reached.max()) - center)
+    assert refiner.receptive_radius_voxels // 2 < reach <= refiner.receptive_radius_voxels
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"channels": ()}, {"units": (1, 1)}, {"channels": (8, 0, 8)}, {"tail_channels": 0}]
+)
+def test_networks_without_meaning_are_refused(wrong):
+    with pytest.raises(ValueError, match="one positive entry per level"):
+        ResidualRefiner(**{**SMALL, **wrong})
+
+
+def test_importing_the_package_stays_light():
+    code = (
+        "import sys, g3r.prior\n"
+        "assert not {'torch', 'monai', 'lightning'} & set(sys.modules)\n"
+        "g3r.prior.DensityGatedPriorNetwork, g3r.prior.estimate_prior, g3r.prior.load_prior\n"
+        "assert not {'lightning', 'pytorch_lightning', 'torchio'} & set(sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from g3r.errors import NumericalError
+from g3r.prior import DensityGatedPriorNetwork, estimate_prior
+
+
+@pytest.fixture(scope="module")
+def network():
+    """The default network with a last layer that gives a residual of a tenth of the intensity scale."""
+    torch.manual_seed(0)
+    network = DensityGatedPriorNetwork().eval()
+    nn.init.normal_(network.refiner.head.weight, std=0.008)
+    return network
+
+
+@pytest.fixture(scope="module")
+def volumes():
+    rng = np.random.default_rng(0)
+    v_coarse = rng.random((250, 20, 17), dtype=np.float32)
+    return v_coarse, 3 * rng.random(v_coarse.shape, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def whole(network, volumes):
+    return estimate_prior(network, *volumes)
+
+
+def test_whole_volume_is_the_network_s_output(network, volumes, whole):
+    v_coarse, m_rho = (torch.from_numpy(volume)[None, None] for volume in volumes)
+    with torch.no_grad():
+        expected = network(v_coarse, m_rho)[0, 0].numpy()
+    assert whole.dtype == np.float32
+    np.testing.assert_allclose(whole, expected, rtol=0, atol=1e-6)
+    assert 0.03 < np.std(whole - volumes[0]) < 0.3
+
+
+def test_tiles_agree_with_the_whole(network, volumes, whole):
+    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=48)
+    # The default halo, on white noise and random weights, which look further than an image and trained ones.
+    assert np.abs(tiled - whole).max() < 1e-3
+
+
+def test_tiles_are_exact_beyond_the_receptive_field(network, volumes, whole):
+    halo = network.refiner.receptive_radius_voxels
+    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=40, halo_voxels=halo)
+    # Rounding only: other extents make the convolution add in another order.
+    assert np.abs(tiled - whole).max() < 1e-5
+
+
+def test_without_a_halo_they_do_not_agree(network, volumes, whole):
+    """The two tests above would notice a tile that is cut off."""
+    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=48, halo_voxels=0)
+    assert np.abs(tiled - whole).max() > 1e-2
+
+
+def test_odd_tile_sizes_cover_every_voxel():
+    network = DensityGatedPriorNetwork((8,), (1,), 4)
+    v_coarse = np.random.default_rng(0).random((13, 7, 22), dtype=np.float32)
+    prior = estimate_prior(network, v_coarse, 0 * v_coarse, max_whole_voxels=0, tile_voxels=5, halo_voxels=3)
+    np.testing.assert_array_equal(prior, v_coarse)
+
+
+def test_inputs_in_other_layouts_and_types(network):
+    v_coarse = np.random.default_rng(0).random((9, 10, 11))
+    straight = estimate_prior(network, v_coarse.astype(np.float32), np.ones((9, 10, 11), np.float32))
+    turned = estimate_prior(network, np.asfortranarray(v_coarse), np.ones((9, 10, 11)))
+    np.testing.assert_array_equal(straight, turned)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (4, 4, 5), (4, 4, 0)])
+def test_shapes_that_do_not_fit(network, shape):
+    with pytest.raises(ValueError, match="two 3D volumes of one shape"):
+        estimate_prior(network, np.zeros((4, 4, 4), np.float32), np.zeros(shape, np.float32))
+
+
+def test_nan_is_reported(network):
+    v_coarse = np.full((8, 8, 8), np.nan, np.float32)
+    with pytest.raises(NumericalError, match="NaN"):
+        estimate_prior(network, v_coarse, np.ones_like(v_coarse))
