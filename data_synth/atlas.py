@@ -34,7 +34,14 @@ class AtlasSubject:
 
 @dataclass(frozen=True)
 class TruthVolume:
-    """A volume to be sliced: data f32 [I, J, K] (99.5th percentile in the mask is 1, zero outside), mask, affine."""
+    """A volume to be sliced.
+
+    Args:
+        name: of the subject.
+        data: [I, J, K] float32; the 99.5th percentile in the mask is 1, outside it is zero.
+        mask: [I, J, K] the head.
+        affine: [4, 4] RAS+ mm from index.
+    """
 
     name: str
     data: NDArray[np.float32]
@@ -47,7 +54,8 @@ def find_subjects(
 ) -> list[AtlasSubject]:
     """Volumes with masks below a folder, by name.
 
-    Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or X-mask.nii.gz.
+    Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or
+    X-mask.nii.gz.
 
     Args:
         folder: the root of the tree.
@@ -158,7 +166,7 @@ def _resampled(
     spacing: NDArray[np.float64],
     spacing_mm: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float64]]:
-    """Cubic splines onto cubic voxels with the same axes; what is finer than a new voxel is smoothed first."""
+    """Cubic splines onto cubic voxels with the same axes, smoothed first where the new voxel is larger."""
     step = spacing_mm / spacing  # old voxels per new voxel
     shape = np.maximum(np.floor((np.array(data.shape) - 1) / step).astype(int) + 1, 1)
     start = ((np.array(data.shape) - 1) - (shape - 1) * step) / 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import torchio as tio
@@ -13,7 +15,7 @@ def augmentation() -> tio.Compose:
     """Left-right flips, small affine and elastic deformations, and changes of contrast and brightness."""
     return tio.Compose(
         [
-            tio.RandomFlip(axes=("LR",), flip_probability=0.5),
+            tio.RandomFlip(axes=0, flip_probability=0.5),  # left-right: truth volumes are RAS
             tio.OneOf(
                 {
                     tio.RandomAffine(
@@ -53,6 +55,7 @@ def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Genera
         image=tio.ScalarImage(tensor=torch.from_numpy(volume.data)[None], affine=volume.affine),
         mask=tio.LabelMap(tensor=torch.from_numpy(volume.mask.astype(np.uint8))[None], affine=volume.affine),
     )
+    result: Any
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**62)))
         result = transform(subject)

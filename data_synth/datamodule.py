@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from typing import Any
 
 import numba
 import torch
@@ -93,8 +94,8 @@ class StackSynthesisDataModule(LightningDataModule):
             raise InputError(f"data.phantom_share: {phantom_share:g}; expected 0 to below 1")
         if batch_size > patches_per_subject * subjects_per_epoch:
             raise InputError(
-                f"data.batch_size: {batch_size}, but an epoch has {patches_per_subject * subjects_per_epoch} patches; "
-                "raise subjects_per_epoch"
+                f"data.batch_size: {batch_size}, but an epoch has {patches_per_subject * subjects_per_epoch} "
+                "patches; raise subjects_per_epoch"
             )
         self.spacing_mm = spacing_mm
         self.train_subjects: SyntheticSubjects | None = None
@@ -104,7 +105,7 @@ class StackSynthesisDataModule(LightningDataModule):
         """Find the subjects; nothing is loaded before it is needed."""
         if self.train_subjects is not None:
             return
-        h = self.hparams
+        h: Any = self.hparams
         train, val = self._sources()
         logger.info("synthesis from %d training and %d validation subjects", len(train), len(val))
         self.train_subjects = SyntheticSubjects(
@@ -118,11 +119,11 @@ class StackSynthesisDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Shuffled patches of this epoch's subjects, a queue ahead."""
         self.setup()
-        h = self.hparams
+        h: Any = self.hparams
         assert self.train_subjects is not None
         epoch = self.trainer.current_epoch if self.trainer is not None else 0
         queue = PatchQueue(
-            self.train_subjects,
+            self.train_subjects,  # type: ignore[arg-type]  # any dataset of subjects will do
             max_length=h.patches_per_subject * min(QUEUE_SUBJECTS, h.subjects_per_epoch),
             samples_per_volume=h.patches_per_subject,
             sampler=HeadPatchSampler(h.patch_size),
@@ -142,7 +143,7 @@ class StackSynthesisDataModule(LightningDataModule):
         return tio.SubjectsLoader(self.val_volumes, batch_size=1, num_workers=0, collate_fn=collate_images)
 
     def _sources(self) -> tuple[list[AtlasSubject | PhantomSubject], list[AtlasSubject | PhantomSubject]]:
-        h = self.hparams
+        h: Any = self.hparams
         train: list[AtlasSubject | PhantomSubject]
         val: list[AtlasSubject | PhantomSubject]
         if h.source == "phantom":
@@ -182,7 +183,7 @@ class EpochSampler(Sampler[int]):
 
 
 class PatchQueue(tio.Queue):
-    """torchio's queue for subjects that are made, not listed: its length is known without asking the sampler."""
+    """torchio's queue for subjects that are made, not listed; it knows its length without the sampler."""
 
     _subjects_loader: DataLoader | None = None
 
@@ -226,7 +227,7 @@ class FixedCrops(Dataset):
         return self._made[index]
 
 
-def collate_images(subjects: list[tio.Subject]) -> dict[str, torch.Tensor]:
+def collate_images(subjects: list[Any]) -> dict[str, torch.Tensor]:
     """A plain dict of float32 tensors [B, 1, I, J, K], without torchio's nesting."""
     return {key: torch.stack([subject[key].data for subject in subjects]).float() for key in IMAGE_KEYS}
 

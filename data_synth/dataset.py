@@ -1,4 +1,4 @@
-"""Synthetic training subjects: a truth volume, sliced, mis-registered, and scattered back to V_coarse and M_rho.
+"""Synthetic training subjects: a truth volume, sliced, mis-registered, scattered back to V_coarse and M_rho.
 
 A subject is a function of (seed, epoch, index) and the settings alone, whatever process or order makes it.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,7 +47,7 @@ class PhantomSubject:
 
 @dataclass(frozen=True)
 class SyntheticSubject:
-    """What the network sees and should answer, all [I, J, K] on the truth's grid, in normalised intensities."""
+    """What the network sees and should answer, [I, J, K] on the truth's grid, in normalised intensities."""
 
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
@@ -165,7 +166,7 @@ def synthesise(truth: TruthVolume, rng: np.random.Generator) -> SyntheticSubject
 
 
 def draw_settings(residual: ResidualKind, rng: np.random.Generator) -> list[StackSettings]:
-    """Settings of one to six stacks as a clinical protocol may have them: one resolution, mostly orthogonal."""
+    """Settings of one to six stacks as a protocol may have them: one resolution, mostly orthogonal."""
     n_stacks = int(rng.choice(list(N_STACKS_SHARE), p=list(N_STACKS_SHARE.values())))
     level = LEVELS[str(rng.choice(["none", "mild", "moderate"]))]
     if residual == "gross":
@@ -192,10 +193,10 @@ def draw_settings(residual: ResidualKind, rng: np.random.Generator) -> list[Stac
 
 
 class HeadPatchSampler(tio.data.PatchSampler):
-    """Patches centred on random voxels of the mask, moved back onto the grid; the same for the same subject."""
+    """Patches centred on random voxels of the mask and moved back onto the grid; fixed by the subject."""
 
     def _generate_patches(
-        self, subject: tio.Subject, num_patches: int | None = None
+        self, subject: Any, num_patches: int | None = None
     ) -> Generator[tio.Subject, None, None]:
         rng = np.random.default_rng([*subject[SAMPLE_SEED_KEY], 1])
         inside = np.flatnonzero(subject["mask"].data[0].numpy() > 0.5)
@@ -210,8 +211,8 @@ class HeadPatchSampler(tio.data.PatchSampler):
 
 def central_crop(subject: tio.Subject, size: int) -> tio.Subject:
     """The cube of `size` voxels in the middle of a subject."""
-    first = (np.array(subject.spatial_shape) - size) // 2
-    return tio.data.PatchSampler(size).extract_patch(subject, tuple(int(n) for n in first))
+    i, j, k = ((n - size) // 2 for n in subject.spatial_shape)
+    return tio.data.PatchSampler(size).extract_patch(subject, (i, j, k))
 
 
 def _per_slice(

@@ -17,6 +17,8 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError
 
+POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
+
 
 def save_simulation(
     folder: Path,
@@ -28,10 +30,10 @@ def save_simulation(
 ) -> None:
     """Write a simulated subject.
 
-    Files: `stack-N.nii.gz` (int16) and `mask-N.nii.gz`, `truth.nii.gz` and `truth-mask.nii.gz`, `poses.tsv`
-    (a row per slice: `stack slice rx ry rz tx ty tz gain void`; a point at x by the file's header truly lies at
-    R x + t), `poses.json` (a list of `stack`, `slice`, `rotation` [3, 3], `center` [3]: the point at (x, y) mm
-    from the middle of the pixel grid truly lies at rotation (x, y, 0) + center), `simulation.json` (`record`).
+    `stack-N.nii.gz` (int16) and `mask-N.nii.gz`; `truth.nii.gz` and `truth-mask.nii.gz`; `poses.tsv`, a
+    row per slice (`POSE_COLUMNS`; a point at x by the file's header truly lies at R x + t); `poses.json`, a
+    list of `stack`, `slice`, `rotation` [3, 3], `center` [3] (the point at (x, y) mm from the middle of the
+    pixel grid truly lies at rotation (x, y, 0) + center); `simulation.json`, the record.
 
     Args:
         folder: output folder.
@@ -100,7 +102,7 @@ def _write(
     centers = []
     with (folder / "poses.tsv").open("w", newline="") as file:
         table = csv.writer(file, delimiter="\t", lineterminator="\n")
-        table.writerow("stack slice rx ry rz tx ty tz gain void".split())
+        table.writerow(list(POSE_COLUMNS))
         for number, one in enumerate(stacks):
             stack = one.stack
             counts = np.clip(np.rint(stack.image), np.iinfo(np.int16).min, np.iinfo(np.int16).max)

@@ -104,7 +104,7 @@ def about(pose: RigidPose, center_mm: Array) -> RigidPose:
 
 ResidualKind = Literal["none", "small", "gross"]
 RESIDUAL_SHARE: dict[ResidualKind, float] = {"none": 0.2, "small": 0.6, "gross": 0.2}
-"""How often a synthetic subject has which error: exact poses, good registration, registration with failures."""
+"""How often a subject has which error: exact poses, good registration, registration with failures."""
 
 
 def draw_residual_kind(rng: np.random.Generator) -> ResidualKind:
@@ -154,7 +154,7 @@ def _partly_shared(stack_id: NDArray[np.int64], rng: np.random.Generator) -> Arr
 
 
 SMOOTHING_GAIN = float(np.sqrt(2 * np.sqrt(np.pi) * 2.0))
-"""Restores the variance of white noise after a Gaussian filter of sigma 2: 1 / sum(w^2) = 2 sqrt(pi) sigma."""
+"""Restores white noise's variance after a Gaussian filter of sigma 2 (sum w^2 = 1 / (2 sqrt(pi) sigma))."""
 
 
 def _direction(rng: np.random.Generator) -> Array:

@@ -114,7 +114,7 @@ def fetal_brain_phantom(
     """
     if not AGE_RANGE_WEEKS[0] <= gestational_age_weeks <= AGE_RANGE_WEEKS[1]:
         raise InputError(
-            f"phantom: gestational age of {gestational_age_weeks:g} weeks; expected 18 to 41; choose another age"
+            f"phantom: gestational age of {gestational_age_weeks:g} weeks; expected 18 to 41 weeks"
         )
     if not 0.3 <= spacing_mm <= 3:
         raise InputError(f"phantom: voxel size of {spacing_mm:g} mm; expected 0.3 to 3 mm")
@@ -242,7 +242,7 @@ def _folded_surface(
         z - centre[2] + wobble[2],
     )
     length = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2) + np.float32(1.0)
-    u = tuple(np.float32(a) * axis / length for axis in u)
+    u = (np.float32(a) * u[0] / length, np.float32(a) * u[1] / length, np.float32(a) * u[2] / length)
     own = (u[0] * sign + np.float32(200) * sign, u[1], u[2])  # the two sides differ in detail
     # No sulci near the centre (all of them meet there) nor on the base of the brain.
     allowed = np.clip((length - np.float32(0.34 * a)) / np.float32(0.14 * a), 0, 1)
@@ -335,7 +335,7 @@ def _cerebellum(body: _Anatomy, p: Coordinates) -> tuple[Field, Field]:
     lamella = np.cos(number * angle + 0.15 * x)
     depth = np.clip(whole / np.float32(5.0 * size), 0, 1)  # 0 at the surface, 1 in the white centre
     signal = np.float32(body.cortex + 40) + 130 * depth + strength * lamella * (1 - depth) * 0.6
-    return whole - 0.5 * np.maximum(lamella, 0) * np.float32(min(1.0, strength / 120)), signal
+    return whole - 0.5 * np.maximum(lamella, 0) * np.float32(min(1.0, float(strength) / 120)), signal
 
 
 def _brainstem(body: _Anatomy, p: Coordinates) -> Field:

@@ -7,11 +7,13 @@ partial-volume weights (`coverage`) and layers a few millimetres thick need.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-Field = NDArray[np.float32]
+Field = NDArray[Any]  # float32; numpy's stubs lose the width in mixed expressions
 Coordinates = tuple[Field, Field, Field]
 
 

@@ -203,14 +203,15 @@ def _simulate_stack(
     n_slices = int(shape[2])
 
     true_pose = slice_trajectory(n_slices, settings.motion, head.center_mm, settings.interleave, rng)
+    middle = np.tile((shape - 1) / 2, (n_slices, 1))
+    middle[:, 2] = np.arange(n_slices)
     nominal = Planes(
         np.tile(frame, (n_slices, 1, 1)),
-        np.stack([np.full(n_slices, (shape[0] - 1) / 2), np.full(n_slices, (shape[1] - 1) / 2), np.arange(n_slices)], 1)
-        @ affine[:3, :3].T + affine[:3, 3],
+        middle @ affine[:3, :3].T + affine[:3, 3],
         np.tile(spacing[:2], (n_slices, 1)),
         np.tile(shape[:2], (n_slices, 1)),
-        np.tile(psf_variance_mm2(spacing[:2], settings.thickness_mm), (n_slices, 1)),
-    )  # fmt: skip
+        np.zeros((n_slices, 3)),  # the profile is the simulator's own
+    )
     planes = nominal.moved(true_pose)
     reach = _ProfileOperator(planes, head.mask_grid, None, None).forward(head.reach) > 0.01
     seen = np.flatnonzero(reach)
@@ -232,8 +233,8 @@ def _simulate_stack(
     mask3d = mask.reshape(n_slices, *shape[:2]).transpose(in_file)
     if not mask3d.any():
         raise InputError(f"simulation: {name} sees nothing of the head; use less motion or another seed")
-    image = np.ascontiguousarray(image.transpose(in_file), dtype=np.float32)
-    stack = Stack(image, np.ascontiguousarray(mask3d), affine, settings.thickness_mm, name)
+    pixels = np.ascontiguousarray(image.transpose(in_file), dtype=np.float32)
+    stack = Stack(pixels, np.ascontiguousarray(mask3d), affine, settings.thickness_mm, name)
     return SimulatedStack(stack, true_pose, gain, is_void)
 
 

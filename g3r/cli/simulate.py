@@ -98,7 +98,8 @@ def _simulate(arguments: argparse.Namespace) -> str:
         record["snr"] = "inf"  # JSON has no infinity
     save_simulation(arguments.output, truth, stacks, record, replace=arguments.force)
     n_slices = sum(len(one.true_pose) for one in stacks)
-    return f"{arguments.output}: {len(stacks)} stacks of {n_slices} slices from {truth.name}, motion {arguments.motion}"
+    made_of = f"{len(stacks)} stacks, {n_slices} slices, motion {arguments.motion}"
+    return f"{arguments.output}: {made_of}, from {truth.name}"
 
 
 if __name__ == "__main__":

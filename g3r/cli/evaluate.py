@@ -1,0 +1,123 @@
+"""`g3r-evaluate`: score a reconstruction against the truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g3r.errors import G3RError, InputError
+
+if TYPE_CHECKING:
+    from g3r.evaluation.compare import Comparison
+    from g3r.evaluation.pose_error import PoseError
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="g3r-evaluate",
+        description="Score a volume against a reference inside the reference's mask: PSNR, SSIM, NCC, RMSE "
+        "after an affine fit of the intensities.",
+    )
+    parser.add_argument("--volume", required=True, help="reconstructed volume (NIfTI)")
+    parser.add_argument("--reference", required=True, help="true volume (NIfTI)")
+    parser.add_argument("--mask", required=True, help="mask on the reference's grid (NIfTI)")
+    parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
+    parser.add_argument("--json", metavar="FILE", help="also write the scores here")
+    parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
+    parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)")
+    parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code (0 done, 2 usage, 3 bad input)."""
+    parser = build_parser()
+    options = parser.parse_args(argv)
+    if (options.poses is None) != (options.slices is None):
+        parser.error("--poses and --slices belong together")
+    logging.basicConfig(level=logging.WARNING, format="g3r-evaluate: %(message)s")
+    try:
+        comparison = _compare(options)
+        pose_error = _pose_error(options.poses, options.slices) if options.poses else None
+        print(table(comparison, pose_error))
+        if options.json:
+            _write_json(Path(options.json), comparison, pose_error)
+    except G3RError as error:
+        print(f"g3r-evaluate: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def table(comparison: Comparison, pose_error: PoseError | None = None) -> str:
+    """The scores as a few lines of text."""
+    s, alignment = comparison.scores, comparison.alignment
+    lines = [
+        f"{'PSNR dB':>8} {'SSIM':>7} {'NCC':>7} {'RMSE':>7}   voxels",
+        f"{s.psnr_db:8.2f} {s.ssim:7.4f} {s.ncc:7.4f} {s.rmse:7.4f}   {s.n_voxels}",
+    ]
+    if alignment:
+        lines.append(f"aligned: {alignment.rotation_deg:.2f} deg, {alignment.shift_mm:.2f} mm removed")
+    if pose_error:
+        lines.append(
+            f"slice poses (TRE mm): mean {pose_error.mean_mm:.2f}, median {pose_error.median_mm:.2f}, "
+            f"90th percentile {pose_error.p90_mm:.2f}; {pose_error.n_slices} slices, {pose_error.n_missing} missing"
+        )
+    return "\n".join(lines)
+
+
+def _compare(options: argparse.Namespace) -> Comparison:
+    from g3r.acquisition.images import load_mask, load_volume
+    from g3r.evaluation.compare import compare
+
+    volume, reference = load_volume(options.volume), load_volume(options.reference)
+    mask = load_mask(options.mask, reference)
+    comparison = compare(volume, reference, mask, align=options.align)
+    if options.sections:
+        from g3r.report.sections import save_sections
+
+        rows = {
+            "reference": reference.data,
+            "volume": comparison.volume * mask,
+            "error": abs(comparison.volume - reference.data) * mask,
+        }
+        save_sections(options.sections, rows, reference.affine, mask, maps=("error",))
+    return comparison
+
+
+def _pose_error(poses: str, slices: str) -> PoseError:
+    from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
+
+    true, estimated = read_poses(poses), read_poses(slices)
+    n_stacks = 1 + max(stack for stack, _ in true.keys)
+    masks = [Path(poses).parent / f"mask-{n}.nii.gz" for n in range(n_stacks)]
+    return target_registration_error(slice_points(masks), true, estimated)
+
+
+def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None) -> None:
+    """Write the scores, whole or not at all."""
+    from dataclasses import asdict
+
+    record: dict[str, object] = asdict(comparison.scores)
+    if comparison.alignment:
+        record["alignment"] = {
+            "rotation_deg": comparison.alignment.rotation_deg,
+            "shift_mm": comparison.alignment.shift_mm,
+        }
+    if pose_error:
+        record["poses"] = {k: v for k, v in vars(pose_error).items() if k != "per_slice_mm"}
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        os.replace(beside, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

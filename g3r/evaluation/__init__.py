@@ -1,0 +1,1 @@
+"""How good a reconstruction is, given the truth: image scores, rigid alignment, pose error."""

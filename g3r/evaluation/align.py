@@ -1,0 +1,197 @@
+"""Rigid alignment of a reconstruction to a reference, and resampling on the reference's grid (SimpleITK).
+
+A reconstruction is determined only up to one rigid motion of the whole head, so it is compared after
+that motion is removed. ITK thinks in LPS; everything that enters or leaves this file is RAS+.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import SimpleITK as sitk
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import Volume
+from g3r.errors import InputError
+from g3r.geometry import RigidPose, VolumeGrid
+
+logger = logging.getLogger(__name__)
+
+LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0])
+
+START_ANGLES_DEG = (-25.0, 0.0, 25.0)
+"""Start rotations about each axis; with the reach of a coarse level (about 20 degrees) they cover 45."""
+
+GOOD_ENOUGH_NCC = 0.95
+"""A start that reaches this at the coarse level is taken and the search ends."""
+
+COARSE_SHRINK = 4
+SAMPLED_SHARE = 0.15
+"""Share of the voxels that the metric looks at, on a regular lattice: same input, same result."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A rigid motion of the reference's space onto the volume's, and how well they then correlate.
+
+    Attributes:
+        volume_from_reference: one pose; maps a world point of the reference to that of the volume.
+        ncc: absolute correlation in the mask that the registration reached.
+        rotation_deg: angle of the motion.
+        shift_mm: how far the middle of the mask moves.
+    """
+
+    volume_from_reference: RigidPose
+    ncc: float
+    rotation_deg: float
+    shift_mm: float
+
+
+def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> Alignment:
+    """Find the rigid motion that best correlates a volume with the reference inside its mask.
+
+    Multi-start at a coarse level (headers as they are, centres of mass, then rotations about each
+    axis), followed by two fine levels from the best start.
+
+    Args:
+        volume: the image to be aligned; zero or not finite where it has no data.
+        reference: the image that stays.
+        mask: bool [I, J, K] on the reference's grid.
+
+    Raises:
+        InputError: no start gave an overlap, or a header is sheared.
+    """
+    fixed, moving = _to_sitk(reference), _to_sitk(volume)
+    fixed_mask = _to_sitk(Volume(mask.astype(np.float32), reference.affine, "mask"))
+    fixed_mask = sitk.Cast(fixed_mask > 0.5, sitk.sitkUInt8)
+    middle = LPS_FROM_RAS @ reference.grid.center_mm
+    best: tuple[float, sitk.Euler3DTransform] | None = None
+    for start in _starts(volume, reference, mask, middle):
+        try:
+            found = _register(fixed, moving, fixed_mask, start, levels=(COARSE_SHRINK,), n_iterations=40)
+        except RuntimeError as error:  # ITK's way to say that nothing overlapped
+            logger.debug("a start was dropped: %s", " ".join(str(error).split())[-120:])
+            continue
+        if best is None or found[0] > best[0]:
+            best = found
+        if best[0] > GOOD_ENOUGH_NCC:
+            break
+    if best is None:
+        raise InputError(
+            f"{volume.name}: cannot be aligned with {reference.name}, no start gave an overlap; "
+            "check that both show the same brain"
+        )
+    ncc, transform = _register(fixed, moving, fixed_mask, best[1], levels=(2, 1), n_iterations=200)
+    pose = _pose(transform)
+    center = LPS_FROM_RAS @ middle
+    return Alignment(
+        pose,
+        ncc,
+        rotation_deg=float(np.rad2deg(np.linalg.norm(pose.rotvec_rad()))),
+        shift_mm=float(np.linalg.norm(pose.apply(center[None])[0] - center)),
+    )
+
+
+def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | None = None) -> NDArray[np.float32]:
+    """A volume's values [I, J, K] at the voxels of another grid, by cubic B-splines; zero where it ends.
+
+    Where the grids are the same and nothing moves, the values are returned untouched.
+    """
+    same = volume.data.shape == grid.shape and np.allclose(volume.affine, grid.affine, atol=1e-4)
+    if volume_from_grid is None and same:
+        return np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
+    pose = RigidPose.identity(1) if volume_from_grid is None else volume_from_grid
+    transform = sitk.AffineTransform(3)
+    transform.SetMatrix((LPS_FROM_RAS @ pose.rotation[0] @ LPS_FROM_RAS).ravel().tolist())
+    transform.SetTranslation((LPS_FROM_RAS @ pose.translation_mm[0]).tolist())
+    target = _to_sitk(Volume(np.zeros(grid.shape, np.float32), grid.affine, "grid"))
+    moved = sitk.Resample(_to_sitk(volume), target, transform, sitk.sitkBSpline, 0.0)
+    return np.ascontiguousarray(sitk.GetArrayFromImage(moved).transpose(2, 1, 0))
+
+
+def _starts(
+    volume: Volume, reference: Volume, mask: NDArray[np.bool_], middle_lps_mm: NDArray[np.float64]
+) -> Iterator[sitk.Euler3DTransform]:
+    """Start transforms, the likeliest first."""
+    shift = LPS_FROM_RAS @ (_centroid_mm(volume) - _centroid_mm(reference))
+    yield _euler(middle_lps_mm, (0.0, 0.0, 0.0), shift)
+    yield _euler(middle_lps_mm, (0.0, 0.0, 0.0), np.zeros(3))
+    for angles in itertools.product(START_ANGLES_DEG, repeat=3):
+        if any(angles):
+            yield _euler(middle_lps_mm, tuple(np.deg2rad(angles)), shift)
+
+
+def _euler(
+    center_mm: NDArray[np.float64], angles_rad: tuple[float, ...], shift_mm: NDArray[np.float64]
+) -> sitk.Euler3DTransform:
+    transform = sitk.Euler3DTransform()
+    transform.SetCenter(center_mm.tolist())
+    transform.SetRotation(*(float(a) for a in angles_rad))
+    transform.SetTranslation(shift_mm.tolist())
+    return transform
+
+
+def _register(
+    fixed: sitk.Image,
+    moving: sitk.Image,
+    fixed_mask: sitk.Image,
+    start: sitk.Euler3DTransform,
+    *,
+    levels: tuple[int, ...],
+    n_iterations: int,
+) -> tuple[float, sitk.Euler3DTransform]:
+    """Climb from one start; returns the correlation and the transform (fixed to moving)."""
+    method = sitk.ImageRegistrationMethod()
+    method.SetMetricAsCorrelation()
+    method.SetMetricSamplingStrategy(method.REGULAR)
+    method.SetMetricSamplingPercentage(SAMPLED_SHARE)
+    method.SetMetricFixedMask(fixed_mask)
+    method.SetInterpolator(sitk.sitkLinear)
+    method.SetOptimizerAsRegularStepGradientDescent(1.0, 1e-4, n_iterations)
+    method.SetOptimizerScalesFromPhysicalShift()
+    method.SetShrinkFactorsPerLevel(levels)
+    method.SetSmoothingSigmasPerLevel([level / 2 for level in levels])
+    transform = sitk.Euler3DTransform(start)
+    method.SetInitialTransform(transform, inPlace=True)
+    method.Execute(fixed, moving)
+    # ITK minimises minus the squared correlation
+    return float(np.sqrt(max(0.0, -method.GetMetricValue()))), transform
+
+
+def _pose(transform: sitk.Euler3DTransform) -> RigidPose:
+    """The RAS pose of ITK's x -> R (x - c) + c + t in LPS."""
+    rotation = np.array(transform.GetMatrix()).reshape(3, 3)
+    center = np.array(transform.GetCenter())
+    shift = np.array(transform.GetTranslation()) + center - rotation @ center
+    return RigidPose((LPS_FROM_RAS @ rotation @ LPS_FROM_RAS)[None], (LPS_FROM_RAS @ shift)[None])
+
+
+def _centroid_mm(volume: Volume, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Centre of mass in the world (mm) of the positive intensities."""
+    weight = np.clip(np.nan_to_num(volume.data, posinf=0.0, neginf=0.0), 0, None).astype(np.float64)
+    if mask is not None:
+        weight *= mask
+    total = weight.sum()
+    if total <= 0:
+        return volume.grid.center_mm
+    others = ((1, 2), (0, 2), (0, 1))
+    index = [weight.sum(other) @ np.arange(n) / total for n, other in zip(weight.shape, others, strict=True)]
+    return volume.grid.world(index)
+
+
+def _to_sitk(volume: Volume) -> sitk.Image:
+    """The ITK image of a RAS volume; values that are not finite become 0, as where there is no data."""
+    spacing = volume.grid.spacing_mm
+    direction = LPS_FROM_RAS @ volume.affine[:3, :3] / spacing
+    if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:
+        raise InputError(f"{volume.name}: header is sheared (axes not orthogonal); resample it on an ordinary grid")
+    data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0).astype(np.float32)
+    image = sitk.GetImageFromArray(np.ascontiguousarray(data.transpose(2, 1, 0)))
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection(direction.ravel().tolist())
+    image.SetOrigin((LPS_FROM_RAS @ volume.affine[:3, 3]).tolist())
+    return image

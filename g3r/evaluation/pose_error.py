@@ -1,0 +1,144 @@
+"""Error of estimated slice poses: target registration error after one common motion is removed."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import load_volume
+from g3r.errors import InputError
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import fit_rigid
+
+POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+FEWEST_PIXELS = 30
+"""Slices with fewer mask pixels are left out: no method can place them, and they hold no anatomy."""
+
+POINTS_PER_SLICE = 64
+
+ROBUST_SCALE_MM = 2.0
+"""Cauchy scale of the common motion's fit: a few gross slices must not tilt it."""
+
+SliceKey = tuple[int, int]
+"""Stack number and slice index along the third axis of the stack's file."""
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """Slice poses as files hold them: a point at x by the stack's header is taken to be at R x + t."""
+
+    keys: tuple[SliceKey, ...]
+    pose: RigidPose
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Target registration error over slices (mm), each slice the mean over its points.
+
+    Attributes:
+        mean_mm, median_mm, p90_mm: over the slices that were compared.
+        n_slices: how many those are.
+        n_missing: slices with brain in them that have no estimate.
+        per_slice_mm: error of each slice.
+    """
+
+    mean_mm: float
+    median_mm: float
+    p90_mm: float
+    n_slices: int
+    n_missing: int
+    per_slice_mm: Mapping[SliceKey, float]
+
+
+def read_poses(path: str | os.PathLike[str]) -> PoseTable:
+    """Read a table of slice poses (`slices.tsv`, `poses.tsv`): stack slice rx ry rz tx ty tz (rad, mm).
+
+    Raises:
+        InputError: no such file, a column is missing, a value is no number, or a slice stands there twice.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a table of slice poses (.tsv)")
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream, delimiter="\t"))
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path.name}: is not a text table; expected tab-separated slice poses") from None
+    missing = [c for c in ("stack", "slice", *POSE_COLUMNS) if not rows or c not in rows[0]]
+    if missing:
+        raise InputError(f"{path.name}: has no column {', '.join(missing)}; expected a tab-separated pose table")
+    try:
+        keys = tuple((int(row["stack"]), int(row["slice"])) for row in rows)
+        values = np.array([[float(row[c]) for c in POSE_COLUMNS] for row in rows])
+        pose = RigidPose.from_rotvec(values[:, :3], values[:, 3:])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path.name}: a pose cannot be read ({error}); expected finite numbers") from None
+    if len(set(keys)) < len(keys):
+        raise InputError(f"{path.name}: names a slice twice; expected one row per slice")
+    return PoseTable(keys, pose)
+
+
+def slice_points(mask_paths: Sequence[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
+    """Where the headers put the brain: up to ~128 points [n, 3] (mm) of each slice with enough mask."""
+    points: dict[SliceKey, NDArray[np.float64]] = {}
+    for stack, path in enumerate(mask_paths):
+        mask = load_volume(path)
+        inside = np.nan_to_num(mask.data) > 0.5
+        for k in np.flatnonzero(inside.sum((0, 1)) >= FEWEST_PIXELS):
+            index = np.argwhere(inside[:, :, k])
+            index = index[:: max(1, len(index) // POINTS_PER_SLICE)]
+            points[stack, int(k)] = mask.grid.world(np.c_[index, np.full(len(index), k)])
+    return points
+
+
+def target_registration_error(
+    points_mm: Mapping[SliceKey, NDArray[np.float64]], true: PoseTable, estimated: PoseTable
+) -> PoseError:
+    """Distance between where slices are and where they are thought to be, up to one common rigid motion.
+
+    Args:
+        points_mm: points of each slice by the header, as `slice_points` gives them; slices without an entry
+            here or without a true pose are not judged.
+        true: the poses the slices were simulated with.
+        estimated: the poses that were found.
+
+    Raises:
+        InputError: no slice is in all three.
+    """
+    true_row = {key: n for n, key in enumerate(true.keys)}
+    estimated_row = {key: n for n, key in enumerate(estimated.keys)}
+    judged = [key for key in points_mm if key in true_row]
+    keys = [key for key in judged if key in estimated_row]
+    if not keys:
+        raise InputError("pose tables have no slice in common; check that they belong to the same stacks")
+    count = [len(points_mm[key]) for key in keys]
+    header = np.concatenate([points_mm[key] for key in keys])
+    owner = np.repeat(np.arange(len(keys)), count)
+    target = _place(header, true.pose.take([true_row[key] for key in keys]), owner)
+    found = _place(header, estimated.pose.take([estimated_row[key] for key in keys]), owner)
+    weight = np.ones(len(header))
+    for _ in range(10):
+        common = fit_rigid(found, target, weight)
+        distance = np.linalg.norm(common.apply(found[None])[0] - target, axis=1)
+        weight = 1 / (1 + (distance / ROBUST_SCALE_MM) ** 2)
+    per_slice = np.bincount(owner, distance) / np.bincount(owner)
+    return PoseError(
+        mean_mm=float(per_slice.mean()),
+        median_mm=float(np.median(per_slice)),
+        p90_mm=float(np.percentile(per_slice, 90)),
+        n_slices=len(keys),
+        n_missing=len(judged) - len(keys),
+        per_slice_mm=dict(zip(keys, per_slice.tolist(), strict=True)),
+    )
+
+
+def _place(points_mm: NDArray[np.float64], pose: RigidPose, owner: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Move each point [P, 3] by the pose of the slice that owns it."""
+    return np.einsum("pij,pj->pi", pose.rotation[owner], points_mm) + pose.translation_mm[owner]

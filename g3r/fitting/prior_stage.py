@@ -1,0 +1,122 @@
+"""Stage 1 (G3R Eq. 8): the Gaussians take the shape of the prior volume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Planes, volume_planes
+from g3r.fitting.losses import scale_regulariser, weighted_l1
+from g3r.fitting.parameters import CloudParameters, LearningRates
+from g3r.fitting.schedules import cosine_decay
+from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
+from g3r.geometry import VolumeGrid
+
+PAIR_MARGIN_SIGMA = 0.5
+"""Pair lists are built this much beyond the cut-off and stay in use for several steps."""
+
+NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
+
+
+@dataclass(frozen=True)
+class PriorStageSettings:
+    """How stage 1 runs.
+
+    Args:
+        n_steps: optimiser steps after the peaks are solved for.
+        peak_iterations: conjugate-gradient steps for the peaks.
+        plane_share: share of the volume's planes in a step.
+        scale_weight: weight of the scale regulariser.
+        steps_per_pair_list: steps between two searches for pairs.
+    """
+
+    n_steps: int = 30
+    peak_iterations: int = 12
+    plane_share: float = 0.34
+    scale_weight: float = 0.01
+    steps_per_pair_list: int = 10
+
+
+@dataclass(frozen=True)
+class VolumeTarget:
+    """A volume as planes with pixels: what stage 1 fits and what stage 2 is distilled towards.
+
+    planes [K] cover the bounding box of the mask; value [P] and weight [P] are the volume and its trust there.
+    """
+
+    planes: Planes
+    value: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, volume: NDArray[np.float32], weight: NDArray[np.float32], grid: VolumeGrid) -> VolumeTarget:
+        """Planes of a volume [I, J, K], cropped to where the weight [I, J, K] is positive.
+
+        Raises:
+            ValueError: the weight is zero everywhere.
+        """
+        inside = np.argwhere(weight > 0)
+        if not len(inside):
+            raise ValueError("the weight is zero everywhere")
+        low, high = inside.min(0), inside.max(0) + 1
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        affine = grid.affine.copy()
+        affine[:3, 3] = grid.world(low)
+        cropped = VolumeGrid(tuple(high - low), affine)
+
+        def pixels(array: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.ascontiguousarray(array[box].transpose(2, 0, 1)).ravel().astype(np.float32)
+
+        return cls(volume_planes(cropped), pixels(volume), pixels(weight))
+
+    def take(self, index: NDArray[np.integer]) -> VolumeTarget:
+        """Some of the planes with their pixels."""
+        size = int(self.planes.offset[1])  # all planes of a volume are alike
+        pixels = (index[:, None] * size + np.arange(size)).ravel()
+        return VolumeTarget(self.planes.take(index), self.value[pixels], self.weight[pixels])
+
+
+def fit_prior(
+    cloud: GaussianCloud,
+    target: VolumeTarget,
+    settings: PriorStageSettings,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = NO_PROGRESS,
+) -> tuple[GaussianCloud, list[float]]:
+    """Fit a seeded cloud to the prior volume.
+
+    Peaks first, by least squares on every second plane; then Adam on everything with the L1 loss on random
+    planes and the scale regulariser.
+
+    Returns:
+        The fitted cloud, and the image loss of each step.
+    """
+    cloud = solve_peaks_on(cloud, target.take(np.arange(0, len(target.planes), 2)), settings.peak_iterations)
+    parameters = CloudParameters(cloud, LearningRates())
+    seed_log_scale = cloud.log_scale.clone()
+    history = []
+    n_planes = max(1, round(settings.plane_share * len(target.planes)))
+    for step in range(settings.n_steps):
+        progress(step, settings.n_steps)
+        if step % settings.steps_per_pair_list == 0:
+            chosen = np.sort(rng.choice(len(target.planes), n_planes, replace=False))
+            part = target.take(chosen)
+            value, weight = torch.from_numpy(part.value), torch.from_numpy(part.weight)
+            pairs = find_pairs(parameters.cloud().detach(), part.planes, 3.2 + PAIR_MARGIN_SIGMA)
+        parameters.set_factor(cosine_decay(step / settings.n_steps))
+        current = parameters.cloud()
+        image = weighted_l1(render(current, part.planes, pairs=pairs), value, weight)
+        loss = image + settings.scale_weight * scale_regulariser(current.log_scale, seed_log_scale)
+        parameters.step(loss)
+        history.append(image.item())
+    progress(settings.n_steps, settings.n_steps)
+    return parameters.cloud().detach(), history
+
+
+def solve_peaks_on(cloud: GaussianCloud, target: VolumeTarget, n_iterations: int) -> GaussianCloud:
+    """Peaks of a cloud by least squares on the planes of a volume."""
+    return solve_peaks(cloud, target.planes, target.value, target.weight, n_iterations=n_iterations)

@@ -1,0 +1,47 @@
+"""How weights and step sizes change during a fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class AnnealedWeight:
+    """w(i): `start` until tau_1, linear to `end` at tau_2, `end` from there (G3R Eq. 9).
+
+    Args:
+        start, end: weights, not negative.
+        tau_1, tau_2: fractions of the fit in [0, 1], tau_1 <= tau_2; equal makes a step.
+
+    Raises:
+        ValueError: a negative weight, or fractions reversed or outside [0, 1].
+    """
+
+    start: float
+    end: float
+    tau_1: float = 0.2
+    tau_2: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not (self.start >= 0 and self.end >= 0 and math.isfinite(self.start) and math.isfinite(self.end)):
+            raise ValueError(f"weights {self.start}, {self.end}; expected finite and not negative")
+        if not 0 <= self.tau_1 <= self.tau_2 <= 1:
+            raise ValueError(f"tau_1 {self.tau_1}, tau_2 {self.tau_2}; expected 0 <= tau_1 <= tau_2 <= 1")
+
+    def at(self, fraction: float) -> float:
+        """The weight at a fraction of the fit."""
+        if fraction < self.tau_1:
+            return self.start
+        if fraction >= self.tau_2:
+            return self.end
+        along = (fraction - self.tau_1) / (self.tau_2 - self.tau_1)
+        return self.start + along * (self.end - self.start)
+
+
+def cosine_decay(fraction: float, hold: float = 0.4, floor: float = 0.05) -> float:
+    """Step size factor: 1 until `hold`, then half a cosine down to `floor` at the end."""
+    if fraction < hold:
+        return 1.0
+    along = (fraction - hold) / (1 - hold)
+    return floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * along))

@@ -1,0 +1,237 @@
+"""Slices against volumes whose slices are known in closed form, and poses against sampling."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from data_synth.motion import (
+    LEVELS,
+    MotionLevel,
+    acquisition_order,
+    draw_residual_kind,
+    residual_errors,
+    slice_trajectory,
+)
+from data_synth.simulator import (
+    SimulatedStack,
+    StackSettings,
+    orthogonal_settings,
+    simulate_stacks,
+)
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.errors import InputError
+from g3r.geometry import VolumeGrid
+
+CLEAN = StackSettings(snr=np.inf, bias=0.0, gain_deviation=0.0)
+N, VOXEL_MM = 56, 1.0
+AFFINE = np.diag([VOXEL_MM, VOXEL_MM, VOXEL_MM, 1.0])
+AFFINE[:3, 3] = [-20.0, -35.0, 10.0]  # no special origin
+GRID = VolumeGrid((N, N, N), AFFINE)
+WORLD = GRID.world(np.stack(np.meshgrid(*[np.arange(N)] * 3, indexing="ij"), -1))
+BALL = np.linalg.norm(WORLD - GRID.center_mm, axis=-1) < 22
+LEVEL = replace(LEVELS["moderate"], offset_mm=2.0)
+
+
+def true_points_mm(one: SimulatedStack) -> np.ndarray:
+    """Where each pixel truly lies [I, J, K, 3]."""
+    shape = one.stack.image.shape
+    header = one.stack.grid.world(np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1))
+    return one.true_pose.apply(header.transpose(2, 0, 1, 3)).transpose(1, 2, 0, 3)
+
+
+def deep(one: SimulatedStack, radius_mm: float = 15.0) -> np.ndarray:
+    """Pixels whose profile stays well inside the ball."""
+    return np.linalg.norm(true_points_mm(one) - GRID.center_mm, axis=-1) < radius_mm
+
+
+@pytest.mark.parametrize("profile", ["box", "gaussian"])
+def test_a_ramp_is_seen_as_it_is(profile: str) -> None:
+    # any symmetric profile of unit integral leaves a linear function unchanged
+    slope = np.array([3.0, -2.0, 5.0])
+    volume = (500 + (WORLD - GRID.center_mm) @ slope).astype(np.float32)
+    settings = [
+        replace(CLEAN, orientation=o, motion=LEVEL, profile=profile, gap_mm=0.7, oblique_deg=8)
+        for o in ("axial", "coronal", "sagittal", "random")
+    ]
+    for one in simulate_stacks(volume, BALL, AFFINE, settings, np.random.default_rng(0)):
+        inside = deep(one)
+        expected = 500 + (true_points_mm(one) - GRID.center_mm) @ slope
+        assert inside.sum() > 1000
+        np.testing.assert_allclose(one.stack.image[inside], expected[inside], atol=2e-3)
+
+
+@pytest.mark.parametrize("profile", ["box", "gaussian"])
+@pytest.mark.parametrize("thickness_mm", [2.2, 4.0])
+def test_a_blob_keeps_its_integral_and_widens_by_the_profile(profile: str, thickness_mm: float) -> None:
+    sigma_mm = 4.5
+    offset = WORLD - GRID.center_mm
+    volume = (1000 * np.exp(-0.5 * (offset**2).sum(-1) / sigma_mm**2)).astype(np.float32)
+    settings = replace(CLEAN, motion=LEVEL, profile=profile, thickness_mm=thickness_mm, resolution_mm=1.1)
+    (one,) = simulate_stacks(volume, BALL, AFFINE, [settings], np.random.default_rng(1))
+    variance = psf_variance_mm2([1.1, 1.1], thickness_mm)
+    if profile == "box":
+        variance[2] = thickness_mm**2 * (1 + 0.2**2) / 12
+    observed = sigma_mm**2 + variance
+    d = np.einsum(
+        "ijkw,kwf->ijkf", true_points_mm(one) - GRID.center_mm, one.true_pose.rotation
+    )  # axial frame
+    expected = 1000 * np.sqrt(sigma_mm**6 / observed.prod()) * np.exp(-0.5 * (d**2 / observed).sum(-1))
+    inside = deep(one)
+    # quadrature, trilinear reading that blurs a voxel's corner and middle differently, and the box's own shape
+    np.testing.assert_allclose(one.stack.image[inside], expected[inside], atol=8)
+    assert abs(one.stack.image[inside].mean() / expected[inside].mean() - 1) < 2e-3
+
+
+def smooth_volume(seed: int = 0) -> np.ndarray:
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=(N, N, N)), 4.0)
+    return (500 + 150 * noise / noise.std()).astype(np.float32)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_sampling_the_truth_at_the_true_poses_gives_the_slices(fine: bool) -> None:
+    volume = smooth_volume()
+    settings = [
+        replace(CLEAN, orientation=o, motion=LEVELS["severe"], thickness_mm=1.0, gap_mm=2.0, interleave=3)
+        for o in ("axial", "sagittal")
+    ]
+    settings = [replace(s, motion=replace(s.motion, dropout_share=0.0)) for s in settings]
+    for one in simulate_stacks(volume, BALL, AFFINE, settings, np.random.default_rng(2), fine=fine):
+        inside = deep(one)
+        expected = map_coordinates(volume, GRID.index(true_points_mm(one)[inside]).T, order=3)
+        error = one.stack.image[inside] - expected
+        assert np.sqrt((error**2).mean()) < 0.02 * expected.std()
+
+
+def test_without_motion_the_header_is_the_truth() -> None:
+    settings = orthogonal_settings(3, "none", gap_mm=0.5, snr=np.inf)
+    for one in simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(3)):
+        np.testing.assert_array_equal(
+            one.true_pose.rotation, np.broadcast_to(np.eye(3), one.true_pose.rotation.shape)
+        )
+        np.testing.assert_allclose(one.true_pose.translation_mm, 0, atol=1e-12)
+        np.testing.assert_allclose(one.stack.spacing_mm, [0.8, 0.8, 2.7])
+        assert one.stack.thickness_mm == 2.2
+        at = GRID.index(true_points_mm(one))
+        near = np.linalg.norm(true_points_mm(one) - GRID.center_mm, axis=-1)
+        assert one.stack.mask[near < 20.5].all()
+        assert not one.stack.mask[near > 23.5].any()
+        assert at.shape[-1] == 3
+
+
+def test_orientations_and_handedness() -> None:
+    settings = [replace(CLEAN, orientation=o) for o in ("axial", "coronal", "sagittal", "random")]
+    stacks = simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(4))
+    for one, normal in zip(stacks, ([0, 0, 1], [0, -1, 0], [1, 0, 0], None), strict=True):
+        axes = one.stack.affine[:3, :3] / one.stack.spacing_mm
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) > 0
+        if normal is not None:
+            np.testing.assert_allclose(axes[:, 2], normal, atol=1e-12)
+
+
+def test_generator_decides_everything() -> None:
+    def make(seed: int, n: int = 2) -> list[SimulatedStack]:
+        state = np.random.get_state()[1].copy()  # noqa: NPY002 - the global state must stay untouched
+        settings = orthogonal_settings(n, "severe")
+        stacks = simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(seed))
+        np.testing.assert_array_equal(state, np.random.get_state()[1])  # noqa: NPY002
+        return stacks
+
+    first, again, other = make(5), make(5, 3), make(6)
+    for a, b in zip(first, again, strict=False):  # a stack does not depend on how many follow it
+        np.testing.assert_array_equal(a.stack.image, b.stack.image)
+        np.testing.assert_array_equal(a.true_pose.translation_mm, b.true_pose.translation_mm)
+    assert np.abs(first[0].true_pose.translation_mm - other[0].true_pose.translation_mm).max() > 0.1
+
+
+def test_noise_gain_and_voids() -> None:
+    volume = np.full((N, N, N), 500, np.float32)
+    level = MotionLevel(dropout_share=0.3)
+    noisy = StackSettings(motion=level, snr=20.0, bias=0.0, gain_deviation=0.1, gap_mm=0.0, thickness_mm=2.0)
+    (one,) = simulate_stacks(volume, BALL, AFFINE, [noisy], np.random.default_rng(7))
+    assert 1 <= one.is_void.sum() < len(one.is_void)
+    assert (one.gain[one.is_void] < 0.7).all()
+    inside = deep(one)
+    for k in np.flatnonzero(inside.sum((0, 1)) > 200):
+        values = one.stack.image[:, :, k][inside[:, :, k]]
+        assert abs(values.mean() - 500 * one.gain[k]) < 4
+        assert abs(values.std() - 500 / 40) < 2
+    background = one.stack.image[:, :, 0][:5, :5]
+    assert 5 < background.mean() < 30  # Rayleigh
+
+
+def test_bright_rim_outside_the_mask_is_not_needed() -> None:
+    far = np.where(BALL, 500, 0).astype(np.float32)
+    (one,) = simulate_stacks(far, BALL, AFFINE, [CLEAN], np.random.default_rng(8))
+    assert one.stack.image[~one.stack.mask].min() == 0
+    assert one.stack.image[deep(one)].min() > 499
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"thickness_mm": 0.0}, {"resolution_mm": -1.0}, {"gap_mm": -0.1}, {"snr": 0.0}, {"bias": float("nan")}],
+)
+def test_impossible_settings(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        StackSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_empty_mask_and_unknown_motion() -> None:
+    with pytest.raises(InputError, match="mask is empty"):
+        simulate_stacks(smooth_volume(), np.zeros_like(BALL), AFFINE, [CLEAN], np.random.default_rng(0))
+    with pytest.raises(InputError, match="moderate"):
+        orthogonal_settings(3, "wild")
+
+
+class TestMotion:
+    @pytest.mark.parametrize("interleave", [1, 2, 3])
+    def test_every_slice_is_taken_once(self, interleave: int) -> None:
+        order = acquisition_order(11, interleave)
+        assert sorted(order) == list(range(11))
+        assert (np.diff(order)[: 11 // interleave - 1] == interleave).all()
+
+    def test_neighbours_in_time_move_together(self) -> None:
+        level = MotionLevel(walk_mm=1.0, walk_deg=1.0)
+        rng = np.random.default_rng(0)
+        pose = slice_trajectory(200, level, np.zeros(3), 2, rng)
+        in_time = pose.translation_mm[acquisition_order(200, 2)]
+        assert 0.8 < np.diff(in_time, axis=0).std() < 1.2
+        assert np.abs(in_time.mean(0)).max() < 0.5
+
+    def test_a_jerk_lasts(self) -> None:
+        level = MotionLevel(n_jerks=1, jerk_mm=5.0)
+        pose = slice_trajectory(30, level, np.zeros(3), 1, np.random.default_rng(1))
+        steps = np.linalg.norm(np.diff(pose.translation_mm, axis=0), axis=1)
+        assert (steps > 1e-9).sum() == 1
+
+    def test_the_head_turns_about_its_centre(self) -> None:
+        center = np.array([30.0, -20.0, 50.0])
+        level = MotionLevel(offset_deg=20.0)
+        pose = slice_trajectory(8, level, center, 2, np.random.default_rng(2))
+        np.testing.assert_allclose(pose.apply(np.tile(center, (8, 1))), np.tile(center, (8, 1)), atol=1e-9)
+
+    def test_residual_errors_have_the_stated_size(self) -> None:
+        stack_id, center = np.repeat([0, 1, 2], 40), np.random.default_rng(3).normal(size=(120, 3)) * 20
+        lengths, angles = [], []
+        for seed in range(40):
+            error = residual_errors("small", stack_id, center, np.random.default_rng(seed))
+            moved = np.linalg.norm(error.apply(center) - center, axis=1)
+            lengths.append(np.sqrt((moved**2).mean()))
+            angles.append(np.degrees(np.sqrt((error.rotvec_rad() ** 2).sum(1).mean())))
+        assert min(lengths) > 0.2
+        assert max(lengths) < 1.2
+        assert 0.55 < np.mean(lengths) < 0.75
+        assert 0.9 < np.mean(angles) < 1.1
+        assert (
+            np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max()
+            == 0
+        )
+        gross = residual_errors("gross", stack_id, center, np.random.default_rng(0))
+        assert 2.0 < np.linalg.norm(gross.apply(center) - center, axis=1).max() < 20
+
+    def test_shares_of_residual_kinds(self) -> None:
+        rng = np.random.default_rng(4)
+        kinds = [draw_residual_kind(rng) for _ in range(2000)]
+        assert abs(kinds.count("small") / 2000 - 0.6) < 0.04
