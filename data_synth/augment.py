@@ -24,7 +24,7 @@ def augmentation() -> tio.Compose:
                         translation=0,
                         image_interpolation="bspline",
                         default_pad_value=0,
-                    ): 0.6,
+                    ): 0.75,
                     tio.RandomAffineElasticDeformation(
                         affine_kwargs={
                             "scales": 0.08,
@@ -34,10 +34,10 @@ def augmentation() -> tio.Compose:
                         },
                         elastic_kwargs={
                             "num_control_points": 7,
-                            "max_displacement": 4.0,
+                            "max_displacement": 2.5,
                             "locked_borders": 2,
                         },
-                    ): 0.4,
+                    ): 0.25,
                 }
             ),
             tio.RandomGamma(log_gamma=(-0.35, 0.35), p=0.8),

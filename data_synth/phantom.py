@@ -244,9 +244,11 @@ def _folded_surface(
     length = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2) + np.float32(1.0)
     u = (np.float32(a) * u[0] / length, np.float32(a) * u[1] / length, np.float32(a) * u[2] / length)
     own = (u[0] * sign + np.float32(200) * sign, u[1], u[2])  # the two sides differ in detail
-    # No sulci near the centre (all of them meet there) nor on the base of the brain.
+    # No sulci near the centre (all of them meet there), on the base, or into the deep nuclei.
     allowed = np.clip((length - np.float32(0.34 * a)) / np.float32(0.14 * a), 0, 1)
     allowed *= np.clip((z + np.float32(0.42 * a)) / np.float32(0.22 * a), 0.15, 1)
+    core = ellipsoid((side, y, z), (0, 0, -0.05 * a), (0.5 * a, 0.5 * b, 0.42 * a))
+    allowed *= np.clip(-core / np.float32(0.08 * a), 0, 1)
     for wavelength, depth, weight in (
         (0.72 * a, body.depth_primary, 0.45),
         (0.40 * a, body.depth_secondary, 0.6),

@@ -22,7 +22,8 @@ def ellipsoid(p: Coordinates, center_mm: tuple[float, ...], radius_mm: tuple[flo
     q = [(axis - np.float32(c)) / np.float32(r) for axis, c, r in zip(p, center_mm, radius_mm, strict=True)]
     k0 = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
     k1 = np.sqrt(sum((axis / np.float32(r)) ** 2 for axis, r in zip(q, radius_mm, strict=True)))
-    return (1 - k0) * k0 / np.maximum(k1, np.float32(1e-6))
+    depth = k0 / np.maximum(k1, np.float32(1e-6))  # 0 / 0 at the centre, where the smallest radius is meant
+    return (1 - k0) * np.where(k0 < 1e-6, np.float32(min(radius_mm)), depth)
 
 
 def tube(p: Coordinates, points_mm: list[tuple[float, ...]], radius_mm: list[float]) -> Field:

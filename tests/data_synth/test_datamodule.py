@@ -11,12 +11,12 @@ import torch
 pytest.importorskip("lightning")
 pytest.importorskip("torchio")
 
-from data_synth.atlas import cropped, find_subjects, load_subject  # noqa: E402
-from data_synth.augment import augmentation, augmented  # noqa: E402
-from data_synth.datamodule import EpochSampler, StackSynthesisDataModule  # noqa: E402
-from data_synth.dataset import PhantomSubject, SyntheticSubjects, synthesise  # noqa: E402
-from data_synth.phantom import fetal_brain_phantom  # noqa: E402
-from g3r.errors import InputError  # noqa: E402
+from data_synth.atlas import cropped, find_subjects, load_subject
+from data_synth.augment import augmentation, augmented
+from data_synth.datamodule import EpochSampler, StackSynthesisDataModule
+from data_synth.dataset import PhantomSubject, SyntheticSubjects, synthesise
+from data_synth.phantom import fetal_brain_phantom
+from g3r.errors import InputError
 
 SPACING_MM = 2.0
 TINY = {
@@ -24,7 +24,7 @@ TINY = {
     "patch_size": 24,
     "patches_per_subject": 4,
     "batch_size": 2,
-    "subjects_per_epoch": 3,
+    "subjects_per_epoch": 2,
     "val_subjects": 2,
     "val_crop": 40,
 }
@@ -58,9 +58,9 @@ def atlas(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_batches_of_training_and_validation() -> None:
     data = StackSynthesisDataModule("phantom", **TINY)
     loader = data.train_dataloader()
-    assert len(loader) == 6
+    assert len(loader) == 4
     batches = list(loader)
-    assert len(batches) == 6
+    assert len(batches) == 4
     for batch in batches:
         assert type(batch) is dict
         assert list(batch) == ["coarse", "density", "truth", "mask"]
@@ -74,7 +74,7 @@ def test_batches_of_training_and_validation() -> None:
         assert float(batch["coarse"].max()) < 3
         assert bool((batch["mask"].sum((1, 2, 3, 4)) > 100).all())
     second_epoch = list(loader)
-    assert len(second_epoch) == 6
+    assert len(second_epoch) == 4
     assert not torch.equal(second_epoch[0]["truth"], batches[0]["truth"])
 
     first, again = list(data.val_dataloader()), list(data.val_dataloader())
@@ -115,7 +115,7 @@ def test_synthesis_leaves_the_global_generator_alone() -> None:
 
 def test_coarse_and_truth_share_grid_and_scale() -> None:
     dataset = make_dataset(augment=False)
-    for index in range(4):
+    for index in range(3):
         one = dataset.sample(0, index)
         seen = one.mask & (one.density > 0.5)
         assert seen.sum() > 0.3 * one.mask.sum()
@@ -132,9 +132,7 @@ def test_epoch_sampler_goes_on() -> None:
 
 
 def test_augmentation_keeps_a_head() -> None:
-    made = PhantomSubject("x", 26.0, 0)
     volume = make_dataset()._volume(0)
-    assert made.weeks == 26.0
     transform = augmentation()
     for seed in range(4):
         varied = augmented(volume, transform, np.random.default_rng(seed))
@@ -188,7 +186,7 @@ def test_training_on_a_folder(atlas: Path) -> None:
     "wrong", [{"patch_size": 0}, {"phantom_share": 1.0}, {"batch_size": 99}, {"source": "/no/such/folder"}]
 )
 def test_bad_settings_say_so(wrong: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="expected|raise"):
+    with pytest.raises(InputError, match=r"expected|raise"):
         StackSynthesisDataModule(**{**TINY, **wrong}).setup()
 
 
