@@ -1,0 +1,65 @@
+"""What the presets mean: one record of settings for the whole reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from g3r.fitting.prior_stage import PriorStageSettings
+from g3r.fitting.slice_stage import SliceStageSettings
+from g3r.motion import MotionSettings
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """Everything that decides a result, besides the data and the prior's weights.
+
+    Args:
+        resolution_mm: voxel size of the volume.
+        gaussian_spacing_mm: cell edge per Gaussian where the image has structure.
+        flat_gradient: gradient (normalised intensity per mm) below which Gaussians stand twice as far apart.
+        motion: registration.
+        prior_stage: stage 1.
+        slice_stage: stage 2.
+        use_prior: False seeds from V_coarse and leaves distillation out.
+        distillation: False uses the prior for the start alone.
+        seed: of every random choice.
+    """
+
+    resolution_mm: float = 0.8
+    gaussian_spacing_mm: float = 2.0
+    flat_gradient: float = 0.0
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
+    slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
+    use_prior: bool = True
+    distillation: bool = True
+    seed: int = 0
+
+
+_BALANCED = ReconstructionSettings()
+
+PRESETS: dict[str, ReconstructionSettings] = {
+    "draft": replace(
+        _BALANCED,
+        gaussian_spacing_mm=2.8,
+        motion=replace(_BALANCED.motion, n_rounds=6, finest_voxel_mm=1.6, pixels_at_most=200_000),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=15),
+    ),
+    "fast": replace(
+        _BALANCED,
+        gaussian_spacing_mm=2.4,
+        motion=replace(_BALANCED.motion, n_rounds=9, finest_voxel_mm=1.4),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=30),
+    ),
+    "balanced": _BALANCED,
+    "accurate": replace(
+        _BALANCED,
+        gaussian_spacing_mm=1.8,
+        motion=replace(_BALANCED.motion, n_rounds=20),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=160),
+    ),
+}
+"""Settings by name, from quick to careful."""

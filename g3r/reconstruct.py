@@ -1,0 +1,239 @@
+"""GaussianReconstructor: the pipeline from stacks to a volume, a screen of calls."""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r._version import __version__
+from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.planes import Slices, slices_from_stacks, volume_from_pixels, volume_planes
+from g3r.acquisition.scatter import coarse_and_density, normalisation_scale
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError, NumericalError
+from g3r.fitting.prior_stage import VolumeTarget, fit_prior
+from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.gaussians import render
+from g3r.gaussians.seeding import seed_cloud
+from g3r.geometry import VolumeGrid
+from g3r.motion import MotionEstimate, estimate_motion
+from g3r.motion.volume import grid_around
+from g3r.presets import PRESETS, ReconstructionSettings
+from g3r.prior import PriorCheckpoint, estimate_prior, load_prior
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.result import ReconstructionResult
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "prior.pt"
+
+RESOLUTION_RANGE_MM = (0.3, 3.0)
+
+UNSURE_NCC = 0.4
+"""Median correlation of a stack's slices with the volume below which its poses are called unsure."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+@dataclass
+class GaussianReconstructor:
+    """Reconstructs subjects with one prior and one set of settings.
+
+    Args:
+        checkpoint: prior file written by g3r-export; the weights that ship with the package when None.
+        settings: see `ReconstructionSettings`, or the name of a preset.
+        progress: called with (stage, done, total) as each stage goes on.
+
+    Raises:
+        InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
+    """
+
+    checkpoint: str | os.PathLike[str] | None = None
+    settings: ReconstructionSettings | str = "balanced"
+    progress: Progress = lambda stage, done, total: None
+    network: DensityGatedPriorNetwork | None = field(init=False, default=None)
+    prior_meta: PriorCheckpoint | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.settings, str):
+            if self.settings not in PRESETS:
+                raise InputError(f"preset {self.settings!r}; expected one of {', '.join(PRESETS)}")
+            self.settings = PRESETS[self.settings]
+        low, high = RESOLUTION_RANGE_MM
+        if not low <= self.settings.resolution_mm <= high:
+            raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
+        if self.settings.use_prior:
+            self.network, self.prior_meta = load_prior(self.checkpoint or DEFAULT_CHECKPOINT)
+
+    def reconstruct(self, stacks: Sequence[Stack]) -> ReconstructionResult:
+        """The volume, maps, poses and record of one subject.
+
+        Raises:
+            InputError: stacks that cannot be used.
+            NumericalError: a fit that broke down.
+        """
+        assert isinstance(self.settings, ReconstructionSettings)
+        settings, clock, notes, warnings = self.settings, _Clock(), [], []
+        rng = np.random.default_rng(settings.seed)
+        slices = slices_from_stacks(stacks)
+        first_scale = _percentile_scale(slices)
+        slices = slices.scaled(1 / first_scale)
+        if len(stacks) == 1:
+            # a single stack says nothing about where its slices are relative to each other across planes;
+            # registered to a volume made of themselves they drift
+            settings = replace(
+                settings,
+                motion=replace(settings.motion, stacks=False, n_rounds=0),
+                slice_stage=replace(settings.slice_stage, optimise_poses=False),
+            )
+            notes.append("slice poses not estimated: a single stack does not determine them")
+
+        with clock("motion"):
+            motion = estimate_motion(slices, settings.motion, self._report("motion"))
+        warnings += _pose_warnings(motion, stacks)
+        with clock("coarse"):
+            voxel = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
+            prior_grid = grid_around(motion.slices, voxel, margin_mm=5.0)
+            coarse, density = coarse_and_density(motion.slices, prior_grid, motion.gain)
+            scale = normalisation_scale(coarse, density)
+            coarse, slices = coarse / np.float32(scale), motion.slices.scaled(1 / scale)
+            prior_mask = foreground_mask(density, slices, prior_grid)
+        with clock("prior"):
+            self.progress("prior", 0, 1)
+            prior = self._prior(coarse, density)
+            self.progress("prior", 1, 1)
+        with clock("fit to prior"):
+            cloud = seed_cloud(prior, prior_mask, prior_grid, settings.gaussian_spacing_mm, settings.flat_gradient)
+            target = VolumeTarget.of(prior, prior_mask.astype(np.float32), prior_grid)
+            cloud, prior_history = fit_prior(
+                cloud, target, settings.prior_stage, rng, self._report("fit to prior")
+            )
+        with clock("fit to slices"):
+            distil_to = target if settings.use_prior and settings.distillation else None
+            fit = fit_slices(
+                cloud, slices, motion.gain, motion.weight, distil_to, settings.slice_stage, rng,
+                self._report("fit to slices"),
+            )  # fmt: skip
+        with clock("volume"):
+            grid = _output_grid(prior_grid, settings.resolution_mm)
+            mask = prior_mask
+            if grid is not prior_grid:
+                _, on_grid = coarse_and_density(fit.slices, grid, fit.gain)
+                mask = foreground_mask(on_grid, fit.slices, grid)
+            volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * mask
+            if not np.isfinite(volume).all():
+                raise NumericalError("the volume holds values that are not finite; lower the step sizes")
+        intensity = first_scale * scale
+        record = self._record(stacks, slices, motion, fit, clock, settings, notes, warnings)
+        record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
+        for warning in warnings:
+            logger.warning(warning)
+        return ReconstructionResult(
+            volume * np.float32(intensity), mask, grid, prior * np.float32(intensity),
+            coarse * np.float32(intensity), density, prior_grid, fit.cloud, intensity, fit.slices, fit.gain,
+            fit.weight, motion.ncc, record,
+        )  # fmt: skip
+
+    def _prior(self, coarse: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray[np.float32]:
+        if self.network is None:
+            return coarse
+        return estimate_prior(self.network, coarse, density)
+
+    def _report(self, stage: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.progress(stage, done, total)
+
+    def _record(
+        self,
+        stacks: Sequence[Stack],
+        slices: Slices,
+        motion: MotionEstimate,
+        fit: SliceFit,
+        clock: _Clock,
+        settings: ReconstructionSettings,
+        notes: list[str],
+        warnings: list[str],
+    ) -> dict[str, Any]:
+        """run.json: what is needed to judge the result and to run it again; file names only, no paths."""
+        of_stack = [slices.stack_id == n for n in range(len(stacks))]
+        return {
+            "g3r": __version__,
+            "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+            "settings": asdict(settings),
+            "prior": asdict(self.prior_meta) if self.prior_meta else None,
+            "stacks": [
+                {
+                    "name": stack.name,
+                    "thickness_mm": stack.thickness_mm,
+                    "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
+                    "n_slices": int(chosen.sum()),
+                    "agreement_with_other_stacks": motion.stack_agreement[n],
+                    "median_slice_ncc": float(np.median(motion.ncc[chosen])) if chosen.any() else None,
+                    "n_doubted_slices": int((fit.weight[chosen] < 0.5).sum()),
+                }
+                for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
+            ],
+            "n_gaussians": len(fit.cloud),
+            "motion": motion.history,
+            "seconds": clock.seconds,
+            "cpu_seconds": clock.cpu_seconds,
+            "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+            "notes": notes,
+            "warnings": warnings,
+        }
+
+
+class _Clock:
+    """Wall and CPU seconds of each stage, and a line in the log when it ends."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str):  # type: ignore[no-untyped-def]
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - wall, 3)
+        self.cpu_seconds[stage] = round(time.process_time() - cpu, 3)
+        logger.info("%s: %.1f s", stage, self.seconds[stage])
+
+
+def _percentile_scale(slices: Slices) -> float:
+    scale = float(np.percentile(slices.masked_value, 99))
+    if not scale > 0:
+        raise InputError(f"99th percentile inside the masks is {scale:g}; expected a positive intensity")
+    return scale
+
+
+def _output_grid(prior_grid: VolumeGrid, resolution_mm: float) -> VolumeGrid:
+    if np.isclose(prior_grid.spacing_mm[0], resolution_mm, rtol=1e-6):
+        return prior_grid
+    low, high = prior_grid.world([0, 0, 0]), prior_grid.world(np.array(prior_grid.shape) - 1)
+    return VolumeGrid.isotropic(low, high, resolution_mm)
+
+
+def _pose_warnings(motion: MotionEstimate, stacks: Sequence[Stack]) -> list[str]:
+    lines = []
+    for n, stack in enumerate(stacks):
+        of_stack = motion.slices.stack_id == n
+        if not of_stack.any():
+            lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
+        elif len(stacks) > 1 and (ncc := float(np.median(motion.ncc[of_stack]))) < UNSURE_NCC:
+            lines.append(
+                f"{stack.name}: slices agree poorly with the volume (median correlation {ncc:.2f}); "
+                "its poses are unsure, do not trust the volume without looking at it"
+            )
+    return lines

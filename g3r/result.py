@@ -1,0 +1,126 @@
+"""What a reconstruction gives, and the folder that it is written to."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import save_volume
+from g3r.acquisition.planes import Slices
+from g3r.errors import InputError
+from g3r.gaussians import GaussianCloud
+from g3r.geometry import VolumeGrid
+
+SLICE_COLUMNS = (
+    "stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason",
+)  # fmt: skip
+
+DOUBTED_WEIGHT = 0.5
+"""Slices trusted less than this get a reason in slices.tsv."""
+
+OUTPUT_NAMES = (
+    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz", "gaussians.npz",
+    "slices.tsv", "run.json", "sections.png",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ReconstructionResult:
+    """One reconstructed subject; intensities are those of the stacks.
+
+    Args:
+        volume, mask: [I, J, K] on `grid`.
+        prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_coarse where no network was used.
+        cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
+        slices: in their last poses.
+        gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
+        record: settings, versions, seconds, memory, warnings: run.json.
+    """
+
+    volume: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    grid: VolumeGrid
+    prior: NDArray[np.float32]
+    coarse: NDArray[np.float32]
+    density: NDArray[np.float32]
+    prior_grid: VolumeGrid
+    cloud: GaussianCloud
+    intensity_scale: float
+    slices: Slices
+    gain: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    ncc: NDArray[np.float64]
+    record: dict[str, Any] = field(default_factory=dict)
+
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Write every output into a folder; it appears whole or not at all.
+
+        Raises:
+            InputError: the folder holds files already (without `replace`), or cannot be written.
+        """
+        folder = Path(folder)
+        check_output_folder(folder, replace=replace)
+        beside: Path | None = None
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            beside.chmod(0o755)  # mkdtemp makes it private
+            self._write(beside)
+            if folder.exists():
+                for name in OUTPUT_NAMES:
+                    os.replace(beside / name, folder / name)
+            else:
+                os.replace(beside, folder)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --output") from None
+        finally:
+            if beside is not None:
+                shutil.rmtree(beside, ignore_errors=True)
+
+    def _write(self, folder: Path) -> None:
+        from g3r.report.sections import save_sections
+
+        save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
+        save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
+        for name in ("prior", "coarse", "density"):
+            save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
+        self.cloud.save(folder / "gaussians.npz")
+        (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
+        (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
+        save_sections(folder / "sections.png", {"volume": self.volume}, self.grid.affine, self.mask)
+
+    def slice_table(self) -> str:
+        """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, rad; mm)."""
+        motion = self.slices.world_from_header()
+        rotvec = motion.rotvec_rad()
+        lines = ["\t".join(SLICE_COLUMNS)]
+        for k in range(len(self.slices)):
+            pose = [f"{x:.9g}" for x in (*rotvec[k], *motion.translation_mm[k])]
+            trust = [f"{x:.4g}" for x in (self.gain[k], self.weight[k], self.ncc[k])]
+            reason = "high residual" if self.weight[k] < DOUBTED_WEIGHT else "-"
+            number = [str(self.slices.stack_id[k]), str(self.slices.slice_index[k])]
+            lines.append("\t".join([*number, *pose, *trust, reason]))
+        return "\n".join(lines) + "\n"
+
+
+def check_output_folder(folder: Path, *, replace: bool) -> None:
+    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
+
+    Raises:
+        InputError: see above, or a parent that cannot be written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+    if folder.exists() and any(folder.iterdir()) and not replace:
+        raise InputError(f"{folder}: is not empty; pass --force to replace an earlier result, or choose another")
+    parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if not os.access(parent, os.W_OK):
+        raise InputError(f"{folder}: cannot be written; choose another --output")
