@@ -1,8 +1,8 @@
 """Slice-to-volume reconstruction of fetal brain MRI: thick moving slices in, one isotropic volume out.
 
-    from g3r import GaussianReconstructor, load_stack
-    result = GaussianReconstructor().reconstruct([load_stack("a.nii.gz"), load_stack("b.nii.gz")])
-    result.save("out")
+from g3r import GaussianReconstructor, load_stack
+result = GaussianReconstructor().reconstruct([load_stack("a.nii.gz"), load_stack("b.nii.gz")])
+result.save("out")
 """
 
 from __future__ import annotations

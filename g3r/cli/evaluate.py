@@ -27,10 +27,16 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--volume", required=True, help="reconstructed volume (NIfTI)")
     parser.add_argument("--reference", required=True, help="true volume (NIfTI)")
     parser.add_argument("--mask", required=True, help="mask on the reference's grid (NIfTI)")
-    parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
+    parser.add_argument(
+        "--align", action="store_true", help="remove one rigid motion of the whole head first"
+    )
     parser.add_argument("--json", metavar="FILE", help="also write the scores here")
-    parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
-    parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)")
+    parser.add_argument(
+        "--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)"
+    )
+    parser.add_argument(
+        "--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)"
+    )
     parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
     return parser
 
@@ -66,7 +72,8 @@ def table(comparison: Comparison, pose_error: PoseError | None = None) -> str:
     if pose_error:
         lines.append(
             f"slice poses (TRE mm): mean {pose_error.mean_mm:.2f}, median {pose_error.median_mm:.2f}, "
-            f"90th percentile {pose_error.p90_mm:.2f}; {pose_error.n_slices} slices, {pose_error.n_missing} missing"
+            f"90th percentile {pose_error.p90_mm:.2f}; {pose_error.n_slices} slices, "
+            f"{pose_error.n_missing} without an estimate"
         )
     return "\n".join(lines)
 

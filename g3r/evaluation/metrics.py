@@ -61,9 +61,7 @@ def fit_intensity(
     return gain, float(y_mean - gain * x_mean)
 
 
-def score(
-    volume: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_]
-) -> Scores:
+def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_]) -> Scores:
     """Compare a volume with the reference on one grid [I, J, K], inside the mask.
 
     The reference is divided by its `RANGE_PERCENTILE` in the mask, the volume is fitted to it affinely,
@@ -74,7 +72,9 @@ def score(
             is not positive anywhere in the mask.
     """
     if not volume.shape == reference.shape == mask.shape:
-        raise ValueError(f"shapes differ: volume {volume.shape}, reference {reference.shape}, mask {mask.shape}")
+        raise ValueError(
+            f"shapes differ: volume {volume.shape}, reference {reference.shape}, mask {mask.shape}"
+        )
     if not mask.any():
         raise ValueError("the mask is empty")
     if not (np.isfinite(volume[mask]).all() and np.isfinite(reference[mask]).all()):

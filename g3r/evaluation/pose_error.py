@@ -73,7 +73,9 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
         raise InputError(f"{path.name}: is not a text table; expected tab-separated slice poses") from None
     missing = [c for c in ("stack", "slice", *POSE_COLUMNS) if not rows or c not in rows[0]]
     if missing:
-        raise InputError(f"{path.name}: has no column {', '.join(missing)}; expected a tab-separated pose table")
+        raise InputError(
+            f"{path.name}: has no column {', '.join(missing)}; expected a tab-separated pose table"
+        )
     try:
         keys = tuple((int(row["stack"]), int(row["slice"])) for row in rows)
         values = np.array([[float(row[c]) for c in POSE_COLUMNS] for row in rows])

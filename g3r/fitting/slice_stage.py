@@ -39,7 +39,7 @@ class SliceStageSettings:
         rates: step sizes.
     """
 
-    n_steps: int = 80
+    n_steps: int = 60
     peak_iterations: int = 6
     peak_damping: float = 0.05
     scale_weight: float = 0.02

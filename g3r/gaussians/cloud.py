@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -98,7 +100,7 @@ class GaussianCloud:
             with np.load(path, allow_pickle=False) as data:
                 names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
                 return cls(*(torch.from_numpy(data[name]) for name in names), data["origin_mm"])
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
 
 

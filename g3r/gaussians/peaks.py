@@ -98,9 +98,10 @@ def solve_peaks(
     start = cloud.peak.detach().double().numpy()
     residual = target.astype(np.float64) - system.forward(start)
     row_sum = system.adjoint(weight * system.forward(np.ones(len(cloud), np.float32)))
-    shift = damping * float(np.abs(row_sum).mean())
-    if not shift > 0:  # no pixel sees any Gaussian
+    seen = float(np.abs(row_sum).sum())
+    if not seen > 0:  # no pixel sees any Gaussian, or there is none
         return cloud
+    shift = damping * seen / len(cloud)
     step = np.zeros_like(start)
     gradient = system.adjoint((weight * residual).astype(np.float32))
     direction = gradient.copy()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
@@ -17,6 +20,14 @@ GAIN_PRIOR_SIGMA = 0.3
 """Spread of the logarithm of slice gains before the image speaks (a prior; keeps dark slices finite)."""
 
 NEIGHBOURS = (-2, -1, 1, 2)
+
+TIE_SHARE = 0.01
+"""Stiffness of the tie between neighbours, as a share of the median slice's own stiffness: a slice through the
+middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
+
+TIE_REACH_MM = 3.0
+"""Neighbours that would put a slice further away than this count less: after a jerk, and between the passes of
+an interleaved stack, neighbours lie elsewhere for good reason."""
 
 
 def register_slices(
@@ -43,15 +54,16 @@ def register_slices(
     log_gain = np.log(gain)
     damping = np.full(len(slices), 1e-2)
     current = model.evaluate(slices.planes, gain, width)
+    tie = NeighbourTie.of(slices, current)
     for _ in range(n_steps):
-        step = _solve(current, log_gain, damping, width)
+        step = _solve(current, log_gain, damping, width, tie, pose)
         trial_pose = RigidPose(
             orthonormal(pose.rotation @ rotation_matrix(step[:, :3])),
             pose.translation_mm + np.einsum("kij,kj->ki", pose.rotation, step[:, 3:6]),
         )
         trial_log_gain = log_gain + step[:, 6]
         trial = model.evaluate(slices.planes.with_pose(trial_pose), np.exp(trial_log_gain), width)
-        better = trial.loss < current.loss
+        better = _objective(trial, width) + tie.cost(trial_pose) < _objective(current, width) + tie.cost(pose)
         pose = _choose(better, trial_pose, pose)
         log_gain = np.where(better, trial_log_gain, log_gain)
         current = _choose_equations(better, trial, current)
@@ -88,13 +100,84 @@ def try_neighbours(
     return slices.with_pose(best_pose), int((best < current).sum())
 
 
+@dataclass(frozen=True)
+class NeighbourTie:
+    """A spring from every slice to where its neighbours in the stack would put it.
+
+    target [K]: mean of the neighbours' motions, weighted by how well each is determined, applied to the
+    slice's header pose; precision [K, 6] of the spring for turns (1/rad^2) and shifts (1/mm^2), in the units
+    of the squared residuals.
+    """
+
+    target: RigidPose
+    precision: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, slices: Slices, equations: NormalEquations) -> NeighbourTie:
+        """Ties for the present poses."""
+        n = len(slices)
+        motion = slices.world_from_header()
+        pose = slices.planes.pose
+        information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
+        # a turn is judged by how far it moves the slice's rim; slices of a few pixels have hardly any
+        radius_mm = np.maximum(np.sqrt(((slices.planes.shape * slices.planes.spacing_mm / 2) ** 2).mean(1)), 10.0)
+        rotation = np.zeros((n, 3, 3))
+        translation, total = np.zeros((n, 3)), np.zeros(n)
+        for step in NEIGHBOURS:
+            source = np.arange(n) + step
+            valid = (source >= 0) & (source < n)
+            source = np.clip(source, 0, n - 1)
+            valid &= slices.stack_id[source] == slices.stack_id
+            candidate = motion.take(source) @ slices.header_pose
+            turn = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
+            away_mm = np.hypot(
+                np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1), radius_mm * turn
+            )
+            weight = np.where(valid, information[source] / (1 + (away_mm / TIE_REACH_MM) ** 2), 0.0)
+            rotation += weight[:, None, None] * candidate.rotation
+            translation += weight[:, None] * candidate.translation_mm
+            total += weight
+        alone = total <= 0
+        safe = np.where(alone, 1.0, total)
+        target = RigidPose(
+            orthonormal(np.where(alone[:, None, None], pose.rotation, rotation / safe[:, None, None])),
+            np.where(alone[:, None], pose.translation_mm, translation / safe[:, None]),
+        )
+        stiffness = np.where(alone, 0.0, TIE_SHARE * float(np.median(information)))
+        precision = np.stack([stiffness * radius_mm**2, stiffness], axis=1)
+        return cls(target, np.repeat(precision, 3, axis=1))
+
+    def twist(self, pose: RigidPose) -> NDArray[np.float64]:
+        """Body-frame turn and shift [K, 6] from poses to the target."""
+        back = pose.rotation.transpose(0, 2, 1)
+        turn = Rotation.from_matrix(back @ self.target.rotation).as_rotvec()
+        shift = np.einsum("kij,kj->ki", back, self.target.translation_mm - pose.translation_mm)
+        return np.concatenate([turn, shift], axis=1)
+
+    def cost(self, pose: RigidPose) -> NDArray[np.float64]:
+        """Energy of the springs [K]."""
+        return 0.5 * (self.precision * self.twist(pose) ** 2).sum(1)
+
+
+def _objective(equations: NormalEquations, width: float) -> NDArray[np.float64]:
+    """Cauchy loss of each slice [K] as half a sum of squares where residuals are small."""
+    return 0.5 * width**2 * equations.loss * equations.moments[:, 0]
+
+
 def _solve(
-    equations: NormalEquations, log_gain: NDArray[np.float64], damping: NDArray[np.float64], width: float
+    equations: NormalEquations,
+    log_gain: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    width: float,
+    tie: NeighbourTie,
+    pose: RigidPose,
 ) -> NDArray[np.float64]:
     hessian, gradient = equations.hessian.copy(), equations.gradient.copy()
     precision = (width / GAIN_PRIOR_SIGMA) ** 2
     hessian[:, 6, 6] += precision
     gradient[:, 6] -= precision * log_gain
+    gradient[:, :6] += tie.precision * tie.twist(pose)
+    hessian[:, np.arange(6), np.arange(6)] += tie.precision
     diagonal = np.einsum("kii->ki", hessian)
     # relative to the largest turn or shift, so that an edge slice without contrast stays where it is
     floor = np.repeat([1e-3, 1e-3, 1.0], [3, 3, 1]) * np.repeat(

@@ -1,0 +1,66 @@
+# Everything a person needs to type. `make` alone explains itself.
+.DEFAULT_GOAL := help
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+
+PYTHON ?= python3
+VENV ?= .venv
+# e.g. PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the small CPU build of torch
+PIP_ARGS ?=
+ATLAS ?=
+PRETRAIN_ARGS ?=
+PRIOR ?= runs/prior.pt
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: help install demo test test-slow lint types pretrain tensorboard clean
+
+help: ## show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+install: $(STAMP) ## make .venv with g3r and everything it needs
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e '.[train,test]'
+	touch $@
+
+demo: install ## simulate a moving 30-week brain, reconstruct it, score it: a volume and a picture in demo/
+	rm -rf demo
+	$(BIN)/g3r-simulate --phantom 30 --motion moderate --stacks 3 --resolution 1.0 --thickness 3.0 --seed 1 --output demo/case
+	$(BIN)/g3r-infer --stacks demo/case/stack-{0,1,2}.nii.gz --masks demo/case/mask-{0,1,2}.nii.gz --thickness 3.0 \
+		--resolution 1.0 --seed 1 --output demo/reconstruction
+	$(BIN)/g3r-evaluate --align --volume demo/reconstruction/volume.nii.gz \
+		--reference demo/case/truth.nii.gz --mask demo/case/truth-mask.nii.gz \
+		--poses demo/case/poses.tsv --slices demo/reconstruction/slices.tsv \
+		--json demo/scores.json --sections demo/comparison.png
+	@echo
+	@echo "volume:   demo/reconstruction/volume.nii.gz"
+	@echo "picture:  demo/comparison.png (truth, reconstruction, error), demo/reconstruction/sections.png"
+
+test: install ## lint, types and all quick tests
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+test-slow: install ## the tests that take minutes
+	$(BIN)/pytest -m slow
+
+lint: install ## ruff: style, imports, docstrings
+	$(BIN)/ruff check .
+
+types: install ## mypy
+	$(BIN)/mypy
+
+pretrain: install ## train the prior on the phantom, or on ATLAS=DIR, and export it to PRIOR=runs/prior.pt
+	$(BIN)/g3r-pretrain fit --config lightning_configs/prior.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(PRETRAIN_ARGS)
+	folder=$$(ls -dt runs/prior/version_*/checkpoints | head -n 1); \
+	best=$$(ls -t "$$folder"/best*.ckpt "$$folder"/last.ckpt 2>/dev/null | grep best | head -n 1 || true); \
+	$(BIN)/g3r-export --force "$${best:-$$folder/last.ckpt}" $(PRIOR)
+
+tensorboard: install ## watch the training runs
+	$(BIN)/tensorboard --logdir runs
+
+clean: ## remove what the commands above made, the environment excepted
+	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find g3r data_synth tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,205 @@
+"""`g3r-infer`: motion-corrupted stacks in, one volume with maps, poses and a record out."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g3r.errors import G3RError, InputError
+
+if TYPE_CHECKING:
+    from g3r.acquisition.stacks import Stack
+    from g3r.presets import ReconstructionSettings
+    from g3r.reconstruct import Progress
+    from g3r.result import ReconstructionResult
+
+PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="g3r-infer",
+        description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
+        "For research only, not for diagnosis.",
+        epilog="exit codes: 0 done, 2 usage, 3 bad input, 4 numerical failure",
+    )
+    parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
+    parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
+    parser.add_argument(
+        "--thickness", nargs="+", type=float, metavar="MM",
+        help="slice thickness, one for all or one per stack (default: the distance of slices)",
+    )  # fmt: skip
+    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
+    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
+    parser.add_argument("--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)")
+    parser.add_argument("--preset", choices=PRESET_NAMES, default="balanced", help="speed against accuracy")
+    parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
+    parser.add_argument("--seed", type=int, default=0, help="of every random choice")
+    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
+    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
+    parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = build_parser()
+    options = parser.parse_args(argv)
+    n_stacks = len(options.stacks)
+    if options.masks is not None and len(options.masks) != n_stacks:
+        parser.error(f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order")
+    if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
+        parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
+    if options.threads is not None and options.threads < 1:
+        parser.error(f"--threads {options.threads}; expected at least 1")
+    if options.ckpt and options.no_prior:
+        parser.error("--ckpt and --no-prior exclude each other")
+    logging.basicConfig(
+        level=logging.WARNING if options.quiet else logging.INFO, format="g3r-infer: %(message)s", stream=sys.stderr
+    )
+    for chatty in ("numba", "matplotlib", "PIL"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    try:
+        return _run(options)
+    except G3RError as error:
+        print(f"g3r-infer: {error}", file=sys.stderr)
+        return error.exit_code
+    except MemoryError:
+        print(
+            "g3r-infer: memory is used up; choose a coarser --resolution or --preset draft, or crop the stacks",
+            file=sys.stderr,
+        )
+        return 4
+    except KeyboardInterrupt:
+        print("g3r-infer: interrupted; nothing was written", file=sys.stderr)
+        return 130
+
+
+def _run(options: argparse.Namespace) -> int:
+    from g3r.result import check_output_folder
+
+    folder = Path(options.output)
+    check_output_folder(folder, replace=options.force)  # before any work
+    stacks = _load(options)
+    from g3r.reconstruct import GaussianReconstructor
+
+    _use_threads(options.threads)
+    settings = _settings(options)
+    with _bars(quiet=options.quiet) as progress:
+        reconstructor = GaussianReconstructor(options.ckpt, settings, progress)
+        if options.dry_run:
+            return _dry_run(stacks, settings, folder)
+        result = reconstructor.reconstruct(stacks)
+    result.record["command"] = {
+        "stacks": [stack.name for stack in stacks], "preset": options.preset, "seed": options.seed,
+        "threads": options.threads,
+    }  # fmt: skip
+    result.save(folder, replace=options.force)
+    if options.tensorboard:
+        _write_tensorboard(Path(options.tensorboard), result)
+    seconds = sum(result.record["seconds"].values())
+    print(f"volume:  {folder / 'volume.nii.gz'}")
+    print(f"picture: {folder / 'sections.png'}")
+    print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
+    return 0
+
+
+def _load(options: argparse.Namespace) -> list[Stack]:
+    from g3r.acquisition.stacks import load_stack
+
+    n = len(options.stacks)
+    masks = options.masks or [None] * n
+    thickness = options.thickness or [None]
+    thickness = thickness * n if len(thickness) == 1 else thickness
+    return [load_stack(*one) for one in zip(options.stacks, masks, thickness, strict=True)]
+
+
+def _settings(options: argparse.Namespace) -> ReconstructionSettings:
+    from dataclasses import replace
+
+    from g3r.presets import PRESETS
+
+    return replace(
+        PRESETS[options.preset],
+        resolution_mm=options.resolution,
+        seed=options.seed,
+        use_prior=not options.no_prior,
+    )
+
+
+def _use_threads(n: int | None) -> None:
+    """Give both thread pools the same number; they take turns, stage by stage."""
+    import numba
+    import torch
+
+    wanted = n or len(os.sched_getaffinity(0))
+    if wanted > numba.config.NUMBA_NUM_THREADS:
+        raise InputError(
+            f"--threads {wanted}: this machine offers {numba.config.NUMBA_NUM_THREADS}; choose at most that"
+        )
+    numba.set_num_threads(wanted)
+    torch.set_num_threads(wanted)
+
+
+def _dry_run(stacks: list[Stack], settings: ReconstructionSettings, folder: Path) -> int:
+    for stack in stacks:
+        spacing = " x ".join(f"{x:.2f}" for x in stack.spacing_mm)
+        print(
+            f"{stack.name}: {'x'.join(map(str, stack.image.shape))} voxels of {spacing} mm, "
+            f"thickness {stack.thickness_mm:g} mm, {int(stack.mask.sum())} masked"
+        )
+    print(f"would write a volume of {settings.resolution_mm:g} mm to {folder}")
+    return 0
+
+
+@contextmanager
+def _bars(*, quiet: bool) -> Iterator[Progress]:
+    """A progress bar per stage."""
+    if quiet:
+        yield lambda stage, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as bars:
+        tasks: dict[str, int] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield report
+
+
+def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise InputError("--tensorboard: tensorboard is not installed; pip install tensorboard") from None
+    with SummaryWriter(str(folder)) as writer:
+        for stage, history in result.record["loss"].items():
+            for step, entry in enumerate(history):
+                values = entry if isinstance(entry, dict) else {"image": entry}
+                for name, value in values.items():
+                    writer.add_scalar(f"{stage}/{name}", value, step)
+        middle = [int(n.mean()) for n in result.mask.nonzero()]
+        top = float(result.volume.max()) or 1.0
+        for axis, name in enumerate(("sagittal", "coronal", "axial")):
+            section = result.volume.take(middle[axis], axis=axis) / top
+            writer.add_image(f"volume/{name}", section.T[::-1].copy(), dataformats="HW")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

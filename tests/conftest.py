@@ -1,0 +1,27 @@
+"""Fixtures that every test may use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A seeded generator, fresh for each test."""
+    return np.random.default_rng(20_260_101)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder with real and atlas-based cases that are not part of the repository; skips without it."""
+    default = REPOSITORY.parent / "shared" / "data"
+    folder = Path(os.environ.get("G3R_TEST_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"no test data at {folder}; set G3R_TEST_DATA to the folder that holds cases/ and real/")
+    return folder

@@ -1,0 +1,91 @@
+"""`g3r-evaluate` as a process: its table, its files, its exit codes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from g3r.acquisition.images import save_volume
+from g3r.cli.evaluate import main
+
+
+@pytest.fixture
+def files(tmp_path, rng):
+    """A noisy volume, its truth and mask."""
+    axes = np.meshgrid(*(np.linspace(-1, 1, n) for n in (24, 28, 22)), indexing="ij")
+    mask = sum(a**2 for a in axes) < 0.7
+    truth = np.where(mask, 500 + 200 * np.sin(4 * axes[0] + 3 * axes[1] * axes[2]), 0)
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = (-24, -28, -22)
+    save_volume(tmp_path / "truth.nii.gz", truth, affine)
+    save_volume(tmp_path / "mask.nii.gz", mask, affine)
+    save_volume(tmp_path / "volume.nii.gz", truth + rng.normal(0, 20, truth.shape) * mask, affine)
+    save_volume(tmp_path / "small.nii.gz", mask[1:], affine)
+    save_volume(tmp_path / "empty.nii.gz", mask & False, affine)
+    save_volume(tmp_path / "nan.nii.gz", truth * np.nan, affine)
+    (tmp_path / "text.nii.gz").write_text("not an image")
+    return tmp_path
+
+
+def options(folder, **changes):
+    names = {"volume": "volume.nii.gz", "reference": "truth.nii.gz", "mask": "mask.nii.gz"} | changes
+    return [part for name, file in names.items() for part in (f"--{name}", str(folder / file))]
+
+
+def test_scores_as_a_process(files):
+    arguments = options(files, json="scores.json", sections="picture.png")
+    command = [sys.executable, "-m", "g3r.cli.evaluate", *arguments]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == ""
+    record = json.loads((files / "scores.json").read_text())
+    assert f"{record['psnr_db']:.2f}" in run.stdout
+    assert 28 < record["psnr_db"] < 33
+    assert (files / "picture.png").read_bytes()[:4] == b"\x89PNG"
+    assert {p.name for p in files.iterdir() if p.name.startswith(".")} == set()
+
+
+def test_alignment_is_reported(files, capsys):
+    assert main([*options(files), "--align"]) == 0
+    assert "aligned: 0." in capsys.readouterr().out
+
+
+def test_pose_error_is_reported(files, capsys):
+    rows = "".join(f"0\t{k}\t0\t0\t0\t0\t0\t0\n" for k in range(22))
+    (files / "poses.tsv").write_text("stack\tslice\trx\try\trz\ttx\tty\ttz\n" + rows)
+    (files / "mask-0.nii.gz").write_bytes((files / "mask.nii.gz").read_bytes())
+    assert main([*options(files, poses="poses.tsv", slices="poses.tsv", json="s.json")]) == 0
+    assert "mean 0.00" in capsys.readouterr().out
+    assert json.loads((files / "s.json").read_text())["poses"]["n_missing"] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"volume": "nowhere.nii.gz"}, "no such file"),
+        ({"volume": "text.nii.gz"}, "NIfTI"),
+        ({"volume": "nan.nii.gz"}, "no finite value"),
+        ({"mask": "small.nii.gz"}, "grid"),
+        ({"mask": "empty.nii.gz"}, "empty"),
+        ({"json": "no/folder/scores.json"}, "cannot be written"),
+        ({"poses": "nowhere.tsv", "slices": "nowhere.tsv"}, "no such file"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_3(files, capsys, changes, message):
+    assert main(options(files, **changes)) == 3
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_usage_errors(files):
+    with pytest.raises(SystemExit) as stop:
+        main(["--volume", "a.nii.gz"])
+    assert stop.value.code == 2
+    with pytest.raises(SystemExit) as stop:
+        main(options(files, poses="poses.tsv"))
+    assert stop.value.code == 2

@@ -1,0 +1,75 @@
+"""Voxel grids: index and world, the box that they cover, refusals."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from g3r.geometry import VolumeGrid
+
+
+def affine_of(axes: np.ndarray, spacing: tuple[float, float, float], origin: tuple[float, ...]) -> np.ndarray:
+    affine = np.eye(4)
+    affine[:3, :3] = axes * np.array(spacing)
+    affine[:3, 3] = origin
+    return affine
+
+
+AXES = {
+    "RAS": np.eye(3),
+    "LAS": np.diag([-1.0, 1, 1]),
+    "LPS": np.diag([-1.0, -1, 1]),
+    "oblique": Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix(),
+    "oblique left-handed": Rotation.from_rotvec([1.3, 0.5, -0.9]).as_matrix() @ np.diag([1.0, -1, 1]),
+}
+
+
+@pytest.mark.parametrize("origin", [(-40.0, 30.0, 12.5), (1e4, -1e4, 1e4)])
+@pytest.mark.parametrize("name", AXES)
+def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, float]):
+    grid = VolumeGrid((30, 41, 17), affine_of(AXES[name], (0.7, 0.8, 3.3), origin))
+    index = np.random.default_rng(0).uniform(-5, 45, (200, 3))
+    world = grid.world(index)
+    np.testing.assert_allclose(grid.world(grid.index(world)), world, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(world, (grid.affine @ np.c_[index, np.ones(200)].T)[:3].T, atol=1e-9)
+    np.testing.assert_allclose(grid.spacing_mm, [0.7, 0.8, 3.3], atol=1e-12)
+    assert grid.voxel_volume_mm3 == pytest.approx(0.7 * 0.8 * 3.3)
+    np.testing.assert_allclose(grid.center_mm, grid.world([14.5, 20, 8]), atol=1e-9)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 0.8, 3.0])
+@pytest.mark.parametrize("margin", [0.0, 5.0])
+def test_isotropic_covers_its_box_and_little_more(spacing: float, margin: float):
+    low, high = np.array([-31.2, -40.05, 7.0]), np.array([28.3, 41.0, 7.3])
+    grid = VolumeGrid.isotropic(low, high, spacing, margin)
+    first, last = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
+    assert (first <= low - margin + 1e-9).all()
+    assert (last >= high + margin - 1e-9).all()
+    assert (last - first < high - low + 2 * margin + spacing).all()
+    np.testing.assert_allclose(grid.spacing_mm, spacing)
+    np.testing.assert_allclose(grid.center_mm, (low + high) / 2, atol=1e-12)
+
+
+def test_isotropic_of_a_point_is_one_voxel():
+    grid = VolumeGrid.isotropic([1, 2, 3], [1, 2, 3], 0.8)
+    assert grid.shape == (1, 1, 1)
+    np.testing.assert_allclose(grid.world([0, 0, 0]), [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("shape", "affine", "message"),
+    [
+        ((0, 3, 3), np.eye(4), "positive"),
+        ((3, 3), np.eye(4), "positive"),
+        ((3, 3, 3), np.eye(3), "4x4"),
+        ((3, 3, 3), np.full((4, 4), np.nan), "finite"),
+        ((3, 3, 3), np.diag([1.0, 0, 1, 1]), "singular"),
+        ((3, 3, 3), np.array([[1.0, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "singular"),
+    ],
+)
+def test_what_is_no_grid_is_refused(shape, affine, message):
+    with pytest.raises(ValueError, match=message):
+        VolumeGrid(shape, affine)
+
+
+def test_small_voxels_are_not_taken_for_singular():
+    assert VolumeGrid((3, 3, 3), np.diag([1e-4, 1e-4, 1e-4, 1])).voxel_volume_mm3 == pytest.approx(1e-12)
