@@ -133,8 +133,13 @@ class PriorModule(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return AdamW with warm-up and a cosine over the trainer's budget."""
+        # Without normalisation layers one batch can have a far larger gradient than those before; with the
+        # usual 0.999 the second moment is then too small and a single step throws the network far off.
         optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay
+            self.network.parameters(),
+            lr=self.learning_rate,
+            betas=(0.9, 0.95),
+            weight_decay=self.weight_decay,
         )
         total = self.trainer.estimated_stepping_batches
         self._total_steps = float(total) if total > 0 else math.inf

@@ -15,11 +15,6 @@ from g3r.prior.gate import confidence_from_density
 # No normalisation layer anywhere: instance statistics would make a voxel's value depend on how the volume
 # was cut into tiles, and on how much empty background a patch has.
 _LEAKY_SLOPE = 0.1
-
-RESIDUAL_SCALE = 5.0
-"""F over the last activations. Where slices are dense the gate passes a tenth of F or less (alpha = 0.05), so
-F has to be about ten times the wanted correction; the scale keeps the weights that make it of order one."""
-
 _BLOCK: dict[str, Any] = {
     "adn_ordering": "A",
     "act": ("LEAKYRELU", {"negative_slope": _LEAKY_SLOPE}),
@@ -151,7 +146,7 @@ class ResidualRefiner(nn.Module):
         for up, decode in zip(reversed(self.up), reversed(self.decoder), strict=True):
             features = decode(_channels_last(up(features)) + skips.pop())
         features = torch.cat([self.to_full(features), inputs], 1)
-        residual = RESIDUAL_SCALE * self.head(self.tail(_channels_last(features)))
+        residual = self.head(self.tail(_channels_last(features)))
         return residual[:, :, : size[0], : size[1], : size[2]]
 
 

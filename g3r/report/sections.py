@@ -202,13 +202,15 @@ def _window(data: NDArray[np.float32], inside: NDArray[np.bool_], *, is_map: boo
 
 
 def _letter(panel: Axes, letters: str) -> None:
-    """Write the anatomical directions at the four sides."""
+    """Write the anatomical directions at the four sides, outlined: there may be image below them."""
+    from matplotlib.patheffects import withStroke
+
+    outline = [withStroke(linewidth=2, foreground=BACKGROUND)]
     places = ((0.02, 0.5), (0.98, 0.5), (0.5, 0.99), (0.5, 0.01))
     aligned = (("left", "center"), ("right", "center"), ("center", "top"), ("center", "bottom"))
     for letter, (x, y), (horizontal, vertical) in zip(letters, places, aligned, strict=True):
-        panel.text(
-            x, y, letter, transform=panel.transAxes, color="#e8b04a", fontsize=8, ha=horizontal, va=vertical
-        )
+        text = panel.text(x, y, letter, transform=panel.transAxes, ha=horizontal, va=vertical)
+        text.set(color="#e8b04a", fontsize=8, path_effects=outline)
 
 
 def _scale_bar(panel: Axes) -> None:
