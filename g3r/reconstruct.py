@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from g3r._version import __version__
 from g3r.acquisition.foreground import foreground_mask
 from g3r.acquisition.planes import Slices, slices_from_stacks, volume_from_pixels, volume_planes
-from g3r.acquisition.scatter import coarse_and_density, normalisation_scale
+from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
@@ -40,6 +40,9 @@ logger = logging.getLogger(__name__)
 DEFAULT_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "prior.pt"
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
+
+LEAST_DISTILLATION = 1e-3
+"""Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
 
 UNSURE_NCC = 0.4
 """Median correlation of a stack's slices with the volume below which its poses are called unsure."""
@@ -74,9 +77,11 @@ class GaussianReconstructor:
             self.settings = PRESETS[self.settings]
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
-            raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
+            raise InputError(
+                f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm"
+            )
         if self.settings.use_prior:
-            self.network, self.prior_meta = load_prior(self.checkpoint or DEFAULT_CHECKPOINT)
+            self.network, self.prior_meta = load_prior(Path(self.checkpoint or DEFAULT_CHECKPOINT))
 
     def reconstruct(self, stacks: Sequence[Stack]) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
@@ -99,6 +104,7 @@ class GaussianReconstructor:
                 motion=replace(settings.motion, stacks=False, n_rounds=0),
                 slice_stage=replace(settings.slice_stage, optimise_poses=False),
             )
+            notes.append("shading not estimated: a single stack cannot tell it from anatomy")
             notes.append("slice poses not estimated: a single stack does not determine them")
 
         with clock("motion"):
@@ -116,13 +122,21 @@ class GaussianReconstructor:
             prior = self._prior(coarse, density)
             self.progress("prior", 1, 1)
         with clock("fit to prior"):
-            cloud = seed_cloud(prior, prior_mask, prior_grid, settings.gaussian_spacing_mm, settings.flat_gradient)
+            cloud = seed_cloud(
+                prior, prior_mask, prior_grid, settings.gaussian_spacing_mm, settings.flat_gradient
+            )
             target = VolumeTarget.of(prior, prior_mask.astype(np.float32), prior_grid)
             cloud, prior_history = fit_prior(
                 cloud, target, settings.prior_stage, rng, self._report("fit to prior")
             )
         with clock("fit to slices"):
-            distil_to = target if settings.use_prior and settings.distillation else None
+            distil_to = None
+            if settings.use_prior and settings.distillation:
+                # the prior counts where slices are sparse; where they are dense they know better
+                unmeasured = np.maximum(
+                    prior_mask * (1 - confidence(density)), LEAST_DISTILLATION * prior_mask
+                )
+                distil_to = VolumeTarget.of(prior, unmeasured.astype(np.float32), prior_grid)
             fit = fit_slices(
                 cloud, slices, motion.gain, motion.weight, distil_to, settings.slice_stage, rng,
                 self._report("fit to slices"),
@@ -170,7 +184,11 @@ class GaussianReconstructor:
         of_stack = [slices.stack_id == n for n in range(len(stacks))]
         return {
             "g3r": __version__,
-            "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+            "versions": {
+                "python": platform.python_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+            },
             "settings": asdict(settings),
             "prior": asdict(self.prior_meta) if self.prior_meta else None,
             "stacks": [
@@ -185,6 +203,7 @@ class GaussianReconstructor:
                 }
                 for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
             ],
+            "shading": fit.shading,
             "n_gaussians": len(fit.cloud),
             "motion": motion.history,
             "seconds": clock.seconds,
@@ -203,7 +222,7 @@ class _Clock:
         self.cpu_seconds: dict[str, float] = {}
 
     @contextmanager
-    def __call__(self, stage: str):  # type: ignore[no-untyped-def]
+    def __call__(self, stage: str):
         wall, cpu = time.perf_counter(), time.process_time()
         yield
         self.seconds[stage] = round(time.perf_counter() - wall, 3)

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
-from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
+
+if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
+    from g3r.gaussians import GaussianCloud
 
 SLICE_COLUMNS = (
     "stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason",
@@ -80,7 +82,9 @@ class ReconstructionResult:
             else:
                 os.replace(beside, folder)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --output") from None
+            raise InputError(
+                f"{folder}: cannot be written ({error.strerror}); choose another --output"
+            ) from None
         finally:
             if beside is not None:
                 shutil.rmtree(beside, ignore_errors=True)
@@ -95,10 +99,14 @@ class ReconstructionResult:
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
-        save_sections(folder / "sections.png", {"volume": self.volume}, self.grid.affine, self.mask)
+        rows = {"volume": self.volume}
+        if self.grid is self.prior_grid:
+            on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
+            rows = {**on_mask, "volume": self.volume}
+        save_sections(folder / "sections.png", rows, self.grid.affine, self.mask)
 
     def slice_table(self) -> str:
-        """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, rad; mm)."""
+        """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, mm)."""
         motion = self.slices.world_from_header()
         rotvec = motion.rotvec_rad()
         lines = ["\t".join(SLICE_COLUMNS)]
@@ -120,7 +128,9 @@ def check_output_folder(folder: Path, *, replace: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
     if folder.exists() and any(folder.iterdir()) and not replace:
-        raise InputError(f"{folder}: is not empty; pass --force to replace an earlier result, or choose another")
+        raise InputError(
+            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
+        )
     parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     if not os.access(parent, os.W_OK):
         raise InputError(f"{folder}: cannot be written; choose another --output")

@@ -45,5 +45,7 @@ def _slice_distance_mm(slices: Slices) -> float:
         normal = slices.header_pose.rotation[of_stack][:, :, 2]
         step = np.abs(((center[1:] - center[:-1]) * normal[1:]).sum(1))
         index_step = np.maximum(np.diff(slices.slice_index[of_stack]), 1)
-        distances.append(np.median(step / index_step) if len(step) else float(slices.thickness_mm[of_stack][0]))
+        distances.append(
+            np.median(step / index_step) if len(step) else float(slices.thickness_mm[of_stack][0])
+        )
     return float(max(distances))

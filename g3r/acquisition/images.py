@@ -54,21 +54,27 @@ def load_volume(path: str | os.PathLike[str]) -> Volume:
     try:
         image = nib.load(path)
     except (ImageFileError, OSError, EOFError, zlib.error, ValueError) as error:
-        raise InputError(f"{name}: not a readable NIfTI file ({_one_line(error)}); expected .nii or .nii.gz") from None
+        raise InputError(
+            f"{name}: not a readable NIfTI file ({_one_line(error)}); expected .nii or .nii.gz"
+        ) from None
     if not isinstance(image, (nib.Nifti1Image, nib.Nifti2Image, nib.Nifti1Pair)):
         raise InputError(f"{name}: is a {type(image).__name__}; expected NIfTI, convert it first")
     shape = tuple(int(n) for n in image.shape)
     if len(shape) > 3 and all(n == 1 for n in shape[3:]):
         shape = shape[:3]
     if len(shape) != 3:
-        raise InputError(f"{name}: has shape {image.shape}; expected 3D, or 4D with one frame: split the frames")
+        raise InputError(
+            f"{name}: has shape {image.shape}; expected 3D, or 4D with one frame: split the frames"
+        )
     if min(shape) < 1:
         raise InputError(f"{name}: has an empty axis (shape {shape}); export the image again")
     if int(np.prod(shape, dtype=np.float64)) > LARGEST_VOXEL_COUNT:
         raise InputError(f"{name}: header claims {shape} voxels; expected a stack or volume of ordinary size")
     dtype = image.get_data_dtype()
     if dtype.names is not None or np.issubdtype(dtype, np.complexfloating):
-        raise InputError(f"{name}: holds {dtype} values (colour or complex); expected one real number a voxel")
+        raise InputError(
+            f"{name}: holds {dtype} values (colour or complex); expected one real number a voxel"
+        )
     affine = np.array(image.affine, dtype=np.float64)
     try:
         VolumeGrid(shape, affine)
@@ -77,7 +83,9 @@ def load_volume(path: str | os.PathLike[str]) -> Volume:
     try:
         data = np.asarray(image.dataobj, dtype=np.float32).reshape(shape)
     except (OSError, EOFError, zlib.error, ValueError, ImageFileError) as error:
-        raise InputError(f"{name}: voxels cannot be read ({_one_line(error)}); the file may be cut off") from None
+        raise InputError(
+            f"{name}: voxels cannot be read ({_one_line(error)}); the file may be cut off"
+        ) from None
     return Volume(data, affine, name)
 
 
@@ -94,12 +102,14 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
             f"{mask.name}: mask grid {mask.data.shape} differs from that of {reference.name} "
             f"{reference.data.shape}; resample the mask or pass the matching file"
         )
-    corners = np.array(np.meshgrid(*[(0, n - 1) for n in reference.data.shape], indexing="ij")).reshape(3, -1).T
+    corners = (
+        np.array(np.meshgrid(*[(0, n - 1) for n in reference.data.shape], indexing="ij")).reshape(3, -1).T
+    )
     offset = reference.grid.index(mask.grid.world(corners)) - corners
     if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
         raise InputError(
-            f"{mask.name}: mask lies up to {np.abs(offset).max():.2g} voxels off {reference.name} by its header; "
-            "resample the mask or pass the matching file"
+            f"{mask.name}: mask lies up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
+            "header; resample the mask or pass the matching file"
         )
     inside = np.nan_to_num(mask.data) > 0.5
     if not inside.any():
@@ -107,9 +117,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
     return inside
 
 
-def save_volume(
-    path: str | os.PathLike[str], data: NDArray[np.generic], affine: NDArray[np.float64]
-) -> None:
+def save_volume(path: str | os.PathLike[str], data: NDArray[np.generic], affine: NDArray[np.float64]) -> None:
     """Write a volume as NIfTI: float32, or uint8 for masks, int16 as it is. Whole or not at all.
 
     Raises:
@@ -131,7 +139,9 @@ def save_volume(
         nib.save(image, beside)
         os.replace(beside, path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another output folder") from None
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); choose another output folder"
+        ) from None
     finally:
         beside.unlink(missing_ok=True)
 

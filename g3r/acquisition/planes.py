@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry.rigid import Selection
 
 SMALLEST_SLICE_PIXELS = 12
 """Slices with fewer masked pixels carry no pose and little image; they are left out and counted."""
@@ -82,7 +83,9 @@ class Planes:
     def pixel_uv_mm(self) -> NDArray[np.float64]:
         """In-plane position (mm from the plane's centre) of every pixel [P, 2]."""
         blocks = [
-            np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2 for n in shape], indexing="ij"), -1).reshape(-1, 2)
+            np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2 for n in shape], indexing="ij"), -1).reshape(
+                -1, 2
+            )
             * spacing
             for shape, spacing in zip(self.shape, self.spacing_mm, strict=True)
         ]
@@ -96,7 +99,7 @@ class Planes:
         in_plane = np.einsum("pij,pj->pi", self.rotation[plane][:, :, :2], uv)
         return in_plane + self.center_mm[plane]
 
-    def take(self, index: ArrayLike) -> Planes:
+    def take(self, index: Selection) -> Planes:
         """The planes at an index array, a mask or a slice."""
         return Planes(*(getattr(self, field)[index] for field in self.__dataclass_fields__))
 
@@ -163,11 +166,12 @@ class Slices:
         """Values of the pixels inside the mask [P']."""
         return self.value[self.pixel_index]
 
-    def take(self, index: ArrayLike) -> Slices:
+    def take(self, index: Selection) -> Slices:
         """The slices at an index array or mask, with their pixels."""
         chosen = np.arange(len(self))[index]
         pixels = np.concatenate(
-            [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen] or [np.zeros(0, int)]
+            [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen]
+            or [np.zeros(0, int)]
         )
         return Slices(
             self.planes.take(chosen),
@@ -228,7 +232,9 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             slice_index.append(k)
             thickness.append(stack.thickness_mm)
     if not rotation:
-        raise InputError(f"{stacks[0].name}: no slice with {SMALLEST_SLICE_PIXELS} masked pixels; check the masks")
+        raise InputError(
+            f"{stacks[0].name}: no slice with {SMALLEST_SLICE_PIXELS} masked pixels; check the masks"
+        )
     planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
     return Slices(
         planes,

@@ -71,7 +71,7 @@ def _psf_points(slices: Slices, grid: VolumeGrid) -> tuple[int, int, int]:
 
 
 def confidence(density: NDArray[np.floating]) -> NDArray[np.floating]:
-    """c = 1 - exp(-M) in [0, 1), without loss of digits at small M."""
+    """C = 1 - exp(-M) in [0, 1), without loss of digits at small M."""
     return -np.expm1(-density)
 
 
@@ -86,5 +86,7 @@ def normalisation_scale(coarse: NDArray[np.floating], density: NDArray[np.floati
         raise InputError("no voxel is covered by a slice; check masks and headers")
     scale = float(np.percentile(covered, 99))
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"99th percentile of the image inside the masks is {scale:g}; expected a positive value")
+        raise InputError(
+            f"99th percentile of the image inside the masks is {scale:g}; expected a positive value"
+        )
     return scale

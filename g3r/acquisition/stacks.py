@@ -50,7 +50,9 @@ class Stack:
         if image.ndim != 3:
             raise InputError(f"{self.name}: has shape {image.shape}; expected a 3D stack of slices")
         if mask.shape != image.shape:
-            raise InputError(f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same")
+            raise InputError(
+                f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same"
+            )
         if image.shape[2] < 2:
             raise InputError(f"{self.name}: holds {image.shape[2]} slice; expected a stack of at least 2")
         try:
@@ -60,7 +62,9 @@ class Stack:
         axes = affine[:3, :3] / spacing
         cosine = np.abs(axes.T @ axes - np.eye(3)).max()
         if cosine > ORTHOGONALITY_TOLERANCE:
-            raise InputError(f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes")
+            raise InputError(
+                f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes"
+            )
         low, high = THICKNESS_RANGE_MM
         if not (np.isfinite(self.thickness_mm) and low <= self.thickness_mm <= high):
             raise InputError(
@@ -72,7 +76,9 @@ class Stack:
         inside = image[mask]
         n_bad = int((~np.isfinite(inside)).sum())
         if n_bad:
-            raise InputError(f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out")
+            raise InputError(
+                f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out"
+            )
         if inside.min() == inside.max():
             raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
         object.__setattr__(self, "image", np.where(np.isfinite(image), image, np.float32(0)))

@@ -16,7 +16,7 @@ from g3r.acquisition.planes import Planes
 from g3r.geometry import VolumeGrid
 
 MOST_SCATTER_BUFFERS = 4
-"""Each thread that scatters needs a volume of its own; more than four cost more memory than they save time."""
+"""Each thread that scatters needs its own volume; more than four cost more memory than they save time."""
 
 
 def psf_nodes(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -107,7 +107,7 @@ class VoxelOperator:
 
 
 @numba.njit(inline="always")
-def _pixel_index(p, plane, uv, index_from_plane, index_center):  # type: ignore[no-untyped-def]
+def _pixel_index(p, plane, uv, index_from_plane, index_center):
     k = plane[p]
     u, v = uv[p, 0], uv[p, 1]
     m = index_from_plane[k]
@@ -118,17 +118,17 @@ def _pixel_index(p, plane, uv, index_from_plane, index_center):  # type: ignore[
 
 
 @numba.njit(parallel=True, cache=True)
-def _gather(volume, plane, uv, index_from_plane, index_center, node_index, node_weight, pixels):  # type: ignore[no-untyped-def]
+def _gather(volume, plane, uv, index_from_plane, index_center, node_index, node_weight, pixels):
     n_i, n_j, n_k = volume.shape
     for p in numba.prange(len(plane)):
         k, x0, y0, z0 = _pixel_index(p, plane, uv, index_from_plane, index_center)
         total = 0.0
         for q in range(len(node_weight)):
             x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-            i, j, l = math.floor(x), math.floor(y), math.floor(z)
-            if i < -1 or j < -1 or l < -1 or i >= n_i or j >= n_j or l >= n_k:
+            i, j, h = math.floor(x), math.floor(y), math.floor(z)
+            if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
                 continue
-            fx, fy, fz = x - i, y - j, z - l
+            fx, fy, fz = x - i, y - j, z - h
             for a in range(2):
                 if i + a < 0 or i + a >= n_i:
                     continue
@@ -137,15 +137,15 @@ def _gather(volume, plane, uv, index_from_plane, index_center, node_index, node_
                     if j + b < 0 or j + b >= n_j:
                         continue
                     wxy = wx * (fy if b else 1.0 - fy) * node_weight[q]
-                    if l >= 0:
-                        total += wxy * (1.0 - fz) * volume[i + a, j + b, l]
-                    if l + 1 < n_k:
-                        total += wxy * fz * volume[i + a, j + b, l + 1]
+                    if h >= 0:
+                        total += wxy * (1.0 - fz) * volume[i + a, j + b, h]
+                    if h + 1 < n_k:
+                        total += wxy * fz * volume[i + a, j + b, h + 1]
         pixels[p] = total
 
 
 @numba.njit(parallel=True, cache=True)
-def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node_weight, buffers):  # type: ignore[no-untyped-def]
+def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node_weight, buffers):
     n_buffers, n_i, n_j, n_k = buffers.shape
     n = len(plane)
     for chunk in numba.prange(n_buffers):
@@ -155,10 +155,10 @@ def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node
             value = pixels[p]
             for q in range(len(node_weight)):
                 x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-                i, j, l = math.floor(x), math.floor(y), math.floor(z)
-                if i < -1 or j < -1 or l < -1 or i >= n_i or j >= n_j or l >= n_k:
+                i, j, h = math.floor(x), math.floor(y), math.floor(z)
+                if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
                     continue
-                fx, fy, fz = x - i, y - j, z - l
+                fx, fy, fz = x - i, y - j, z - h
                 for a in range(2):
                     if i + a < 0 or i + a >= n_i:
                         continue
@@ -167,7 +167,7 @@ def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node
                         if j + b < 0 or j + b >= n_j:
                             continue
                         wxy = wx * (fy if b else 1.0 - fy) * node_weight[q] * value
-                        if l >= 0:
-                            volume[i + a, j + b, l] += wxy * (1.0 - fz)
-                        if l + 1 < n_k:
-                            volume[i + a, j + b, l + 1] += wxy * fz
+                        if h >= 0:
+                            volume[i + a, j + b, h] += wxy * (1.0 - fz)
+                        if h + 1 < n_k:
+                            volume[i + a, j + b, h + 1] += wxy * fz

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
-    parser.add_argument("--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)")
+    parser.add_argument(
+        "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
+    )
     parser.add_argument("--preset", choices=PRESET_NAMES, default="balanced", help="speed against accuracy")
     parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
@@ -57,15 +60,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     n_stacks = len(options.stacks)
     if options.masks is not None and len(options.masks) != n_stacks:
-        parser.error(f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order")
+        parser.error(
+            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order"
+        )
     if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
-        parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
+        parser.error(
+            f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
+        )
     if options.threads is not None and options.threads < 1:
         parser.error(f"--threads {options.threads}; expected at least 1")
     if options.ckpt and options.no_prior:
         parser.error("--ckpt and --no-prior exclude each other")
     logging.basicConfig(
-        level=logging.WARNING if options.quiet else logging.INFO, format="g3r-infer: %(message)s", stream=sys.stderr
+        level=logging.WARNING if options.quiet else logging.INFO,
+        format="g3r-infer: %(message)s",
+        stream=sys.stderr,
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
@@ -76,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return error.exit_code
     except MemoryError:
         print(
-            "g3r-infer: memory is used up; choose a coarser --resolution or --preset draft, or crop the stacks",
+            "g3r-infer: out of memory; choose a coarser --resolution or --preset draft, or crop the stacks",
             file=sys.stderr,
         )
         return 4
@@ -90,13 +99,15 @@ def _run(options: argparse.Namespace) -> int:
 
     folder = Path(options.output)
     check_output_folder(folder, replace=options.force)  # before any work
-    stacks = _load(options)
-    from g3r.reconstruct import GaussianReconstructor
+    with _lines_held_back():
+        stacks = _load(options)
+        from g3r.reconstruct import GaussianReconstructor
 
-    _use_threads(options.threads)
-    settings = _settings(options)
+        _use_threads(options.threads)
+        settings = _settings(options)
+        reconstructor = GaussianReconstructor(options.ckpt, settings)
     with _bars(quiet=options.quiet) as progress:
-        reconstructor = GaussianReconstructor(options.ckpt, settings, progress)
+        reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, settings, folder)
         result = reconstructor.reconstruct(stacks)
@@ -112,6 +123,21 @@ def _run(options: argparse.Namespace) -> int:
     print(f"picture: {folder / 'sections.png'}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
     return 0
+
+
+@contextmanager
+def _lines_held_back() -> Iterator[None]:
+    """Keep log lines until the inputs have proved good, so that a refusal is one line."""
+    root = logging.getLogger()
+    streams = root.handlers
+    held = [MemoryHandler(1000, logging.CRITICAL + 1, stream, flushOnClose=False) for stream in streams]
+    root.handlers = list(held)
+    try:
+        yield
+        for handler in held:
+            handler.flush()
+    finally:
+        root.handlers = streams
 
 
 def _load(options: argparse.Namespace) -> list[Stack]:
@@ -142,11 +168,10 @@ def _use_threads(n: int | None) -> None:
     import numba
     import torch
 
-    wanted = n or len(os.sched_getaffinity(0))
-    if wanted > numba.config.NUMBA_NUM_THREADS:
-        raise InputError(
-            f"--threads {wanted}: this machine offers {numba.config.NUMBA_NUM_THREADS}; choose at most that"
-        )
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    wanted = n or min(len(os.sched_getaffinity(0)), most)
+    if wanted > most:
+        raise InputError(f"--threads {wanted}: this machine offers {most}; choose at most that")
     numba.set_num_threads(wanted)
     torch.set_num_threads(wanted)
 
@@ -184,6 +209,8 @@ def _bars(*, quiet: bool) -> Iterator[Progress]:
 
 
 def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
+    import numpy as np
+
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
@@ -197,7 +224,7 @@ def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
         middle = [int(n.mean()) for n in result.mask.nonzero()]
         top = float(result.volume.max()) or 1.0
         for axis, name in enumerate(("sagittal", "coronal", "axial")):
-            section = result.volume.take(middle[axis], axis=axis) / top
+            section = np.take(result.volume, middle[axis], axis=axis) / top
             writer.add_image(f"volume/{name}", section.T[::-1].copy(), dataformats="HW")
 
 

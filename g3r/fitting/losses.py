@@ -10,7 +10,8 @@ def weighted_l1(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     """Sum of weight |prediction - target| over the sum of weights; zero where nothing counts.
 
     Args:
-        prediction, target: [P].
+        prediction: [P].
+        target: [P].
         weight: [P], not negative; zero leaves a pixel out.
     """
     total = weight.sum()

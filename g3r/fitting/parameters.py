@@ -25,6 +25,7 @@ class LearningRates:
     quaternion: float = 0.02
     peak_share: float = 0.04
     log_gain: float = 0.002
+    shading: float = 0.004
     turn_rad: float = 1e-3
     shift_mm: float = 0.03
 
@@ -48,7 +49,7 @@ class CloudParameters:
 
     def cloud(self) -> GaussianCloud:
         """The present cloud, differentiable."""
-        return GaussianCloud(*self.tensors, self.origin_mm)
+        return GaussianCloud.of(self.tensors, self.origin_mm)
 
     def set_factor(self, factor: float) -> None:
         """Scale every step size."""
@@ -62,7 +63,9 @@ class CloudParameters:
             NumericalError: the loss is not finite.
         """
         if not math.isfinite(loss.item()):
-            raise NumericalError("the loss of the fit is not finite; lower the step sizes or check the intensities")
+            raise NumericalError(
+                "the loss of the fit is not finite; lower the step sizes or check the intensities"
+            )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()

@@ -45,7 +45,7 @@ class PriorStageSettings:
 class VolumeTarget:
     """A volume as planes with pixels: what stage 1 fits and what stage 2 is distilled towards.
 
-    planes [K] cover the bounding box of the mask; value [P] and weight [P] are the volume and its trust there.
+    planes [K] cover the bounding box of the mask; value [P] and weight [P] are the volume and its trust.
     """
 
     planes: Planes

@@ -13,6 +13,7 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.losses import scale_regulariser, weighted_l1
 from g3r.fitting.parameters import CloudParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, PAIR_MARGIN_SIGMA, VolumeTarget
+from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
 from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes
@@ -35,6 +36,8 @@ class SliceStageSettings:
             the mean residual by its own size would; keeps slices put that the data say nothing about.
         reweight_every: steps between two estimates of the trust in slices.
         steps_per_pair_list: steps between two searches for pairs.
+        optimise_shading: whether stacks have a smooth intensity field each (two stacks or more).
+        shading_ridge: weight of the mean squared coefficient of the fields.
         amplitude: "exact", or "printed" for comparison.
         rates: step sizes.
     """
@@ -46,22 +49,29 @@ class SliceStageSettings:
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.5, 0.05))
     distillation_planes: float = 0.1
     optimise_poses: bool = True
-    pose_prior_mm: float = 2.0
+    pose_prior_mm: float = 10.0
     reweight_every: int = 20
     steps_per_pair_list: int = 10
+    optimise_shading: bool = True
+    shading_ridge: float = 0.02
     amplitude: str = "exact"
     rates: LearningRates = field(default_factory=LearningRates)
 
 
 @dataclass(frozen=True)
 class SliceFit:
-    """Result of stage 2: cloud, slices in their last poses, gain [K], weight [K], loss of each step."""
+    """Result of stage 2.
+
+    cloud; slices in their last poses; gain [K], weight [K]; loss of each step; coefficients of each stack's
+    shading (see `StackShading`; empty where it was not estimated).
+    """
 
     cloud: GaussianCloud
     slices: Slices
     gain: NDArray[np.float64]
     weight: NDArray[np.float64]
     history: list[dict[str, float]]
+    shading: list[list[float]]
 
 
 def fit_slices(
@@ -79,8 +89,10 @@ def fit_slices(
     Args:
         cloud: from stage 1.
         slices: intensities of order one, poses from registration.
-        gain, weight: [K] intensity factor and trust of each slice, from registration.
-        prior: what to stay near to; None leaves the term out.
+        gain: [K] intensity factor of each slice, from registration.
+        weight: [K] trust in each slice, from registration.
+        prior: what to stay near to, with a weight from 0 (measured) to 1 (not measured) for each voxel; None
+            leaves the term out.
         settings: how long and how hard.
         rng: draws the prior's planes.
         progress: called with (steps done, steps in all).
@@ -98,19 +110,31 @@ def fit_slices(
     if settings.peak_iterations:
         cloud = solve_peaks(
             cloud, planes, slices.value, pixel_weight.numpy(), gain=gain,
-            n_iterations=settings.peak_iterations, damping=settings.peak_damping, amplitude=settings.amplitude,
+            n_iterations=settings.peak_iterations, damping=settings.peak_damping,
+            amplitude=settings.amplitude,
         )  # fmt: skip
     turn, shift = torch.zeros(n_slices, 3), torch.zeros(n_slices, 3)
     log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
     free_gain = n_slices > 1  # the gain of a single slice cannot be told from the peaks
     extra = []
     if settings.optimise_poses:
-        extra += [(turn.requires_grad_(), settings.rates.turn_rad), (shift.requires_grad_(), settings.rates.shift_mm)]
+        extra += [
+            (turn.requires_grad_(), settings.rates.turn_rad),
+            (shift.requires_grad_(), settings.rates.shift_mm),
+        ]
     if free_gain:
         extra += [(log_gain.requires_grad_(), settings.rates.log_gain)]
+    # one stack cannot tell its shading from anatomy
+    shading = StackShading(slices) if settings.optimise_shading and len(np.unique(slices.stack_id)) > 1 else None
+    coefficients = torch.zeros(len(np.unique(slices.stack_id)), N_TERMS)
+    if shading:
+        extra.append((coefficients.requires_grad_(), settings.rates.shading))
     parameters = CloudParameters(cloud, settings.rates, extra)
     seed_log_scale = cloud.log_scale.detach().clone()
     radius_mm = float(np.sqrt(((planes.shape * planes.spacing_mm / 2) ** 2).sum(1)).mean()) / 2
+    # with the distance being a mean over the prior's trust, this makes the term the mean over the head of
+    # trust times difference: well-measured heads feel little of it, sparsely measured ones much
+    prior_share = float(prior.weight[prior.weight > 0].mean()) if prior is not None else 0.0
     history: list[dict[str, float]] = []
     for step in range(settings.n_steps):
         fraction = step / settings.n_steps
@@ -118,7 +142,9 @@ def fit_slices(
         twist = torch.cat([turn, shift], 1) if settings.optimise_poses else None
         current = parameters.cloud()
         if step % settings.steps_per_pair_list == 0:
-            pairs = find_pairs(current.detach(), moved_planes(planes, twist), CUTOFF_SIGMA + PAIR_MARGIN_SIGMA)
+            pairs = find_pairs(
+                current.detach(), moved_planes(planes, twist), CUTOFF_SIGMA + PAIR_MARGIN_SIGMA
+            )
             if prior is not None:
                 n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
                 part = prior.take(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
@@ -129,13 +155,17 @@ def fit_slices(
         pixels = render(
             current, planes, twist=twist, log_gain=centred, pairs=pairs, amplitude=settings.amplitude
         )
+        if shading:
+            pixels = pixels * shading.log_field(coefficients).exp()
         image = weighted_l1(pixels, target, pixel_weight)
         loss = image + settings.scale_weight * scale_regulariser(current.log_scale, seed_log_scale)
         entry = {"image": image.item()}
+        if shading:
+            loss = loss + settings.shading_ridge * coefficients.square().mean()
         strength = settings.distillation.at(fraction)
         if prior is not None and strength > 0:
             distance = weighted_l1(render(current, part.planes, pairs=part_pairs), part_value, part_weight)
-            loss = loss + strength * distance
+            loss = loss + strength * prior_share * distance
             entry |= {"distillation": distance.item(), "distillation_weight": strength}
         if settings.optimise_poses:
             moved_mm2 = (shift.square().sum(1) + (radius_mm * turn).square().sum(1)).mean()
@@ -151,7 +181,8 @@ def fit_slices(
     if settings.optimise_poses:
         moved = moved_planes(planes, torch.cat([turn, shift], 1))
     return SliceFit(
-        parameters.cloud().detach(), slices.with_pose(moved.pose), final_gain, trust.double().numpy(), history
+        parameters.cloud().detach(), slices.with_pose(moved.pose), final_gain, trust.double().numpy(), history,
+        coefficients.detach().double().tolist() if shading else [],
     )
 
 
@@ -162,5 +193,3 @@ def _trust(
     total = torch.zeros(n_slices).index_add_(0, plane, inside * (pixels - target).abs())
     count = torch.zeros(n_slices).index_add_(0, plane, inside)
     return slice_weights((total / count.clamp_min(1)).double().numpy()).astype(np.float32)
-
-

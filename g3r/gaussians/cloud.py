@@ -6,6 +6,7 @@ import io
 import os
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,12 @@ class GaussianCloud:
                 raise ValueError(f"{name} has shape {found}; expected {shape}")
         object.__setattr__(self, "origin_mm", np.array(self.origin_mm, dtype=np.float64).reshape(3))
 
+    @classmethod
+    def of(cls, parameters: Sequence[Tensor], origin_mm: NDArray[np.float64]) -> GaussianCloud:
+        """A cloud from the four tensors in the order of `parameters`."""
+        mean_mm, log_scale, quaternion_wxyz, peak = parameters
+        return cls(mean_mm, log_scale, quaternion_wxyz, peak, origin_mm)
+
     def __len__(self) -> int:
         return len(self.mean_mm)
 
@@ -62,15 +69,15 @@ class GaussianCloud:
 
     def take(self, index: Tensor) -> GaussianCloud:
         """The Gaussians at an index tensor or mask."""
-        return GaussianCloud(*(p[index] for p in self.parameters), self.origin_mm)
+        return GaussianCloud.of([p[index] for p in self.parameters], self.origin_mm)
 
     def detach(self) -> GaussianCloud:
         """The same values without a graph."""
-        return GaussianCloud(*(p.detach() for p in self.parameters), self.origin_mm)
+        return GaussianCloud.of([p.detach() for p in self.parameters], self.origin_mm)
 
     def double(self) -> GaussianCloud:
         """The same cloud in float64."""
-        return GaussianCloud(*(p.double() for p in self.parameters), self.origin_mm)
+        return GaussianCloud.of([p.double() for p in self.parameters], self.origin_mm)
 
     def with_peak(self, peak: Tensor) -> GaussianCloud:
         """The same shapes with other heights."""
@@ -99,7 +106,7 @@ class GaussianCloud:
         try:
             with np.load(path, allow_pickle=False) as data:
                 names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
-                return cls(*(torch.from_numpy(data[name]) for name in names), data["origin_mm"])
+                return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
 

@@ -22,12 +22,10 @@ N_PLANE_GRADIENTS = 7
 
 
 @numba.njit(inline="always", fastmath=True)
-def fast_exp(e):  # type: ignore[no-untyped-def]
+def fast_exp(e):
     """exp(e) for e in [-18, 0] within 2e-7 absolutely: a polynomial of e/16, squared four times."""
     t = e * f32(0.0625)
-    p = f32(1.0) + t * (
-        f32(1.0) + t * (f32(0.5) + t * (f32(1 / 6) + t * (f32(1 / 24) + t * f32(1 / 120))))
-    )
+    p = f32(1.0) + t * (f32(1.0) + t * (f32(0.5) + t * (f32(1 / 6) + t * (f32(1 / 24) + t * f32(1 / 120)))))
     p = p * p
     p = p * p
     p = p * p
@@ -35,7 +33,7 @@ def fast_exp(e):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def observe(mean, cov, j, r, t, psf):  # type: ignore[no-untyped-def]
+def observe(mean, cov, j, r, t, psf):
     """Mean m and covariance S = R^T Sigma R + D of Gaussian j in the frame of a plane (r, t, psf)."""
     dx, dy, dz = mean[j, 0] - t[0], mean[j, 1] - t[1], mean[j, 2] - t[2]
     mx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
@@ -61,7 +59,7 @@ def observe(mean, cov, j, r, t, psf):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz):  # type: ignore[no-untyped-def]
+def conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz):
     """The 2D Gaussian that a 3D one leaves on its plane: exponent at its centre, centre, covariance, det."""
     iz = 1.0 / szz
     cx, cy = mx - sxz * iz * mz, my - syz * iz * mz
@@ -70,7 +68,7 @@ def conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz):  # type: ignore[no-un
 
 
 @numba.njit(inline="always")
-def sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx):  # type: ignore[no-untyped-def]
+def sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx):
     """Index of the centre and the range of x rows that the ellipse touches."""
     px, py = cx / sx + 0.5 * (n_x - 1), cy / sy + 0.5 * (n_y - 1)
     half = math.sqrt(c2 * cxx) / sx
@@ -78,7 +76,7 @@ def sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True)
-def pair_mask(mean, cov, r, t, psf, half_x, half_y, cut, chosen):  # type: ignore[no-untyped-def]
+def pair_mask(mean, cov, r, t, psf, half_x, half_y, cut, chosen):
     """Number of Gaussians whose ellipsoid at the cut-off may touch a plane; their numbers into `chosen`."""
     n = 0
     for j in range(len(mean)):
@@ -102,7 +100,7 @@ def pair_mask(mean, cov, r, t, psf, half_x, half_y, cut, chosen):  # type: ignor
 
 
 @numba.njit(parallel=True, cache=True)
-def covariances(log_scale, quaternion, cov, log_volume):  # type: ignore[no-untyped-def]
+def covariances(log_scale, quaternion, cov, log_volume):
     """Sigma (xx xy xz yy yz zz) and ln(s1 s2 s3) of every Gaussian, float64."""
     for j in numba.prange(len(log_scale)):
         r = quaternion_matrix(quaternion, j)
@@ -117,7 +115,7 @@ def covariances(log_scale, quaternion, cov, log_volume):  # type: ignore[no-unty
 
 
 @numba.njit(inline="always")
-def quaternion_matrix(quaternion, j):  # type: ignore[no-untyped-def]
+def quaternion_matrix(quaternion, j):
     """Rotation (tuple of rows) of quaternion j, which is normalised first."""
     w, x, y, z = (
         float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]),
@@ -133,9 +131,9 @@ def quaternion_matrix(quaternion, j):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def forward(
-    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact,
-    n_workers, out,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut,
+    exact, n_workers, out,
+):  # fmt: skip
     """Add every pair's Gaussian, gain included, onto the flat pixels `out`."""
     n_planes = len(rotation)
     for worker in numba.prange(n_workers):
@@ -144,7 +142,9 @@ def forward(
             sx, sy = spacing[k, 0], spacing[k, 1]
             for pair in range(start[k], start[k + 1]):
                 j = order[pair]
-                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(mean, cov, j, rotation[k], center[k], psf[k])
+                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(
+                    mean, cov, j, rotation[k], center[k], psf[k]
+                )
                 ez, cx, cy, cxx, cxy, cyy, det = conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz)
                 c2 = cut + 2.0 * ez
                 if c2 <= 0.0 or not det > 0.0:
@@ -154,7 +154,11 @@ def forward(
                     height *= math.exp(log_volume[j]) / math.sqrt(det * szz)
                 px, py, x0, x1 = sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx)
                 amplitude = f32(height)
-                qx, qxy, qy = f32(-0.5 * cyy / det * sx * sx), cxy / det * sx * sy, f32(-0.5 * cxx / det * sy * sy)
+                qx, qxy, qy = (
+                    f32(-0.5 * cyy / det * sx * sx),
+                    cxy / det * sx * sy,
+                    f32(-0.5 * cxx / det * sy * sy),
+                )
                 slope, width = cxy / cxx * sx / sy, math.sqrt(det / cxx) / sy
                 for x in range(x0, x1 + 1):
                     ddx = x - px
@@ -170,7 +174,7 @@ def forward(
 
 
 @numba.njit(inline="always")
-def sweep_moments(weight, row0, n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx, sy):  # type: ignore[no-untyped-def]
+def sweep_moments(weight, row0, n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx, sy):
     """Six moments (mm) of weight times the 2D Gaussian about the Gaussian's centre on the plane."""
     qx, qxy, qy = f32(-0.5 * cyy / det * sx * sx), cxy / det * sx * sy, f32(-0.5 * cxx / det * sy * sy)
     slope, width = cxy / cxx * sx / sy, math.sqrt(det / cxx) / sy
@@ -190,12 +194,12 @@ def sweep_moments(weight, row0, n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx,
             s0 += g
             s1 += g * ddy
             s2 += g * ddy * ddy
-        m0 += s0
+        m0 += float(s0)
         m1 += ddx * s0
-        m2 += s1
+        m2 += float(s1)
         m3 += ddx * ddx * s0
         m4 += ddx * s1
-        m5 += s2
+        m5 += float(s2)
     return m0, m1 * sx, m2 * sy, m3 * sx * sx, m4 * sx * sy, m5 * sy * sy
 
 
@@ -203,7 +207,7 @@ def sweep_moments(weight, row0, n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx,
 def adjoint_peak(
     mean, cov, log_volume, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact,
     n_workers, weight, buffers,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """A^T w for y = A c: gradient of sum(w y) in the peaks alone, into buffers [n_workers, N]."""
     n_planes = len(rotation)
     for worker in numba.prange(n_workers):
@@ -212,7 +216,9 @@ def adjoint_peak(
             sx, sy = spacing[k, 0], spacing[k, 1]
             for pair in range(start[k], start[k + 1]):
                 j = order[pair]
-                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(mean, cov, j, rotation[k], center[k], psf[k])
+                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(
+                    mean, cov, j, rotation[k], center[k], psf[k]
+                )
                 ez, cx, cy, cxx, cxy, cyy, det = conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz)
                 c2 = cut + 2.0 * ez
                 if c2 <= 0.0 or not det > 0.0:

@@ -12,9 +12,9 @@ from g3r.gaussians.kernels import conditional, observe, quaternion_matrix, sweep
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def backward(
-    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact,
-    n_workers, weight, buffers, plane_gradient,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut,
+    exact, n_workers, weight, buffers, plane_gradient,
+):  # fmt: skip
     """Gradients of sum(weight * pixels) by the moments G0, G1, G2 of each pair.
 
     buffers [n_workers, N, 11] and plane_gradient [K, 7] are added to; columns as in `kernels`.
@@ -106,7 +106,7 @@ def backward(
 
 
 @numba.njit(cache=True)
-def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):  # type: ignore[no-untyped-def]
+def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
     n_workers = len(buffers)
     g = buffers[0, j].copy()
     for worker in range(1, n_workers):
@@ -150,7 +150,7 @@ def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, sca
 
 
 @numba.njit(parallel=True, cache=True)
-def shape_gradients(log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):  # type: ignore[no-untyped-def]
+def shape_gradients(log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
     """Sum the workers' buffers and turn dL/dSigma into gradients of log-scales and quaternions.
 
     Sigma = M M^T with M = R diag(s): dL/dM = 2 T M, dL/dln s_a = sum_i dM_ia M_ia (+ the log-volume's),

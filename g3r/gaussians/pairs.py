@@ -59,7 +59,9 @@ class CloudArrays:
     @classmethod
     def of(cls, cloud: GaussianCloud) -> CloudArrays:
         """Views and derived arrays of a cloud on the CPU."""
-        mean, log_scale, quaternion, peak = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters)
+        mean, log_scale, quaternion, peak = (
+            np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters
+        )
         covariance, log_volume = np.empty((len(mean), 6)), np.empty(len(mean))
         kernels.covariances(log_scale, quaternion, covariance, log_volume)
         return cls(

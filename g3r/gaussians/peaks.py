@@ -40,16 +40,22 @@ class PeakSystem:
         """The system for the shapes of a cloud (its peaks are not read)."""
         if pairs is None:
             pairs = find_pairs(cloud, planes, cutoff_sigma)
-        gain = np.ones(len(planes)) if gain is None else np.asarray(gain, dtype=np.float64)
+        factor = np.asarray(np.ones(len(planes)) if gain is None else gain, dtype=np.float64)
         arrays = CloudArrays.of(cloud)
-        before, after = plane_arguments(arrays, planes, planes.center_mm - cloud.origin_mm, gain, pairs)
+        before, after = plane_arguments(arrays, planes, planes.center_mm - cloud.origin_mm, factor, pairs)
         return cls(before, after, len(cloud), planes.n_pixels, cutoff_sigma**2, amplitude == "exact")
 
-    def forward(self, peak: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, peak: NDArray[np.floating]) -> NDArray[np.float32]:
         """Pixels [P] of peaks [N]."""
         out = np.zeros(self.n_pixels, np.float32)
-        kernels.forward(
-            *self.before, peak.astype(np.float32), *self.after, self.cut, self.exact, numba.get_num_threads(), out
+        kernels.forward(  # type: ignore[call-arg]
+            *self.before,
+            peak.astype(np.float32),
+            *self.after,
+            self.cut,
+            self.exact,
+            numba.get_num_threads(),
+            out,
         )
         return out
 
@@ -58,7 +64,7 @@ class PeakSystem:
         n_workers = numba.get_num_threads()
         buffers = np.zeros((n_workers, self.n_gaussians))
         weight = np.ascontiguousarray(pixels, dtype=np.float32)
-        kernels.adjoint_peak(*self.before, *self.after, self.cut, self.exact, n_workers, weight, buffers)
+        kernels.adjoint_peak(*self.before, *self.after, self.cut, self.exact, n_workers, weight, buffers)  # type: ignore[call-arg]
         return buffers.sum(0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,7 +26,7 @@ def render_reference(
     Works in the dtype and on the device of the cloud; differentiable by autograd in everything.
     """
     mean, log_scale, quaternion, peak = cloud.parameters
-    like = {"dtype": mean.dtype, "device": mean.device}
+    like: dict[str, Any] = {"dtype": mean.dtype, "device": mean.device}
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None, :]
     covariance = root @ root.transpose(1, 2)
     pixels = []
@@ -35,7 +37,9 @@ def render_reference(
         if twist is not None:
             rotation = rotation @ torch.linalg.matrix_exp(_skew(twist[k, :3].to(**like)))
             center = center + twist[k, 3:].to(**like)
-        observed = rotation.T @ covariance @ rotation + torch.diag(torch.as_tensor(planes.psf_var_mm2[k], **like))
+        observed = rotation.T @ covariance @ rotation + torch.diag(
+            torch.as_tensor(planes.psf_var_mm2[k], **like)
+        )
         chol = torch.linalg.cholesky(observed)
         local_mean = (mean - center) @ rotation
         if amplitude == "exact":

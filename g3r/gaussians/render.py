@@ -48,7 +48,8 @@ def render(
         planes: K planes.
         twist: [K, 6] change of the poses: R <- R exp(w) (rad, body frame), t <- t + v (mm, world).
         log_gain: [K] logarithm of the intensity factor of each plane.
-        backend: "numba" (CPU, gradients by moments), or "reference" (plain torch, dense, any dtype, no cut-off).
+        backend: "numba" (CPU, gradients by moments), or "reference" (plain torch, dense, any dtype, no
+            cut-off).
         amplitude: "exact", or "printed" for B = 1 as G3R Eq. 5 stands in print (for comparison).
         cutoff_sigma: where a Gaussian ends, up to 6 (numba only).
         pairs: list from `find_pairs`, to be used again while nothing moves far (numba only).
@@ -87,7 +88,11 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
 
 
 def plane_arguments(
-    arrays: CloudArrays, planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: PairList
+    arrays: CloudArrays,
+    planes: Planes,
+    center: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    pairs: PairList,
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Arguments of the kernels in front of and behind the cloud's peaks."""
     before = (arrays.mean, arrays.covariance, arrays.log_volume)
@@ -100,7 +105,7 @@ def plane_arguments(
 
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         mean: Tensor,
         log_scale: Tensor,
@@ -120,19 +125,21 @@ class _Render(torch.autograd.Function):
         before, after = plane_arguments(arrays, moved, moved.center_mm - origin_mm, gain, pairs)
         out = np.zeros(planes.n_pixels, np.float32)
         n_workers = numba.get_num_threads()
-        kernels.forward(*before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, out)
+        kernels.forward(*before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, out)  # type: ignore[call-arg]
         ctx.saved = (arrays, before, after, cutoff_sigma, exact, n_workers, twist)
-        ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, peak, twist, log_gain)]
+        ctx.like = [
+            None if p is None else p.dtype for p in (mean, log_scale, quaternion, peak, twist, log_gain)
+        ]
         return torch.from_numpy(out).to(mean.dtype)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         arrays, before, after, cutoff_sigma, exact, n_workers, twist = ctx.saved
         n, n_planes = len(arrays.mean), len(after[0])
         buffers = np.zeros((n_workers, n, kernels.N_GRADIENTS))
         plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
         weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
-        kernels_backward.backward(
+        kernels_backward.backward(  # type: ignore[call-arg]
             *before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, weight, buffers, plane_gradient
         )
         peak, mean = np.empty(n), np.empty((n, 3))

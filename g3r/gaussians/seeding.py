@@ -12,7 +12,7 @@ from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
 
 SCALE_PER_SPACING = 0.6
-"""Sigma of a seed over the lattice spacing: neighbours overlap enough for a constant to come out flat to 2 %."""
+"""Sigma of a seed over the lattice spacing: neighbours overlap so that a constant comes out flat to 2 %."""
 
 COARSE_FACTOR = 2
 """Spacing in regions without structure, over the fine one."""
@@ -50,7 +50,9 @@ def seed_cloud(
     if not mask.any():
         raise ValueError("the foreground is empty")
     voxel = float(grid.spacing_mm.mean())
-    gradient = np.stack([gaussian_filter(volume, 1.0, order=np.eye(3, dtype=int)[a]) / voxel for a in range(3)])
+    gradient = np.stack(
+        [gaussian_filter(volume, 1.0, order=np.eye(3, dtype=int)[a]) / voxel for a in range(3)]
+    )
     strength = gaussian_filter(np.sqrt((gradient**2).sum(0)), spacing_mm / voxel)
     corners = grid.world(np.argwhere(mask))
     low, high = corners.min(0), corners.max(0)
@@ -87,12 +89,14 @@ def _lattice(low: NDArray[np.float64], high: NDArray[np.float64], spacing_mm: fl
 
 def _inside(points: NDArray[np.float64], mask: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.float64]:
     index = np.rint(grid.index(points)).astype(int)
-    ok = ((index >= 0) & (index < mask.shape)).all(1)
+    ok = np.asarray(((index >= 0) & (index < mask.shape)).all(1))
     ok[ok] = mask[tuple(index[ok].T)]
     return points[ok]
 
 
-def _sample(volume: NDArray[np.floating], grid: VolumeGrid, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sample(
+    volume: NDArray[np.floating], grid: VolumeGrid, points: NDArray[np.float64]
+) -> NDArray[np.float64]:
     return map_coordinates(volume, grid.index(points).T, order=1, mode="nearest", output=np.float64)
 
 

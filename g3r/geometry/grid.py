@@ -52,7 +52,7 @@ class VolumeGrid:
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
         """Distance of neighbouring voxels along each axis [3]."""
-        return np.linalg.norm(self.affine[:3, :3], axis=0)
+        return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0), dtype=np.float64)
 
     @property
     def voxel_volume_mm3(self) -> float:
@@ -67,7 +67,7 @@ class VolumeGrid:
     @property
     def index_from_world(self) -> NDArray[np.float64]:
         """The affine [4, 4] from world to (fractional) index."""
-        return np.linalg.inv(self.affine)
+        return np.asarray(np.linalg.inv(self.affine), dtype=np.float64)
 
     def world(self, index: ArrayLike) -> NDArray[np.float64]:
         """World positions (mm) of indices [..., 3]."""

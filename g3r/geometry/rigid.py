@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+
+Selection = NDArray[np.integer] | NDArray[np.bool_] | Sequence[int] | slice
+"""What `take` accepts: numbers, a mask, or a slice."""
 
 ORTHONORMALITY_TOLERANCE = 1e-6
 """Largest accepted entry of R R^T - 1; a rotation read from text has about 1e-7."""
@@ -77,7 +81,7 @@ class RigidPose:
         """Rotation vectors [S, 3] (rad), angle in [0, pi]."""
         return Rotation.from_matrix(self.rotation).as_rotvec()
 
-    def take(self, index: ArrayLike) -> RigidPose:
+    def take(self, index: Selection) -> RigidPose:
         """The motions at an index array, a mask or a slice."""
         return RigidPose(self.rotation[index], self.translation_mm[index])
 

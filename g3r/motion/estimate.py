@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
+from g3r.geometry.rigid import fit_rigid
 from g3r.motion.normal_equations import SliceModel
 from g3r.motion.slice_registration import register_slices, try_neighbours
 from g3r.motion.stack_registration import register_stacks
 from g3r.motion.volume import grid_around, solve_volume
 
 logger = logging.getLogger(__name__)
+
+
+HEADER_REACH_MM = 2.0
+"""Slices further than this from the common motion hardly take part in finding it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,9 @@ def estimate_motion(
         smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
         if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
             grid, volume = grid_around(slices, voxel), None
-        stride = max(1, round(len(slices.pixel_index) / settings.pixels_at_most * (voxel / settings.finest_voxel_mm)))
+        stride = max(
+            1, round(len(slices.pixel_index) / settings.pixels_at_most * (voxel / settings.finest_voxel_mm))
+        )
         volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
         model = SliceModel(slices, volume, grid, stride=stride)
         residual = model.residuals(slices.planes, gain)
@@ -89,15 +96,42 @@ def estimate_motion(
         moved = 0
         if 0.1 < fraction < 0.8:
             slices, moved = try_neighbours(model, slices, gain, width=width)
-        slices, gain, fit = register_slices(model, slices, gain, n_steps=settings.steps_per_round, width=width)
+        slices, gain, fit = register_slices(
+            model, slices, gain, n_steps=settings.steps_per_round, width=width
+        )
         weight = slice_weights(fit.loss)
         history.append(
-            {"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": float(np.median(fit.ncc)), "moved": moved}
+            {"round": number, "voxel_mm": voxel, "residual": width / 2,
+             "median_ncc": float(np.median(fit.ncc)), "moved": moved}
         )  # fmt: skip
-        logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
+        logger.info(
+            "slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved
+        )
     progress(n_rounds, n_rounds)
+    slices = centred_on_headers(slices)
     ncc = _final_ncc(slices, gain, weight, settings)
     return MotionEstimate(slices, gain, weight, ncc, agreement, history)
+
+
+def centred_on_headers(slices: Slices) -> Slices:
+    """Take out the motion that all slices share, as their headers see it.
+
+    Poses are determined up to one rigid motion of the whole head. This choice keeps the volume where the
+    scanner's coordinates say it is, on (robust) average over all slices.
+    """
+    corners = np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    size_mm = slices.planes.shape * slices.planes.spacing_mm
+    half = np.pad(size_mm / 2, ((0, 0), (0, 1)))
+    local = half[:, None, :] * corners
+    here = slices.planes.pose.apply(local).reshape(-1, 3)
+    header = slices.header_pose.apply(local).reshape(-1, 3)
+    area = np.repeat(size_mm.prod(1), len(corners))
+    weight = area
+    for _ in range(10):
+        back = fit_rigid(here, header, weight)
+        away_mm = np.linalg.norm(back.apply(here[None])[0] - header, axis=1)
+        weight = area / (1 + (away_mm / HEADER_REACH_MM) ** 2)
+    return slices.with_pose(back @ slices.planes.pose)
 
 
 def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,8 +1,8 @@
 """Normal equations of rigid slice-to-volume registration, all slices at once, through the PSF.
 
 For a slice in pose (R, t) with gain g the model of a pixel at u is g sum_q w_q V(R (u + u_q) + t), with the
-PSF's quadrature nodes u_q. Parameters of a slice are a body-frame turn w (R <- R exp[w]), a body-frame shift v
-(t <- t + R v) and the logarithm of the gain; with the gradient h = R^T grad V the derivatives are
+PSF's quadrature nodes u_q. Parameters of a slice are a body-frame turn w (R <- R exp[w]), a body-frame shift
+v (t <- t + R v) and the logarithm of the gain; with the gradient h = R^T grad V the derivatives are
 u x h, h and the model itself. Residuals count with the Cauchy loss of a common width.
 """
 
@@ -96,14 +96,15 @@ class SliceModel:
     def residuals(self, planes: Planes, gain: NDArray[np.float64]) -> NDArray[np.float32]:
         """Slice minus model for every pixel in use."""
         self.operator.move(planes)
-        return self.value - (gain[self.operator.plane] * self.operator.forward(self.volume)).astype(np.float32)
+        model = gain[self.operator.plane] * self.operator.forward(self.volume)
+        return self.value - model.astype(np.float32)
 
 
 @numba.njit(parallel=True, cache=True)
 def _accumulate(
     volume, start, uv, value, weight, index_from_plane, index_center, node_index, node_mm, node_weight, gain,
     width, hessian, gradient, loss, moments,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     n_i, n_j, n_k = volume.shape
     for k in numba.prange(len(start) - 1):
         m = index_from_plane[k]
@@ -118,14 +119,14 @@ def _accumulate(
             jac[:] = 0.0
             for q in range(len(node_weight)):
                 x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-                i, j, l = math.floor(x), math.floor(y), math.floor(z)
-                if i < 0 or j < 0 or l < 0 or i + 1 >= n_i or j + 1 >= n_j or l + 1 >= n_k:
+                i, j, h = math.floor(x), math.floor(y), math.floor(z)
+                if i < 0 or j < 0 or h < 0 or i + 1 >= n_i or j + 1 >= n_j or h + 1 >= n_k:
                     continue
-                fx, fy, fz = x - i, y - j, z - l
-                a000, a001 = volume[i, j, l], volume[i, j, l + 1]
-                a010, a011 = volume[i, j + 1, l], volume[i, j + 1, l + 1]
-                a100, a101 = volume[i + 1, j, l], volume[i + 1, j, l + 1]
-                a110, a111 = volume[i + 1, j + 1, l], volume[i + 1, j + 1, l + 1]
+                fx, fy, fz = x - i, y - j, z - h
+                a000, a001 = volume[i, j, h], volume[i, j, h + 1]
+                a010, a011 = volume[i, j + 1, h], volume[i, j + 1, h + 1]
+                a100, a101 = volume[i + 1, j, h], volume[i + 1, j, h + 1]
+                a110, a111 = volume[i + 1, j + 1, h], volume[i + 1, j + 1, h + 1]
                 b00, b01 = a000 + fz * (a001 - a000), a010 + fz * (a011 - a010)
                 b10, b11 = a100 + fz * (a101 - a100), a110 + fz * (a111 - a110)
                 c0, c1 = b00 + fy * (b01 - b00), b10 + fy * (b11 - b10)

@@ -22,12 +22,12 @@ GAIN_PRIOR_SIGMA = 0.3
 NEIGHBOURS = (-2, -1, 1, 2)
 
 TIE_SHARE = 0.01
-"""Stiffness of the tie between neighbours, as a share of the median slice's own stiffness: a slice through the
-middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
+"""Stiffness of the tie between neighbours, as a share of the median slice's own stiffness: a slice through
+the middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
 
 TIE_REACH_MM = 3.0
-"""Neighbours that would put a slice further away than this count less: after a jerk, and between the passes of
-an interleaved stack, neighbours lie elsewhere for good reason."""
+"""Neighbours that would put a slice further away than this count less: after a jerk, and between the passes
+of an interleaved stack, neighbours lie elsewhere for good reason."""
 
 
 def register_slices(
@@ -120,7 +120,8 @@ class NeighbourTie:
         pose = slices.planes.pose
         information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
         # a turn is judged by how far it moves the slice's rim; slices of a few pixels have hardly any
-        radius_mm = np.maximum(np.sqrt(((slices.planes.shape * slices.planes.spacing_mm / 2) ** 2).mean(1)), 10.0)
+        half_mm = slices.planes.shape * slices.planes.spacing_mm / 2
+        radius_mm = np.maximum(np.sqrt((half_mm**2).mean(1)), 10.0)
         rotation = np.zeros((n, 3, 3))
         translation, total = np.zeros((n, 3)), np.zeros(n)
         for step in NEIGHBOURS:
@@ -184,7 +185,7 @@ def _solve(
         np.stack([diagonal[:, :3].max(1), diagonal[:, 3:6].max(1), diagonal[:, 6]], 1), [3, 3, 1], axis=1
     )
     hessian += np.eye(7) * (damping[:, None] * diagonal + floor * 1e-2 + 1e-20)[:, None, :]
-    step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+    step = np.asarray(np.linalg.solve(hessian, gradient[..., None])[..., 0], dtype=np.float64)
     step[:, :3] *= _limit(step[:, :3], LARGEST_TURN_RAD)
     step[:, 3:6] *= _limit(step[:, 3:6], LARGEST_SHIFT_MM)
     step[:, 6] = np.clip(step[:, 6], -0.3, 0.3)

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
-from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix
 from g3r.motion.normal_equations import SliceModel, correlation
 from g3r.motion.volume import grid_around, solve_volume

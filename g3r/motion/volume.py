@@ -33,7 +33,8 @@ def solve_volume(
         smoothness: weight of squared differences of neighbouring voxels.
     """
     seen = operator.adjoint(weight.astype(np.float32))
-    strength = np.float32(smoothness * float(seen[seen > 0.1 * seen.max(initial=0)].mean() if seen.any() else 1.0))
+    typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
+    strength = np.float32(smoothness * typical)
 
     def normal(volume: NDArray[np.float32]) -> NDArray[np.float32]:
         return operator.adjoint(weight * operator.forward(volume)) + strength * _laplacian(volume)

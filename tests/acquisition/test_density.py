@@ -20,7 +20,11 @@ TURNS = {
 
 
 def cube_stack(
-    pixel_mm: float = 1.0, thickness_mm: float = 3.0, distance_mm: float | None = None, turn=np.eye(3), value: float | None = 7.0
+    pixel_mm: float = 1.0,
+    thickness_mm: float = 3.0,
+    distance_mm: float | None = None,
+    turn=TURNS["axial"],
+    value: float | None = 7.0,
 ) -> Stack:
     """A stack whose mask is a cube of 40 mm about the origin."""
     spacing = np.array([pixel_mm, pixel_mm, distance_mm or thickness_mm])
@@ -97,7 +101,9 @@ def test_weight_zero_leaves_pixels_out():
     stacks = [cube_stack(value=7.0), cube_stack(value=9000.0)]
     slices = slices_from_stacks(stacks)
     weight = (slices.stack_id[slices.pixel_plane] == 0).astype(np.float32)
-    coarse, density = coarse_and_density(slices, VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0), weight=weight)
+    coarse, density = coarse_and_density(
+        slices, VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0), weight=weight
+    )
     np.testing.assert_allclose(coarse, 7, rtol=1e-4)
     assert density.mean() == pytest.approx(1, abs=0.02)
 
@@ -150,8 +156,12 @@ def test_normalisation_scale_is_the_99th_percentile_of_what_was_seen():
 
 @pytest.mark.parametrize(
     ("coarse", "density", "message"),
-    [(np.ones(5), np.zeros(5), "no voxel is covered"), (np.zeros(5), np.ones(5), "positive"), (-np.ones(5), np.ones(5), "-1")],
-)  # fmt: skip
+    [
+        (np.ones(5), np.zeros(5), "no voxel is covered"),
+        (np.zeros(5), np.ones(5), "positive"),
+        (-np.ones(5), np.ones(5), "-1"),
+    ],
+)
 def test_normalisation_scale_refuses(coarse, density, message):
     with pytest.raises(InputError, match=message):
         normalisation_scale(coarse, density)

@@ -62,7 +62,9 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str):
     image, mask = arrays()
     affine = affine_of(AXES[name])
     stack = load_stack(
-        write(tmp_path / "a.nii.gz", image, affine), write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine), 2.5
+        write(tmp_path / "a.nii.gz", image, affine),
+        write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine),
+        2.5,
     )
     kept = mask.sum((0, 1)) >= 12
     slices = slices_from_stacks([stack])
@@ -159,7 +161,9 @@ def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.
     assert normal_sigma == pytest.approx(2.2 / 2.3548, rel=1e-4)
 
 
-def test_without_a_mask_positive_voxels_count_and_a_line_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_without_a_mask_positive_voxels_count_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     image, mask = arrays()
     stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])))
     np.testing.assert_array_equal(stack.mask, mask)
@@ -195,7 +199,10 @@ def test_take_keeps_pixels_values_and_slices_together(index):
     world, offset = slices.planes.pixel_world_mm(), slices.planes.offset
     part_world = part.planes.pixel_world_mm()
     for new, old in enumerate(chosen):
-        old_pixels, new_pixels = slice(offset[old], offset[old + 1]), slice(*part.planes.offset[new : new + 2])
+        old_pixels, new_pixels = (
+            slice(offset[old], offset[old + 1]),
+            slice(*part.planes.offset[new : new + 2]),
+        )
         np.testing.assert_array_equal(part.value[new_pixels], slices.value[old_pixels])
         np.testing.assert_array_equal(part.mask[new_pixels], slices.mask[old_pixels])
         np.testing.assert_array_equal(part_world[new_pixels], world[old_pixels])
@@ -220,10 +227,11 @@ def test_slices_with_hardly_a_pixel_are_left_out():
     mask[5:8, 5:8, 2] = True
     slices = slices_from_stacks([Stack(image, mask, affine_of(AXES["RAS"]), 3.0)])
     assert 2 not in slices.slice_index
+    mask[:] = False
+    mask[5:8, 5:8] = True
+    lonely = Stack(image, mask, affine_of(AXES["RAS"]), 3.0, "lonely")
     with pytest.raises(InputError, match=r"lonely.*12 masked pixels"):
-        mask[:] = False
-        mask[5:8, 5:8] = True
-        slices_from_stacks([Stack(image, mask, affine_of(AXES["RAS"]), 3.0, "lonely")])
+        slices_from_stacks([lonely])
 
 
 def test_volume_planes_are_the_volume_in_order():
@@ -267,7 +275,10 @@ def bad_files(folder: Path) -> dict[str, Path]:
     """One file per way of being unusable."""
     image, _ = arrays()
     affine = affine_of(AXES["RAS"])
-    files = {name: folder / f"{name}.nii.gz" for name in ("missing", "text", "frames", "complex", "colour", "singular")}
+    files = {
+        name: folder / f"{name}.nii.gz"
+        for name in ("missing", "text", "frames", "complex", "colour", "singular")
+    }
     files["text"].write_text("not an image\n")
     write(files["frames"], np.zeros((4, 4, 4, 3), np.float32), affine)
     write(files["complex"], np.ones((4, 4, 4), np.complex64), affine)
@@ -285,7 +296,9 @@ def bad_files(folder: Path) -> dict[str, Path]:
     files["singular"] = raw
     files["folder"] = folder / "folder.nii.gz"
     files["folder"].mkdir()
-    whole = write(folder / "whole.nii.gz", np.random.default_rng(0).normal(size=image.shape), affine).read_bytes()
+    whole = write(
+        folder / "whole.nii.gz", np.random.default_rng(0).normal(size=image.shape), affine
+    ).read_bytes()
     files["cut off"] = folder / "cut.nii.gz"
     files["cut off"].write_bytes(whole[: len(whole) // 2])
     files["cut header"] = folder / "cuthead.nii.gz"
@@ -366,7 +379,13 @@ SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))
 )
 def test_unusable_stacks_are_refused(change, message):
     image, mask = arrays()
-    good = {"image": image, "mask": mask, "affine": affine_of(AXES["RAS"]), "thickness_mm": 3.0, "name": "a.nii"}
+    good = {
+        "image": image,
+        "mask": mask,
+        "affine": affine_of(AXES["RAS"]),
+        "thickness_mm": 3.0,
+        "name": "a.nii",
+    }
     Stack(**good)
     with pytest.raises(InputError, match=message) as caught:
         Stack(**(good | change))
@@ -379,7 +398,14 @@ def test_no_stack_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change", [{"spacing_mm": [[0.0, 1]]}, {"shape": [[0, 3]]}, {"psf_var_mm2": [[-1.0, 0, 0]]}, {"center_mm": [[np.nan, 0, 0]]}, {"center_mm": [[0.0, 0]]}]
+    "change",
+    [
+        {"spacing_mm": [[0.0, 1]]},
+        {"shape": [[0, 3]]},
+        {"psf_var_mm2": [[-1.0, 0, 0]]},
+        {"center_mm": [[np.nan, 0, 0]]},
+        {"center_mm": [[0.0, 0]]},
+    ],
 )
 def test_planes_without_meaning_are_refused(change):
     good = {

@@ -39,7 +39,9 @@ def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]):
     volume, pixels = rng.normal(size=GRID.shape), rng.normal(size=len(index))
     image, back = operator.forward(volume), operator.adjoint(pixels)
     assert (image == 0).any()  # some pixels see nothing
-    assert np.abs(image @ pixels - (volume * back).sum()) <= 1e-12 * np.linalg.norm(image) * np.linalg.norm(pixels)
+    assert np.abs(image @ pixels - (volume * back).sum()) <= 1e-12 * np.linalg.norm(image) * np.linalg.norm(
+        pixels
+    )
 
 
 def test_the_adjoint_is_exact_with_several_buffers():

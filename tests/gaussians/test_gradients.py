@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import GaussianCloud, render
-from scipy.spatial.transform import Rotation
 
 NAMES = ("mean_mm", "log_scale", "quaternion_wxyz", "peak", "twist", "log_gain")
 
@@ -52,7 +53,9 @@ def test_numba_gradients_agree_with_float64_autograd(seed, amplitude, psf):
     expected, expected_grad = gradients(
         leaves, planes, weight, torch.float64, backend="reference", amplitude=amplitude
     )
-    found, found_grad = gradients(leaves, planes, weight, torch.float32, cutoff_sigma=6.0, amplitude=amplitude)
+    found, found_grad = gradients(
+        leaves, planes, weight, torch.float32, cutoff_sigma=6.0, amplitude=amplitude
+    )
     # the cut-off at 6 sigma leaves 1.5e-8 of a peak, the polynomial exponential 2e-7
     assert (found - expected).abs().max() < 3e-6 * expected.abs().max()
     for name, a, b in zip(NAMES, expected_grad, found_grad, strict=True):
@@ -67,7 +70,11 @@ def test_reference_gradcheck(amplitude):
     )
     leaves = [leaf.requires_grad_() for leaf in leaves]
     assert torch.autograd.gradcheck(
-        lambda *x: image(x, planes, backend="reference", amplitude=amplitude), leaves, rtol=1e-8, atol=1e-8, eps=1e-6
+        lambda *x: image(x, planes, backend="reference", amplitude=amplitude),
+        leaves,
+        rtol=1e-8,
+        atol=1e-8,
+        eps=1e-6,
     )
 
 

@@ -1,4 +1,4 @@
-"""Both renderers against 3D quadrature of G3R Eq. 2, written here without any of their code; invariances; limits."""
+"""Both renderers against 3D quadrature of G3R Eq. 2, written here without their code; invariances; limits."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,9 @@ from g3r.gaussians import GaussianCloud, find_pairs, render
 from g3r.geometry import RigidPose, VolumeGrid
 
 
-def make_cloud(seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0, -30.0, 20.0)) -> GaussianCloud:
+def make_cloud(
+    seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0, -30.0, 20.0)
+) -> GaussianCloud:
     rng = np.random.default_rng(seed)
     return GaussianCloud(
         torch.tensor(rng.normal(0, spread_mm, (n, 3))),
@@ -101,9 +103,15 @@ def test_both_backends_agree_with_quadrature(seed: int):
 @pytest.mark.parametrize("backend", ["reference", "numba"])
 def test_the_printed_amplitude_is_off_by_the_factor_of_the_design(backend: str):
     """0.53 at sigma 1 mm, 0.8 mm pixels, 3 mm slices; quadrature sides with the exact form."""
-    one = GaussianCloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1), np.zeros(3))
+    one = GaussianCloud(
+        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1), np.zeros(3)
+    )
     planes = Planes(
-        np.eye(3)[None], np.zeros((1, 3)), [[0.8, 0.8]], [[1, 1]], psf_variance_mm2([[0.8, 0.8]], np.array([3.0]))
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        [[0.8, 0.8]],
+        [[1, 1]],
+        psf_variance_mm2([[0.8, 0.8]], np.array([3.0])),
     )
     exact = render(one, planes, backend=backend).item()
     printed = render(one, planes, backend=backend, amplitude="printed").item()
@@ -125,14 +133,14 @@ def test_without_psf_a_plane_samples_the_volume(backend: str):
 def test_a_volume_is_its_planes():
     cloud = make_cloud(4, 8)
     affine = np.diag([-1.0, 1.2, 0.9, 1])
-    affine[:3, 3] = cloud.origin_mm + [4, -5, -4]
+    affine[:3, 3] = cloud.origin_mm + np.array([4, -5, -4])
     grid = VolumeGrid((9, 8, 7), affine)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
     expected = volume_at(cloud, grid.world(index).transpose(2, 0, 1, 3).reshape(-1, 3))
     np.testing.assert_allclose(render(cloud, volume_planes(grid), backend="reference"), expected, atol=1e-12)
 
 
-# -- invariances -----------------------------------------------------------------------------------------------
+# -- invariances -----------------------------------------------------------------------------------
 
 
 def images(cloud: GaussianCloud, planes: Planes) -> Iterator[tuple[np.ndarray, float]]:
@@ -161,7 +169,9 @@ def test_moving_the_whole_world_changes_nothing():
 
 def test_the_order_of_gaussians_does_not_matter():
     cloud, planes = make_cloud(6, 30), make_planes(6)
-    assert_same_images((cloud, planes), (cloud.take(torch.randperm(30, generator=torch.Generator().manual_seed(0))), planes))
+    assert_same_images(
+        (cloud, planes), (cloud.take(torch.randperm(30, generator=torch.Generator().manual_seed(0))), planes)
+    )
 
 
 def test_q_and_minus_q_and_their_length_do_not_matter():
@@ -183,7 +193,9 @@ def test_ten_metres_from_the_origin_no_digit_is_lost():
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
     away = GaussianCloud(*cloud.parameters, far)
-    moved = Planes(planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
+    moved = Planes(
+        planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2
+    )
     for (first, _), (second, _) in zip(images(cloud, planes), images(away, moved), strict=True):
         assert np.abs(first - second).max() < 1e-6 * np.abs(first).max()
 
@@ -192,7 +204,12 @@ def test_intensities_scale_with_the_peaks():
     cloud, planes = single(make_cloud(10, 10)), make_planes(10)
     plain = render(cloud, planes)
     for factor in (1e-6, 1e6, -1.0):
-        torch.testing.assert_close(render(cloud.with_peak(cloud.peak * factor), planes), plain * factor, rtol=2e-5, atol=1e-6 * abs(factor))
+        torch.testing.assert_close(
+            render(cloud.with_peak(cloud.peak * factor), planes),
+            plain * factor,
+            rtol=2e-5,
+            atol=1e-6 * abs(factor),
+        )
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
@@ -212,7 +229,7 @@ def test_gain_and_twist_are_what_they_say(backend: str):
     assert np.abs(found.numpy() - expected).max() < (1e-12 if backend == "reference" else 2e-5)
 
 
-# -- small and empty scenes ------------------------------------------------------------------------------------
+# -- small and empty scenes ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
@@ -231,13 +248,17 @@ def test_no_plane_renders_nothing(backend: str):
 def test_one_gaussian_and_one_pixel():
     cloud, planes = make_cloud(14, 1), make_planes(14, n=1, shape=(1, 1))
     assert_same_images((cloud, planes), (cloud, planes))
-    assert render(cloud, planes, backend="reference").item() == pytest.approx(quadrature(cloud, planes)[0], rel=1e-8)
+    assert render(cloud, planes, backend="reference").item() == pytest.approx(
+        quadrature(cloud, planes)[0], rel=1e-8
+    )
 
 
 def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed():
     cloud, planes = single(make_cloud(15, 10)), make_planes(15)
     away = planes.moved(RigidPose.from_rotvec([[0.0, 0, 0]], [[500.0, 0, 0]]))
-    both = Planes(*(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__))
+    both = Planes(
+        *(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__)
+    )
     pixels = render(cloud, both)
     assert (pixels[: away.n_pixels] == 0).all()
     torch.testing.assert_close(pixels[away.n_pixels :], render(cloud, planes), rtol=1e-6, atol=1e-7)
@@ -246,10 +267,14 @@ def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed():
 
 @pytest.mark.parametrize("log_scale", [[-3.9, -3.9, -3.9], [4.6, 4.6, 4.6], [-3.5, 3.4, 0.0]])
 @pytest.mark.parametrize("psf", [0.0, 1.0])
-def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(log_scale: list[float], psf: float):
+def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(
+    log_scale: list[float], psf: float
+):
     """Sigma 0.02 and 100 mm, and an axis ratio of 1000."""
     base, planes = make_cloud(16, 5, spread_mm=0.2), make_planes(16, psf=psf, shape=(15, 15))
-    cloud = GaussianCloud(base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:], base.origin_mm)
+    cloud = GaussianCloud(
+        base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:], base.origin_mm
+    )
     expected = render(cloud, planes, backend="reference")
     leaves = [p.float().requires_grad_() for p in cloud.parameters]
     twist = torch.zeros(len(planes), 6, requires_grad=True)
@@ -260,7 +285,7 @@ def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(log_s
     assert all(torch.isfinite(leaf.grad).all() for leaf in (*leaves, twist))
 
 
-# -- cut-off, pair lists, threads ------------------------------------------------------------------------------
+# -- cut-off, pair lists, threads ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 3.2, 4.5])
@@ -310,14 +335,20 @@ def test_two_thread_counts_agree():
 
 @pytest.mark.parametrize(
     "options",
-    [{"backend": "cuda"}, {"amplitude": "wrong"}, {"cutoff_sigma": 0.0}, {"cutoff_sigma": 6.5}, {"cutoff_sigma": float("nan")}],
-)  # fmt: skip
+    [
+        {"backend": "cuda"},
+        {"amplitude": "wrong"},
+        {"cutoff_sigma": 0.0},
+        {"cutoff_sigma": 6.5},
+        {"cutoff_sigma": float("nan")},
+    ],
+)
 def test_unknown_options_are_refused(options):
     with pytest.raises(ValueError, match="expected"):
         render(single(make_cloud(20, 2)), make_planes(20), **options)
 
 
-# -- the record ------------------------------------------------------------------------------------------------
+# -- the record ------------------------------------------------------------------------------------
 
 
 def test_save_and_load(tmp_path):

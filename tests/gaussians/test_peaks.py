@@ -23,11 +23,17 @@ def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
         torch.tensor(rng.uniform(0.2, 1.0, n)).float(),
         np.array([10.0, 20.0, 30.0]),
     )
-    frames = [np.eye(3), Rotation.from_euler("x", 90, degrees=True).as_matrix(), Rotation.from_euler("y", 90, degrees=True).as_matrix()]
+    frames = [
+        np.eye(3),
+        Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+        Rotation.from_euler("y", 90, degrees=True).as_matrix(),
+    ]
     rotation = np.repeat(frames, 7, axis=0)
     center = cloud.origin_mm + rotation[:, :, 2] * np.tile(np.arange(7) * 2.2 - 6.6, 3)[:, None]
     spacing = np.full((21, 2), 1.0)
-    return cloud, Planes(rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2)))
+    return cloud, Planes(
+        rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2))
+    )
 
 
 @pytest.mark.parametrize("amplitude", ["exact", "printed"])
@@ -57,8 +63,8 @@ def test_known_peaks_are_recovered(amplitude: str, damping: float):
     target = PeakSystem.of(cloud, planes, gain, amplitude=amplitude).forward(cloud.peak.numpy())
     start = cloud.with_peak(torch.zeros(len(cloud)))
     found = solve_peaks(
-        start, planes, target, np.ones(planes.n_pixels, np.float32), gain=gain, n_iterations=60, damping=damping,
-        amplitude=amplitude,
+        start, planes, target, np.ones(planes.n_pixels, np.float32), gain=gain, n_iterations=60,
+        damping=damping, amplitude=amplitude,
     )  # fmt: skip
     assert (found.peak - cloud.peak).abs().max() < 2e-3
     assert torch.equal(found.mean_mm, cloud.mean_mm)
@@ -70,7 +76,12 @@ def test_more_iterations_never_fit_worse():
     target = (render(cloud, planes).numpy() + rng.normal(0, 0.1, planes.n_pixels)).astype(np.float32)
     start, weight = cloud.with_peak(torch.zeros(len(cloud))), np.ones(planes.n_pixels, np.float32)
     errors = [
-        float(((render(solve_peaks(start, planes, target, weight, n_iterations=n), planes).numpy() - target) ** 2).sum())
+        float(
+            (
+                (render(solve_peaks(start, planes, target, weight, n_iterations=n), planes).numpy() - target)
+                ** 2
+            ).sum()
+        )
         for n in (0, 1, 2, 4, 8, 16)
     ]
     assert (np.diff(errors) <= 1e-4 * errors[0]).all()
@@ -90,7 +101,9 @@ def test_pixels_of_weight_zero_do_not_count():
 
 def test_what_no_pixel_sees_stays():
     cloud, planes = scene()
-    away = Planes(planes.rotation, planes.center_mm + 500, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
+    away = Planes(
+        planes.rotation, planes.center_mm + 500, planes.spacing_mm, planes.shape, planes.psf_var_mm2
+    )
     ones = np.ones(planes.n_pixels, np.float32)
     assert torch.equal(solve_peaks(cloud, away, ones, ones).peak, cloud.peak)
     assert torch.equal(solve_peaks(cloud, planes, ones, 0 * ones).peak, cloud.peak)
@@ -112,6 +125,9 @@ def test_no_gaussian_at_all():
 def test_strong_damping_holds_the_peaks():
     cloud, planes = scene()
     ones = np.ones(planes.n_pixels, np.float32)
-    change = [float((solve_peaks(cloud, planes, ones, ones, damping=d).peak - cloud.peak).norm()) for d in (1e-3, 1.0, 1e3)]
+    change = [
+        float((solve_peaks(cloud, planes, ones, ones, damping=d).peak - cloud.peak).norm())
+        for d in (1e-3, 1.0, 1e3)
+    ]
     assert change[0] > change[1] > change[2]
     assert change[2] < 0.01 * change[0]

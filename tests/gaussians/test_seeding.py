@@ -41,7 +41,7 @@ def test_a_constant_comes_out_flat(spacing: float):
 
 
 def test_the_lattice_is_coarser_where_nothing_happens():
-    """Structure in one half only: fewer Gaussians than a uniform lattice, fine ones where the structure is."""
+    """Structure in one half only: fewer Gaussians than a uniform lattice, fine ones where it is."""
     volume = (0.5 + 0.4 * np.sin(INDEX[..., 0] * 1.2) * (INDEX[..., 2] > 19)).astype(np.float32)
     uniform = seed_cloud(volume, BALL, GRID, 2.0)
     cloud = seed_cloud(volume, BALL, GRID, 2.0, structure_threshold=0.03)
@@ -63,13 +63,17 @@ def test_seeds_are_flattened_across_an_edge():
     assert edge.sum() > 20
     log_scale = cloud.log_scale[edge].double()
     smallest = log_scale.argmin(1)
-    axis = rotation_from_quaternion(cloud.quaternion_wxyz[edge].double())[torch.arange(int(edge.sum())), :, smallest]
+    axis = rotation_from_quaternion(cloud.quaternion_wxyz[edge].double())[
+        torch.arange(int(edge.sum())), :, smallest
+    ]
     normal = AFFINE[:3, 2]
     assert np.abs(axis.numpy() @ normal).min() > 0.95
     ratio = (log_scale - log_scale.mean(1, keepdim=True)).exp()
     assert ratio.min() < 0.8
     assert ratio.max() < MOST_ANISOTROPY**2
-    torch.testing.assert_close(log_scale.mean(1).exp(), torch.full((int(edge.sum()),), 1.2).double(), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        log_scale.mean(1).exp(), torch.full((int(edge.sum()),), 1.2).double(), rtol=1e-4, atol=0
+    )
 
 
 def test_an_empty_foreground_is_refused():

@@ -1,0 +1,53 @@
+"""Smooth multiplicative shading of each stack (receive-coil inhomogeneity), where stacks can tell it.
+
+The coil stands still while the fetus moves, so the field belongs to a stack's header frame. Its logarithm is
+a polynomial of second order in the stack's in-plane coordinates without a constant; what varies from slice to
+slice is the slices' gain. Stacks of different orientation see the same tissue under different fields, which
+determines the fields up to what they share; a small ridge keeps that part at zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from g3r.acquisition.planes import Slices
+
+LENGTH_MM = 40.0
+"""Unit of the coordinates, about half a head: coefficients are log-intensities at that distance."""
+
+N_TERMS = 5
+
+
+class StackShading:
+    """Log-fields of all stacks, linear in coefficients [n_stacks, 5] (x, y, x^2, xy, y^2; zero mean in a stack).
+
+    Args:
+        slices: pixels and header poses.
+    """
+
+    def __init__(self, slices: Slices) -> None:
+        planes = slices.planes.with_pose(slices.header_pose)
+        plane = planes.plane_id()
+        world = planes.pixel_world_mm()
+        stack_of_pixel = slices.stack_id[plane]
+        self.stacks = np.unique(slices.stack_id)
+        basis = np.zeros((planes.n_pixels, N_TERMS), np.float32)
+        self.ranges: list[tuple[int, int]] = []
+        for stack in self.stacks:
+            pixels = np.flatnonzero(stack_of_pixel == stack)
+            start, end = int(pixels[0]), int(pixels[-1]) + 1  # slices of a stack stand together
+            inside = slices.mask[start:end]
+            axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
+            center = world[start:end][inside].mean(0)
+            x, y = ((world[start:end] - center) @ axes / LENGTH_MM).T
+            terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
+            basis[start:end] = terms - terms[inside].mean(0)
+            self.ranges.append((start, end))
+        self.basis = torch.from_numpy(basis)
+
+    def log_field(self, coefficients: Tensor) -> Tensor:
+        """Log-intensity of the field at every pixel [P]."""
+        parts = [self.basis[a:b] @ coefficients[n] for n, (a, b) in enumerate(self.ranges)]
+        return torch.cat(parts)
