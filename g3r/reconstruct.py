@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from g3r._version import __version__
 from g3r.acquisition.foreground import foreground_mask
-from g3r.acquisition.planes import Slices, slices_from_stacks, volume_from_pixels, volume_planes
+from g3r.acquisition.planes import SMALLEST_SLICE_PIXELS, Slices, slices_from_stacks, volume_from_pixels, volume_planes
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
@@ -94,6 +94,7 @@ class GaussianReconstructor:
         settings, clock, notes, warnings = self.settings, _Clock(), [], []
         rng = np.random.default_rng(settings.seed)
         slices = slices_from_stacks(stacks)
+        notes += _left_out(stacks, slices)
         first_scale = _percentile_scale(slices)
         slices = slices.scaled(1 / first_scale)
         if len(stacks) == 1:
@@ -228,6 +229,18 @@ class _Clock:
         self.seconds[stage] = round(time.perf_counter() - wall, 3)
         self.cpu_seconds[stage] = round(time.process_time() - cpu, 3)
         logger.info("%s: %.1f s", stage, self.seconds[stage])
+
+
+def _left_out(stacks: Sequence[Stack], slices: Slices) -> list[str]:
+    """A line for each stack of which slices were left out for want of masked pixels."""
+    lines = []
+    for n, stack in enumerate(stacks):
+        marked = np.flatnonzero(stack.mask.any((0, 1)))
+        missing = sorted(set(marked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
+        if missing:
+            numbers = ", ".join(map(str, missing))
+            lines.append(f"{stack.name}: slices {numbers} left out, fewer than {SMALLEST_SLICE_PIXELS} masked pixels")
+    return lines
 
 
 def _percentile_scale(slices: Slices) -> float:

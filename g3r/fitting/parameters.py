@@ -25,7 +25,7 @@ class LearningRates:
     quaternion: float = 0.02
     peak_share: float = 0.04
     log_gain: float = 0.002
-    shading: float = 0.004
+    shading: float = 0.008
     turn_rad: float = 1e-3
     shift_mm: float = 0.03
 

@@ -42,7 +42,7 @@ class SliceStageSettings:
         rates: step sizes.
     """
 
-    n_steps: int = 60
+    n_steps: int = 100
     peak_iterations: int = 6
     peak_damping: float = 0.05
     scale_weight: float = 0.02
@@ -53,7 +53,7 @@ class SliceStageSettings:
     reweight_every: int = 20
     steps_per_pair_list: int = 10
     optimise_shading: bool = True
-    shading_ridge: float = 0.02
+    shading_ridge: float = 0.005
     amplitude: str = "exact"
     rates: LearningRates = field(default_factory=LearningRates)
 
