@@ -11,9 +11,9 @@ from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 INSIDE_SHARE = 0.36
-"""Share of the typical density from which a voxel counts: below one half, where the edge of a mask lies, because
-a voxel too few loses brain. A mask of just the volume of the stacks' masks costs 1 to 4 dB in their rim; one much
-more generous (0.25) shows values there that no slice determines (docs/method.md, "Mask")."""
+"""Share of the typical density from which a voxel counts: below one half, where the edge of a mask lies,
+because a voxel too few loses brain. A mask of just the volume of the stacks' masks costs 1 to 4 dB in their
+rim; one much more generous (0.25) shows values there that no slice determines (docs/method.md, "Mask")."""
 
 
 def foreground_mask(density: NDArray[np.float32], slices: Slices, grid: VolumeGrid) -> NDArray[np.bool_]:

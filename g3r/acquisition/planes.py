@@ -16,7 +16,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
 SMALLEST_SLICE_PIXELS = 12
-"""Slices with fewer masked pixels carry no pose and little image; they are left out, and run.json names them."""
+"""Slices with fewer masked pixels carry no pose and little image; they are left out and named in run.json."""
 
 
 @dataclass(frozen=True)

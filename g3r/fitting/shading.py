@@ -21,7 +21,9 @@ N_TERMS = 5
 
 
 class StackShading:
-    """Log-fields of all stacks, linear in coefficients [n_stacks, 5] (x, y, x^2, xy, y^2; zero mean in a stack).
+    """Log-fields of all stacks, linear in coefficients [n_stacks, 5].
+
+    The terms are x, y, x^2, xy, y^2, each with zero mean over a stack's masked pixels.
 
     Args:
         slices: pixels and header poses.

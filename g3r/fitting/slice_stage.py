@@ -13,8 +13,8 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.losses import scale_regulariser, weighted_l1
 from g3r.fitting.parameters import CloudParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, PAIR_MARGIN_SIGMA, VolumeTarget
-from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
+from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
 from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes
 from g3r.motion.estimate import slice_weights
@@ -125,7 +125,9 @@ def fit_slices(
     if free_gain:
         extra += [(log_gain.requires_grad_(), settings.rates.log_gain)]
     # one stack cannot tell its shading from anatomy
-    shading = StackShading(slices) if settings.optimise_shading and len(np.unique(slices.stack_id)) > 1 else None
+    shading = (
+        StackShading(slices) if settings.optimise_shading and len(np.unique(slices.stack_id)) > 1 else None
+    )
     coefficients = torch.zeros(len(np.unique(slices.stack_id)), N_TERMS)
     if shading:
         extra.append((coefficients.requires_grad_(), settings.rates.shading))
@@ -181,7 +183,11 @@ def fit_slices(
     if settings.optimise_poses:
         moved = moved_planes(planes, torch.cat([turn, shift], 1))
     return SliceFit(
-        parameters.cloud().detach(), slices.with_pose(moved.pose), final_gain, trust.double().numpy(), history,
+        parameters.cloud().detach(),
+        slices.with_pose(moved.pose),
+        final_gain,
+        trust.double().numpy(),
+        history,
         coefficients.detach().double().tolist() if shading else [],
     )
 
