@@ -29,7 +29,7 @@ demo: install ## simulate a moving 30-week brain, reconstruct it, score it: a vo
 	rm -rf demo
 	$(BIN)/g3r-simulate --phantom 30 --motion moderate --stacks 3 --resolution 1.0 --thickness 3.0 --seed 1 --output demo/case
 	$(BIN)/g3r-infer --stacks demo/case/stack-{0,1,2}.nii.gz --masks demo/case/mask-{0,1,2}.nii.gz --thickness 3.0 \
-		--resolution 1.0 --seed 1 --output demo/reconstruction
+		--seed 1 --output demo/reconstruction
 	$(BIN)/g3r-evaluate --align --volume demo/reconstruction/volume.nii.gz \
 		--reference demo/case/truth.nii.gz --mask demo/case/truth-mask.nii.gz \
 		--poses demo/case/poses.tsv --slices demo/reconstruction/slices.tsv \

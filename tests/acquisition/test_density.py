@@ -173,7 +173,9 @@ def test_the_foreground_is_the_masked_cube_even_with_gaps(distance_mm: float):
     grid = VolumeGrid.isotropic([-30] * 3, [30] * 3, 1.5)
     _, density = coarse_and_density(slices, grid)
     mask = foreground_mask(density, slices, grid)
-    assert mask.sum() * grid.voxel_volume_mm3 == pytest.approx(SIZE_MM**3, rel=0.2)
+    # generous on purpose (INSIDE_SHARE below one half): up to 1.5 mm more on each face, never less
+    volume_mm3 = mask.sum() * grid.voxel_volume_mm3
+    assert (SIZE_MM - 1) ** 3 < volume_mm3 < (SIZE_MM + 3) ** 3
     middle = tuple(slice(n // 2 - 6, n // 2 + 6) for n in grid.shape)
     assert mask[middle].all()
 

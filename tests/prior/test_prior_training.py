@@ -243,7 +243,7 @@ def test_cosine_factor():
 def test_the_configuration_fits_the_module(pytestconfig):
     config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
     module = training.PriorModule(**config["model"])
-    assert module.network.arguments()["alpha"] == 0.05
+    assert module.network.arguments()["alpha"] == config["model"]["alpha"]
 
 
 @pytest.mark.parametrize("command", ["pretrain", "export"])
