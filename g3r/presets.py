@@ -15,7 +15,8 @@ class ReconstructionSettings:
 
     Args:
         resolution_mm: voxel size of the volume.
-        gaussian_spacing_mm: cell edge per Gaussian where the image has structure.
+        gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers (its
+            area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
         flat_gradient: gradient (normalised intensity per mm) below which Gaussians stand twice as far apart.
         motion: registration.
         prior_stage: stage 1.
@@ -26,7 +27,7 @@ class ReconstructionSettings:
     """
 
     resolution_mm: float = 0.8
-    gaussian_spacing_mm: float = 2.4
+    gaussian_spacing_pixels: float = 2.14
     flat_gradient: float = 0.0
     motion: MotionSettings = field(default_factory=MotionSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
@@ -41,14 +42,14 @@ _BALANCED = ReconstructionSettings()
 PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
-        gaussian_spacing_mm=3.2,
+        gaussian_spacing_pixels=2.85,
         motion=replace(_BALANCED.motion, n_rounds=6, finest_voxel_mm=1.6, pixels_at_most=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=15),
     ),
     "fast": replace(
         _BALANCED,
-        gaussian_spacing_mm=2.8,
+        gaussian_spacing_pixels=2.5,
         motion=replace(_BALANCED.motion, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=30),
@@ -56,7 +57,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "balanced": _BALANCED,
     "accurate": replace(
         _BALANCED,
-        gaussian_spacing_mm=2.2,
+        gaussian_spacing_pixels=1.96,
         motion=replace(_BALANCED.motion, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=160),

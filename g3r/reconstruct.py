@@ -135,7 +135,7 @@ class GaussianReconstructor:
             self.progress("prior", 1, 1)
         with clock("fit to prior"):
             cloud = seed_cloud(
-                prior, prior_mask, prior_grid, settings.gaussian_spacing_mm, settings.flat_gradient
+                prior, prior_mask, prior_grid, _gaussian_spacing_mm(slices, settings), settings.flat_gradient
             )
             target = VolumeTarget.of(prior, prior_mask.astype(np.float32), prior_grid)
             cloud, prior_history = fit_prior(
@@ -240,6 +240,12 @@ class _Clock:
         self.seconds[stage] = round(time.perf_counter() - wall, 3)
         self.cpu_seconds[stage] = round(time.process_time() - cpu, 3)
         logger.info("%s: %.1f s", stage, self.seconds[stage])
+
+
+def _gaussian_spacing_mm(slices: Slices, settings: ReconstructionSettings) -> float:
+    """Cell edge per Gaussian: the settings' number of (typical) pixels, as cubes of equal volume."""
+    covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
+    return settings.gaussian_spacing_pixels * float(np.median(covered_mm3)) ** (1 / 3)
 
 
 def _left_out(stacks: Sequence[Stack], slices: Slices) -> list[str]:
