@@ -15,8 +15,8 @@ class ReconstructionSettings:
 
     Args:
         resolution_mm: voxel size of the volume.
-        gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers (its
-            area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
+        gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
+            (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
         flat_gradient: gradient (normalised intensity per mm) below which Gaussians stand twice as far apart.
         motion: registration.
         prior_stage: stage 1.
