@@ -1,0 +1,53 @@
+"""Mean heads in standard orientation, to which slices of an unknown head can be compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.geometry import VolumeGrid
+
+
+@dataclass(frozen=True)
+class AtlasTemplate:
+    """Mean heads by gestational age on one grid, in the atlas frame.
+
+    The atlas frame is RAS in mm with the head's centre at the origin and the mid-sagittal plane at x = 0.
+
+    Args:
+        volume: [A, I, J, K] float32 intensities; the 99.5th percentile in each head is 1, outside it is 0.
+        affine: [4, 4] RAS+ mm from index.
+        weeks: [A] gestational ages.
+
+    Raises:
+        ValueError: shapes that do not fit, or values that are not finite.
+    """
+
+    volume: NDArray[np.float32]
+    affine: NDArray[np.float64]
+    weeks: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("volume", np.float32), ("affine", np.float64), ("weeks", np.float64)):
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if not np.isfinite(array).all():
+                raise ValueError(f"template: {name} holds values that are not finite")
+            object.__setattr__(self, name, array)
+        if self.volume.ndim != 4 or self.affine.shape != (4, 4) or self.weeks.shape != self.volume.shape[:1]:
+            raise ValueError(
+                f"template: volume {self.volume.shape}, affine {self.affine.shape}, weeks {self.weeks.shape}; "
+                "expected [A, I, J, K], [4, 4], [A]"
+            )
+        if not len(self.volume):
+            raise ValueError("template: holds no head")
+
+    def __len__(self) -> int:
+        return len(self.volume)
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """Voxel grid of every head."""
+        shape = self.volume.shape
+        return VolumeGrid((shape[1], shape[2], shape[3]), self.affine)
