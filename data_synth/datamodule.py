@@ -12,15 +12,14 @@ import torchio as tio
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from data_synth.atlas import AtlasSubject, find_subjects
+from data_synth.atlas import find_subjects
 from data_synth.dataset import (
     IMAGE_KEYS,
     HeadPatchSampler,
-    PhantomSubject,
     SyntheticSubjects,
     central_crop,
-    phantom_subjects,
 )
+from data_synth.heads import Subject, phantom_subjects
 from g3r.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -142,10 +141,10 @@ class StackSynthesisDataModule(LightningDataModule):
         assert self.val_volumes is not None
         return tio.SubjectsLoader(self.val_volumes, batch_size=1, num_workers=0, collate_fn=collate_images)
 
-    def _sources(self) -> tuple[list[AtlasSubject | PhantomSubject], list[AtlasSubject | PhantomSubject]]:
+    def _sources(self) -> tuple[list[Subject], list[Subject]]:
         h: Any = self.hparams
-        train: list[AtlasSubject | PhantomSubject]
-        val: list[AtlasSubject | PhantomSubject]
+        train: list[Subject]
+        val: list[Subject]
         if h.source == "phantom":
             return (
                 [*phantom_subjects(N_PHANTOMS, h.seed, "training")],

@@ -16,10 +16,10 @@ import torchio as tio
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from data_synth.atlas import AtlasSubject, TruthVolume, cropped, load_subject
+from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
+from data_synth.heads import Subject, load_volume_of
 from data_synth.motion import LEVELS, ResidualKind, draw_residual_kind, residual_errors
-from data_synth.phantom import fetal_brain_phantom
 from data_synth.simulator import Orientation, SimulatedStack, StackSettings, simulate_stacks
 from g3r.acquisition.planes import slices_from_stacks
 from g3r.acquisition.scatter import coarse_and_density, normalisation_scale
@@ -37,15 +37,6 @@ VOID_SHARE_IF_GROSS = 0.03
 
 
 @dataclass(frozen=True)
-class PhantomSubject:
-    """A phantom to be made: gestational age (weeks) and seed."""
-
-    name: str
-    weeks: float
-    seed: int
-
-
-@dataclass(frozen=True)
 class SyntheticSubject:
     """What the network sees and should answer, [I, J, K] on the truth's grid, in normalised intensities."""
 
@@ -57,13 +48,6 @@ class SyntheticSubject:
     name: str
     n_stacks: int
     residual: ResidualKind
-
-
-def phantom_subjects(n: int, seed: int, split: str) -> list[PhantomSubject]:
-    """N phantoms with ages spread evenly over 21 to 38 weeks; `split` separates training from validation."""
-    first = 10_000 * seed + (5_000 if split == "validation" else 0)
-    ages = 21 + 17 * (np.arange(n) + 0.5) / n
-    return [PhantomSubject(f"phantom-{w:.1f}w-{first + k}", float(w), first + k) for k, w in enumerate(ages)]
 
 
 class SyntheticSubjects(Dataset):
@@ -81,7 +65,7 @@ class SyntheticSubjects(Dataset):
 
     def __init__(
         self,
-        sources: Sequence[AtlasSubject | PhantomSubject],
+        sources: Sequence[Subject],
         spacing_mm: float = 0.8,
         length: int = 32,
         seed: int = 0,
@@ -126,13 +110,7 @@ class SyntheticSubjects(Dataset):
 
     def _volume(self, which: int) -> TruthVolume:
         if which not in self._cache:
-            source = self.sources[which]
-            if isinstance(source, PhantomSubject):
-                made = fetal_brain_phantom(source.weeks, self.spacing_mm, source.seed)
-                bright = float(np.percentile(made.t2[made.mask], 99.5))
-                volume = TruthVolume(source.name, made.t2 / np.float32(bright), made.mask, made.affine)
-            else:
-                volume = load_subject(source, self.spacing_mm)
+            volume = load_volume_of(self.sources[which], self.spacing_mm)
             self._cache[which] = cropped(volume, MARGIN_VOXELS + 4)
         return self._cache[which]
 

@@ -14,7 +14,8 @@ pytest.importorskip("torchio")
 from data_synth.atlas import cropped, find_subjects, load_subject
 from data_synth.augment import augmentation, augmented
 from data_synth.datamodule import EpochSampler, StackSynthesisDataModule
-from data_synth.dataset import PhantomSubject, SyntheticSubjects, synthesise
+from data_synth.dataset import SyntheticSubjects, synthesise
+from data_synth.heads import PhantomSubject
 from data_synth.phantom import fetal_brain_phantom
 from g3r.errors import InputError
 

@@ -1,0 +1,79 @@
+"""Mean heads by age, made from the training subjects: what `AtlasTemplate` holds."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform
+
+from data_synth.atlas import TruthVolume
+from data_synth.heads import Subject, load_head, weeks_of
+from g3r.acquisition.template import AtlasTemplate
+from g3r.errors import InputError
+from g3r.geometry import VolumeGrid
+
+logger = logging.getLogger(__name__)
+
+TEMPLATE_WEEKS = (22.0, 25.0, 28.0, 31.0, 34.0, 37.0)
+HALF_WINDOW_WEEKS = 2.0
+"""A mean head of an age takes in the subjects of at most this many weeks more or less."""
+
+
+def mean_heads(
+    subjects: Sequence[Subject], spacing_mm: float = 3.0, weeks: Sequence[float] = TEMPLATE_WEEKS
+) -> AtlasTemplate:
+    """Mean heads in the atlas frame: centred, normalised, averaged over near ages, left-right symmetric.
+
+    Each subject is brought to the template's voxel size, its mask's centroid to the origin and its 99.5th
+    percentile to 1. Axes are taken as they stand: both atlases and the phantom are RAS with the mid-sagittal
+    plane at constant x. An age without a subject within two weeks is left out.
+
+    Args:
+        subjects: to average.
+        spacing_mm: isotropic voxel size of the template.
+        weeks: gestational ages wanted.
+
+    Raises:
+        InputError: no subject near any of the ages, or a subject without an age in its name.
+    """
+    ages = np.array([weeks_of(subject) for subject in subjects])
+    members = {w: np.flatnonzero(np.abs(ages - w) <= HALF_WINDOW_WEEKS + 1e-6) for w in weeks}
+    used = [w for w in weeks if len(members[w])]
+    if not used:
+        raise InputError(
+            f"template: none of {len(subjects)} subjects is within {HALF_WINDOW_WEEKS:g} weeks of "
+            f"{', '.join(f'{w:g}' for w in weeks)} weeks; add subjects or change the ages"
+        )
+    if len(used) < len(weeks):
+        logger.warning("template: no subject near week %s", sorted(set(weeks) - set(used)))
+    needed = sorted({int(k) for w in used for k in members[w]})
+    heads = {k: load_head(subjects[k], spacing_mm) for k in needed}
+    grid = _common_grid(list(heads.values()), spacing_mm)
+    placed = {k: _placed(head, grid) for k, head in heads.items()}
+    means = []
+    for week in used:
+        mean = np.mean([placed[int(k)] for k in members[week]], axis=0)
+        mean = (mean + mean[::-1]) / 2  # the grid is symmetric about x = 0
+        bright = np.percentile(mean[mean > 0], 99.5)
+        means.append(np.clip(mean / bright, 0, None).astype(np.float32))
+        logger.info("template at %g weeks from %d subjects", week, len(members[week]))
+    return AtlasTemplate(np.stack(means), grid.affine, np.array(used))
+
+
+def _common_grid(heads: Sequence[TruthVolume], spacing_mm: float) -> VolumeGrid:
+    """The grid about the origin that holds every head; the same reach on both sides of each axis."""
+    reach = np.zeros(3)
+    for head in heads:
+        corners = np.array([[0, 0, 0], np.array(head.data.shape) - 1])
+        reach = np.maximum(reach, np.abs(VolumeGrid(head.data.shape, head.affine).world(corners)).max(0))
+    reach = np.ceil(reach / spacing_mm) * spacing_mm
+    return VolumeGrid.isotropic(-reach, reach, spacing_mm)
+
+
+def _placed(head: TruthVolume, grid: VolumeGrid) -> NDArray[np.float32]:
+    """A head on the template's grid, linearly interpolated."""
+    index = np.linalg.inv(head.affine) @ grid.affine
+    return affine_transform(head.data, index[:3, :3], index[:3, 3], grid.shape, order=1, output=np.float32)
