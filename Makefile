@@ -9,11 +9,12 @@ VENV ?= .venv
 PIP_ARGS ?=
 ATLAS ?=
 PRETRAIN_ARGS ?=
+BENCH_ARGS ?=
 PRIOR ?= runs/prior.pt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard clean
+.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -61,6 +62,15 @@ pretrain: install ## train the prior on the phantom, or on ATLAS=DIR, and export
 tensorboard: install ## watch the training runs
 	$(BIN)/tensorboard --logdir runs
 
+bench-motion: install ## registration of 30 random subjects (G3R_TEST_DATA): the table of docs/motion.md
+	$(BIN)/python -m benchmarks.motion_sweep --docs docs/motion.md $(BENCH_ARGS)
+
+bench-layers: install ## what each layer of registration brings, on the cases (G3R_TEST_DATA)
+	$(BIN)/python -m benchmarks.motion_layers --docs docs/motion.md --figure docs/images/motion-tre.png $(BENCH_ARGS)
+
+bench-bias: install ## poses and volume under shading (G3R_TEST_DATA)
+	$(BIN)/python -m benchmarks.motion_bias --docs docs/motion.md $(BENCH_ARGS)
+
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find g3r data_synth tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find g3r data_synth benchmarks tests -name __pycache__ -type d -prune -exec rm -rf {} +

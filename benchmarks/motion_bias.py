@@ -1,0 +1,115 @@
+"""`python -m benchmarks.motion_bias`: poses and volume under shading, with the shading estimated and not."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.errors import G3RError
+
+if TYPE_CHECKING:
+    from benchmarks.subjects import SubjectRecipe
+
+BIASES = (0.05, 0.15)
+VOLUMES = ("crl-sta/sta30", "spina-bifida/sb32-operated")
+"""A week left out of training, and a volume that training used for choosing only."""
+
+SEED = 33_000
+"""Seeds from here on belong to this benchmark; a volume has the same at every strength of shading, so that
+motion, noise and the shape of the shading agree."""
+
+VARIANTS: dict[str, Mapping[str, Any]] = {
+    "estimated": {},
+    "not estimated": {"slice_stage.optimise_shading": False},
+}
+"""What is compared; options as `benchmarks.runs.changed` reads them."""
+
+DEFAULT_FOLDER = Path("runs") / "bench" / "motion-bias"
+
+
+def recipes() -> list[SubjectRecipe]:
+    """The subjects: each volume at each strength of shading, moderate motion."""
+    from benchmarks.subjects import SubjectRecipe
+
+    return [
+        SubjectRecipe(
+            name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}", volume=volume, motion="moderate",
+            seed=SEED + n, bias=bias, stretch=0.0,
+        )
+        for n, volume in enumerate(VOLUMES)
+        for bias in BIASES
+    ]  # fmt: skip
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.motion_bias", formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description="Reconstruct subjects with weak and strong shading, with the shading estimated and not. "
+        "Needs the atlas in the folder that G3R_TEST_DATA names.",
+    )  # fmt: skip
+    parser.add_argument("--preset", default="balanced", help="settings")
+    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
+    parser.add_argument("--threads", type=int, help="(None: all cores)")
+    parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="simulated subjects")
+    parser.add_argument("--output", type=Path, default=DEFAULT_FOLDER, help="for bias.json and bias.md")
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = build_parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
+    try:
+        return _run(options)
+    except G3RError as error:
+        print(f"motion_bias: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _run(options: argparse.Namespace) -> int:
+    from benchmarks.runs import available_cores, changed, machine, preset_settings, reconstructed, use_threads
+    from benchmarks.subjects import simulated_subject, test_data_folder
+    from g3r.evaluation.case import load_case
+
+    atlas, settings = test_data_folder() / "atlas", preset_settings(options.preset)
+    threads = options.threads or available_cores()
+    use_threads(threads)
+    rows: list[dict[str, Any]] = []
+    record = {"preset": options.preset, "threads": threads, "machine": machine(), "runs": rows}
+    for recipe in recipes():
+        case = load_case(simulated_subject(recipe, atlas, options.cache))
+        for variant, changes in VARIANTS.items():
+            run = reconstructed(case, changed(settings, changes), options.ckpt)
+            rows.append({"volume": recipe.volume, "bias": recipe.bias, "shading": variant, **run.record()})
+            print(table(record).splitlines()[-1], flush=True)
+            write_json(options.output / "bias.json", record)
+    text = table(record)
+    write_text(options.output / "bias.md", text)
+    print(text)
+    if options.docs:
+        put_into(options.docs, "bias", text)
+    return 0
+
+
+def table(record: Mapping[str, Any]) -> str:
+    """A row per run in Markdown."""
+    head = ["volume", "bias", "shading", "TRE median mm", "TRE p90 mm", "PSNR dB", "SSIM", "wall s"]
+    rows = [
+        [
+            row["volume"], f"{row['bias']:.2f}", row["shading"], f"{row['median_mm']:.2f}",
+            f"{row['p90_mm']:.2f}", f"{row['psnr_db']:.2f}", f"{row['ssim']:.3f}", f"{row['seconds']:.0f}",
+        ]
+        for row in record["runs"]
+    ]  # fmt: skip
+    return f"Preset `{record['preset']}`, {record['threads']} threads.\n\n{markdown_table(head, rows)}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

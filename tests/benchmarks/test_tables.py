@@ -1,0 +1,122 @@
+"""Tables of the documentation: cells, levels, and the markers that hold their place."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks import motion_bias, motion_layers, motion_sweep
+from benchmarks.runs import changed, preset_settings
+from benchmarks.tables import between_markers, markdown_table, put_into, write_json
+from g3r.errors import InputError
+from g3r.presets import PRESETS
+
+
+def test_markdown_table():
+    assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == (
+        "| a | b |\n| --- | ---: |\n| x | 1 |\n| y | 2.5 |"
+    )
+    with pytest.raises(ValueError, match="row of 1 cells"):
+        markdown_table(["a", "b"], [["x"]])
+
+
+def test_only_what_is_between_the_markers_changes(tmp_path):
+    path = tmp_path / "page.md"
+    path.write_text("before\n<!-- t:begin -->\nold\n<!-- t:end -->\nafter | t:begin\n", encoding="utf-8")
+    for _ in range(2):  # a second time changes nothing
+        put_into(path, "t", "\nnew \\1 line\n")
+        assert path.read_text(encoding="utf-8") == (
+            "before\n<!-- t:begin -->\nnew \\1 line\n<!-- t:end -->\nafter | t:begin\n"
+        )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "<!-- t:begin -->", "<!-- t:end --><!-- t:begin -->", "<!-- t:begin --><!-- t:end -->" * 2]
+)
+def test_markers_must_be_there_once(text):
+    with pytest.raises(InputError, match="markers"):
+        between_markers(text, "t", "x")
+
+
+def test_a_document_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"page\.md: no such file"):
+        put_into(tmp_path / "page.md", "t", "x")
+
+
+def test_json_is_written_whole(tmp_path):
+    write_json(tmp_path / "made" / "record.json", {"a": 1})
+    assert json.loads((tmp_path / "made" / "record.json").read_text()) == {"a": 1}
+    assert [path.name for path in (tmp_path / "made").iterdir()] == ["record.json"]
+
+
+def subject(level, median, p90, *, warned, psnr=None):
+    row = {
+        "level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90,
+        "bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0,
+    }  # fmt: skip
+    return row if psnr is None else {**row, "psnr_db": psnr}
+
+
+def test_sweep_counts_who_was_warned():
+    rows = {
+        "a": subject("severe", 0.4, 1.0, warned=False),
+        "b": subject("severe", 0.6, 2.0, warned=True),
+        "c": subject("severe", 8.0, 20.0, warned=True),
+        "d": subject("severe", 1.0, 3.0, warned=False),  # not under a millimetre
+        "e": subject("mild", 0.3, 0.5, warned=False),
+    }
+    text = motion_sweep.sweep_tables(
+        {"preset": "balanced", "full": False, "jobs": 1, "threads": 2, "subjects": rows}
+    )
+    assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 0 | 0 | 0 | 20 | 35 |" in text
+    assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 1 | 1 | 1 | 20 | 35 |" in text
+    assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | yes | 20 | 35 |" in text
+    assert "moderate" not in text
+
+
+def test_sweep_with_volumes():
+    rows = {"a": subject("mild", 0.4, 1.0, warned=False, psnr=28.04), "b": subject("mild", 9, 9, warned=True)}
+    text = motion_sweep.sweep_tables(
+        {"preset": "fast", "full": True, "jobs": 2, "threads": 1, "subjects": rows}
+    )
+    assert "| 35 | 28.0 |" in text
+    assert "| 35 | 28.04 |" in text
+    assert "| 35 | none |" in text  # refused: no volume
+
+
+def test_layer_tables_leave_gaps_where_nothing_was_measured():
+    figures = {"median_mm": 0.5, "p90_mm": 1.25, "seconds": 12.3, "psnr_db": 28.0}
+    cases = {
+        "one": {"layers": {"headers": figures, "slices": figures}, "without": {"everything": figures}},
+        "two": {"layers": {"headers": figures}, "without": {"stacks": figures}},
+    }
+    text = motion_layers.layer_tables({"preset": "balanced", "threads": 2, "cases": cases})
+    assert "| one | 0.50 / 1.25 | 0.50 / 1.25 |" in text
+    assert "| two | 0.50 / 1.25 |  |" in text
+    assert "| case | everything | without stacks |" in text
+    assert "| two |  | 28.00 (0.50) |" in text
+
+
+def test_bias_table():
+    run = {"volume": "v", "bias": 0.15, "shading": "estimated", "median_mm": 0.5, "p90_mm": 1.0,
+           "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}  # fmt: skip
+    text = motion_bias.table({"preset": "balanced", "threads": 2, "runs": [run]})
+    assert "| v | 0.15 | estimated | 0.50 | 1.00 | 28.00 | 0.970 | 26 |" in text
+
+
+def test_nested_settings():
+    settings = PRESETS["balanced"]
+    other = changed(settings, {"motion.n_rounds": 0, "use_prior": False})
+    assert (other.motion.n_rounds, other.use_prior) == (0, False)
+    assert other.slice_stage == settings.slice_stage
+    with pytest.raises(ValueError, match="no field 'n_turns'"):
+        changed(settings, {"motion.n_turns": 1})
+    with pytest.raises(InputError, match="--preset best"):
+        preset_settings("best")
+
+
+def test_named_variants_are_options_that_exist():
+    tables = [motion_layers.WITHOUT, motion_bias.VARIANTS, {x.name: x.options for x in motion_layers.LAYERS}]
+    for options in [one for table in tables for one in table.values()]:
+        changed(PRESETS["balanced"], options)
