@@ -32,16 +32,17 @@ VARIANTS: dict[str, Mapping[str, Any]] = {
 DEFAULT_FOLDER = Path("runs") / "bench" / "motion-bias"
 
 
-def recipes() -> list[SubjectRecipe]:
-    """The subjects: each volume at each strength of shading, moderate motion."""
+def recipes(n_repeats: int = 1) -> list[SubjectRecipe]:
+    """The subjects: each volume with moderate motion, `n_repeats` times, at each strength of shading."""
     from benchmarks.subjects import SubjectRecipe
 
     return [
         SubjectRecipe(
-            name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}", volume=volume, motion="moderate",
-            seed=SEED + n, bias=bias, stretch=0.0,
+            name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}-{number}", volume=volume, motion="moderate",
+            seed=SEED + n + len(VOLUMES) * number, bias=bias, stretch=0.0,
         )
         for n, volume in enumerate(VOLUMES)
+        for number in range(n_repeats)
         for bias in BIASES
     ]  # fmt: skip
 
@@ -53,6 +54,8 @@ def build_parser() -> argparse.ArgumentParser:
         description="Reconstruct subjects with weak and strong shading, with the shading estimated and not. "
         "Needs the atlas in the folder that G3R_TEST_DATA names.",
     )  # fmt: skip
+    parser.add_argument("--repeats", type=int, default=1, metavar="N", help="subjects of each volume")
+    parser.add_argument("--motion-only", action="store_true", help="registration alone, no volume")
     parser.add_argument("--preset", default="balanced", help="settings")
     parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
     parser.add_argument("--threads", type=int, help="(None: all cores)")
@@ -74,7 +77,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import available_cores, changed, machine, preset_settings, reconstructed, use_threads
+    from benchmarks.runs import (
+        available_cores,
+        changed,
+        machine,
+        preset_settings,
+        reconstructed,
+        registered,
+        use_threads,
+    )
     from benchmarks.subjects import simulated_subject, test_data_folder
     from g3r.evaluation.case import load_case
 
@@ -83,11 +94,17 @@ def _run(options: argparse.Namespace) -> int:
     use_threads(threads)
     rows: list[dict[str, Any]] = []
     record = {"preset": options.preset, "threads": threads, "machine": machine(), "runs": rows}
-    for recipe in recipes():
+    for recipe in recipes(options.repeats):
         case = load_case(simulated_subject(recipe, atlas, options.cache))
         for variant, changes in VARIANTS.items():
-            run = reconstructed(case, changed(settings, changes), options.ckpt)
-            rows.append({"volume": recipe.volume, "bias": recipe.bias, "shading": variant, **run.record()})
+            chosen = changed(settings, changes)
+            if options.motion_only and chosen != settings and chosen.motion == settings.motion:
+                continue  # registration would do the same again
+            run = (
+                registered(case, chosen) if options.motion_only else reconstructed(case, chosen, options.ckpt)
+            )
+            row = {"volume": recipe.volume, "seed": recipe.seed, "bias": recipe.bias, "shading": variant}
+            rows.append({**row, **run.record()})
             print(table(record).splitlines()[-1], flush=True)
             write_json(options.output / "bias.json", record)
     text = table(record)
@@ -100,15 +117,21 @@ def _run(options: argparse.Namespace) -> int:
 
 def table(record: Mapping[str, Any]) -> str:
     """A row per run in Markdown."""
-    head = ["volume", "bias", "shading", "TRE median mm", "TRE p90 mm", "PSNR dB", "SSIM", "wall s"]
+    head = ["volume", "seed", "bias", "shading", "TRE median mm", "TRE p90 mm", "PSNR dB", "SSIM", "warned"]
+    head += ["wall s"]
     rows = [
         [
-            row["volume"], f"{row['bias']:.2f}", row["shading"], f"{row['median_mm']:.2f}",
-            f"{row['p90_mm']:.2f}", f"{row['psnr_db']:.2f}", f"{row['ssim']:.3f}", f"{row['seconds']:.0f}",
+            row["volume"], row["seed"], f"{row['bias']:.2f}", row["shading"], f"{row['median_mm']:.2f}",
+            f"{row['p90_mm']:.2f}", _figure(row, "psnr_db", 2), _figure(row, "ssim", 3),
+            "yes" if row["warned"] else "-", f"{row['seconds']:.0f}",
         ]
         for row in record["runs"]
     ]  # fmt: skip
     return f"Preset `{record['preset']}`, {record['threads']} threads.\n\n{markdown_table(head, rows)}"
+
+
+def _figure(row: Mapping[str, Any], key: str, digits: int) -> str:
+    return f"{row[key]:.{digits}f}" if key in row else ""
 
 
 if __name__ == "__main__":

@@ -99,10 +99,10 @@ def test_layer_tables_leave_gaps_where_nothing_was_measured():
 
 
 def test_bias_table():
-    run = {"volume": "v", "bias": 0.15, "shading": "estimated", "median_mm": 0.5, "p90_mm": 1.0,
-           "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}  # fmt: skip
+    run = {"volume": "v", "bias": 0.15, "shading": "estimated", "seed": 7, "median_mm": 0.5,
+           "p90_mm": 1.0, "warned": False, "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}  # fmt: skip
     text = motion_bias.table({"preset": "balanced", "threads": 2, "runs": [run]})
-    assert "| v | 0.15 | estimated | 0.50 | 1.00 | 28.00 | 0.970 | 26 |" in text
+    assert "| v | 7 | 0.15 | estimated | 0.50 | 1.00 | 28.00 | 0.970 | - | 26 |" in text
 
 
 def test_nested_settings():
