@@ -103,7 +103,9 @@ def _run(options: argparse.Namespace) -> int:
             run = (
                 registered(case, chosen) if options.motion_only else reconstructed(case, chosen, options.ckpt)
             )
-            row = {"volume": recipe.volume, "seed": recipe.seed, "bias": recipe.bias, "shading": variant}
+            # without the fit, settings left as they are say nothing about the shading
+            label = "-" if options.motion_only and not changes else variant
+            row = {"volume": recipe.volume, "seed": recipe.seed, "bias": recipe.bias, "shading": label}
             rows.append({**row, **run.record()})
             print(table(record).splitlines()[-1], flush=True)
             write_json(options.output / "bias.json", record)
