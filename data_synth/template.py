@@ -55,8 +55,10 @@ def mean_heads(
     placed = {k: _placed(head, grid) for k, head in heads.items()}
     means = []
     for week in used:
-        mean = np.mean([placed[int(k)] for k in members[week]], axis=0)
-        mean = (mean + mean[::-1]) / 2  # the grid is symmetric about x = 0
+        total, inside = np.sum([placed[int(k)] for k in members[week]], axis=0) / len(members[week])
+        # the grid is symmetric about x = 0
+        total, inside = (total + total[::-1]) / 2, (inside + inside[::-1]) / 2
+        mean = np.where(inside > 0.5, total / np.maximum(inside, 0.5), 0)
         bright = np.percentile(mean[mean > 0], 99.5)
         means.append(np.clip(mean / bright, 0, None).astype(np.float32))
         logger.info("template at %g weeks from %d subjects", week, len(members[week]))
@@ -74,6 +76,8 @@ def _common_grid(heads: Sequence[TruthVolume], spacing_mm: float) -> VolumeGrid:
 
 
 def _placed(head: TruthVolume, grid: VolumeGrid) -> NDArray[np.float32]:
-    """A head on the template's grid, linearly interpolated."""
+    """A head and its mask [2, I, J, K] on the template's grid, linearly interpolated."""
     index = np.linalg.inv(head.affine) @ grid.affine
-    return affine_transform(head.data, index[:3, :3], index[:3, 3], grid.shape, order=1, output=np.float32)
+    both = (head.data, head.mask.astype(np.float32))
+    placed = [affine_transform(one, index[:3, :3], index[:3, 3], grid.shape, order=1) for one in both]
+    return np.stack(placed).astype(np.float32)

@@ -1,4 +1,4 @@
-"""`g3r-pretrain`: train the prior network with LightningCLI."""
+"""`g3r-pretrain`: train the prior network or the pose network with LightningCLI."""
 
 import sys
 from collections.abc import Sequence
@@ -6,10 +6,13 @@ from collections.abc import Sequence
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
 
-Train the density-gated prior network. Logs go to TensorBoard, checkpoints beside them.
+Train the density-gated prior network, or the pose network (lightning_configs/pose.yaml). Logs go to
+TensorBoard, checkpoints beside them.
 
   fit, validate            what to do
   --config FILE            settings; every one of them can be overridden on the command line
+  --model CLASS            what to train: g3r.prior.lightning_module.PriorModule (default, also where a config
+                           names no class) or g3r.prior.pose_module.PoseModule
   --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
   --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit
   --ckpt_path FILE         go on from a training checkpoint
@@ -30,17 +33,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         from lightning.pytorch import LightningDataModule
-        from lightning.pytorch.cli import LightningCLI
+        from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-        from g3r.prior.lightning_module import PriorModule
+        from g3r.prior.training import AnnealedModule
     except ModuleNotFoundError as error:
         advice = "install the training extra: pip install 'g3r[train]'"
         print(f"g3r-pretrain: {error.name} is not installed; {advice}", file=sys.stderr)
         return 3
+
+    class PretrainCLI(LightningCLI):
+        def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+            # a config that names no class is one of the prior's
+            parser.set_defaults({"model": {"class_path": "g3r.prior.lightning_module.PriorModule"}})
+
     try:
-        LightningCLI(
-            PriorModule,
+        PretrainCLI(
+            AnnealedModule,
             LightningDataModule,
+            subclass_mode_model=True,
             subclass_mode_data=True,
             seed_everything_default=1,
             save_config_kwargs={"overwrite": True},  # a resumed run writes its settings again

@@ -1,7 +1,7 @@
-"""The density-gated prior network: layers, whole-volume inference, and the checkpoint that carries it.
+"""The density-gated prior network and the pose network: layers, inference, and the files that carry them.
 
 Names are looked up on first use: MONAI takes seconds to import, and a command that only parses its
-arguments should not wait for it. The training side, `g3r.prior.lightning_module`, is never imported here.
+arguments should not wait for it. The training side, which imports Lightning, is never imported here.
 """
 
 from importlib import import_module
@@ -17,26 +17,39 @@ if TYPE_CHECKING:
     from g3r.prior.gate import DensityGate, confidence_from_density
     from g3r.prior.inference import estimate_prior
     from g3r.prior.network import ResidualRefiner
+    from g3r.prior.pose_checkpoint import PoseCheckpoint, load_pose_network, save_pose_checkpoint
+    from g3r.prior.pose_inference import predict_poses
+    from g3r.prior.pose_network import PoseNetwork
 
 __all__ = [
     "DensityGate",
     "DensityGatedPriorNetwork",
+    "PoseCheckpoint",
+    "PoseNetwork",
     "PriorCheckpoint",
     "ResidualRefiner",
     "confidence_from_density",
     "estimate_prior",
+    "load_pose_network",
     "load_prior",
+    "predict_poses",
+    "save_pose_checkpoint",
     "save_prior_checkpoint",
 ]
 
 _MODULE_OF = {
     "DensityGate": "gate",
     "DensityGatedPriorNetwork": "dgpn",
+    "PoseCheckpoint": "pose_checkpoint",
+    "PoseNetwork": "pose_network",
     "PriorCheckpoint": "checkpoint",
     "ResidualRefiner": "network",
     "confidence_from_density": "gate",
     "estimate_prior": "inference",
+    "load_pose_network": "pose_checkpoint",
     "load_prior": "checkpoint",
+    "predict_poses": "pose_inference",
+    "save_pose_checkpoint": "pose_checkpoint",
     "save_prior_checkpoint": "checkpoint",
 }
 

@@ -1,14 +1,9 @@
-"""Training of the prior network. The only file of `g3r.prior` that imports Lightning."""
+"""Training of the prior network."""
 
-import math
-import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torchmetrics.functional.image import (
@@ -19,26 +14,22 @@ from torchmetrics.functional.image import (
 from g3r.errors import InputError
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
+from g3r.prior.training import AnnealedModule, describe_data
 
 Batch = Mapping[str, Tensor]
 """{"coarse", "density", "truth", "mask"}, each float32 [B, 1, I, J, K]; intensities by "p99-coarse-v1"."""
 
 EXPORT_KEY = "g3r_prior"
 """Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
-NETWORK_PREFIX = "network."
 
 
-class PriorModule(LightningModule):
+class PriorModule(AnnealedModule):
     """Supervised training of V_prior against the true volume.
 
     Loss: mean absolute error, weighted 1 in the brain mask and `background_weight` elsewhere. Only what lies
     in the mask is used later, and V_coarse ends in a bright halo around it: with a background that counted
     more (0.1, and 1 within 3 voxels of the mask, was tried) the network learnt to trim the halo and nothing
     else. The little that is left keeps the output bounded there.
-
-    The learning rate warms up over `warmup_steps`, then follows half a cosine to 1 % by the budget that
-    runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run given 70 minutes ends
-    annealed, however fast the machine.
 
     Args:
         channels: see `ResidualRefiner`.
@@ -76,24 +67,18 @@ class PriorModule(LightningModule):
         augment_orientation: bool = True,
         voxel_mm: float | None = None,
     ) -> None:
-        super().__init__()
-        if not (learning_rate > 0 and weight_decay >= 0 and 0 <= background_weight <= 1):
-            raise ValueError(f"got {learning_rate=}, {weight_decay=}, {background_weight=}")
+        super().__init__(learning_rate, weight_decay, warmup_steps)
+        if not 0 <= background_weight <= 1:
+            raise ValueError(f"got {background_weight=}")
         self.save_hyperparameters()
         self.network = DensityGatedPriorNetwork(
             channels, units, tail_channels, alpha, beta, use_gate, use_density
         ).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
-        self.learning_rate = learning_rate
-        self.weight_decay = weight_decay
-        self.warmup_steps = warmup_steps
         self.background_weight = background_weight
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
         self._training_data = "not recorded"
-        self._total_steps = math.inf
-        self._timer: Timer | None = None
         self._panel: Tensor | None = None
-        self._pace = _Pace()
 
     def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
         """Return V_prior; see `DensityGatedPriorNetwork.forward`."""
@@ -113,50 +98,9 @@ class PriorModule(LightningModule):
         self.log("train/l1_coarse", coarse_loss, batch_size=n_samples)
         return loss
 
-    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Note when the data arrived."""
-        self._pace.start_batch()
-
-    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """Log samples per second and the share of time spent waiting for data."""
-        self._pace.end_batch(batch["truth"].shape[0])
-        every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
-        if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
-            samples_per_second, waiting = self._pace.read_and_reset()
-            self.log("train/samples_per_second", samples_per_second, prog_bar=True)
-            self.log("train/waiting_for_data", waiting)
-
-    def on_train_epoch_start(self) -> None:
-        """Forget the time spent in validation."""
-        self._pace = _Pace()
-
-    def configure_optimizers(self) -> Any:
-        """Return AdamW with warm-up and a cosine over the trainer's budget."""
-        # Without normalisation layers one batch can have a far larger gradient than those before; with the
-        # usual 0.999 the second moment is then too small and a single step throws the network far off.
-        optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            lr=self.learning_rate,
-            betas=(0.9, 0.95),
-            weight_decay=self.weight_decay,
-        )
-        total = self.trainer.estimated_stepping_batches
-        self._total_steps = float(total) if total > 0 else math.inf
-        self._timer = next((c for c in self.trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate_factor)
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step", "name": "train/learning_rate"},
-        }
-
-    def _rate_factor(self, step: int) -> float:
-        """Return the learning rate's factor at a step, in (0, 1]."""
-        progress = step / self._total_steps
-        if self._timer is not None:
-            elapsed, remaining = self._timer.time_elapsed(), self._timer.time_remaining()
-            if remaining is not None and elapsed > 0:
-                progress = max(progress, elapsed / (elapsed + max(remaining, 0.0)))
-        return min((step + 1) / (self.warmup_steps + 1), 1.0) * cosine_factor(progress)
+    def n_samples(self, batch: Batch) -> int:
+        """Patches of a batch."""
+        return int(batch["truth"].shape[0])
 
     # ---- validation -----------------------------------------------------------------------------------
 
@@ -222,34 +166,6 @@ class PriorModule(LightningModule):
         }
 
 
-class _Pace:
-    """Samples per second, and the share of the time in which training waits for data."""
-
-    def __init__(self) -> None:
-        self._since = self._arrived = self._ended = time.monotonic()
-        self._n_samples = 0
-        self._waited_seconds = 0.0
-
-    def start_batch(self) -> None:
-        self._arrived = time.monotonic()
-        self._waited_seconds += self._arrived - self._ended
-
-    def end_batch(self, n_samples: int) -> None:
-        self._ended = time.monotonic()
-        self._n_samples += n_samples
-
-    def read_and_reset(self) -> tuple[float, float]:
-        seconds = max(self._ended - self._since, 1e-9)
-        result = self._n_samples / seconds, min(self._waited_seconds / seconds, 1.0)
-        self._since, self._n_samples, self._waited_seconds = self._ended, 0, 0.0
-        return result
-
-
-def cosine_factor(progress: float, final: float = 0.01) -> float:
-    """Return half a cosine from 1 at progress 0 to `final` at progress 1 and beyond."""
-    return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
-
-
 def loss_weight(mask: Tensor, background_weight: float) -> Tensor:
     """Return 1 in the mask and `background_weight` elsewhere, [B, 1, I, J, K]."""
     return background_weight + (1.0 - background_weight) * (mask > 0.5).to(mask.dtype)
@@ -313,19 +229,3 @@ def panel(batch: Batch, prior: Tensor, gate: DensityGate) -> Tensor:
     ]
     # Columns follow i (the patient's right), rows follow j upwards (anterior).
     return torch.cat([image[:, :, section].T.flip(0) for image in row], 1).clamp(0.0, 1.0)
-
-
-def describe_data(data: object, settings: Mapping[str, Any]) -> str:
-    """Return the data module and its settings in one line, with folders by name only.
-
-    The line ends up in files that are passed on; where the data lay on this machine is nobody's business.
-    """
-    if data is None:
-        return "not recorded"
-    plain = {
-        name: Path(value).name if isinstance(value, (str, Path)) and "/" in str(value) else value
-        for name, value in settings.items()
-        if not name.startswith("_")
-    }
-    listed = ", ".join(f"{name}={value}" for name, value in plain.items())
-    return f"{type(data).__module__}.{type(data).__qualname__}({listed})"

@@ -18,6 +18,7 @@ lightning = pytest.importorskip("lightning.pytorch", reason="the training extra 
 from torch.utils.data import DataLoader  # noqa: E402
 
 from g3r.prior import lightning_module as training  # noqa: E402
+from g3r.prior.training import cosine_factor  # noqa: E402
 
 SMALL = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
@@ -236,7 +237,7 @@ def test_learning_rate_follows_the_budget_that_ends_first(tmp_path):
 
 
 def test_cosine_factor():
-    values = [training.cosine_factor(progress) for progress in (-1, 0, 0.5, 1, 7)]
+    values = [cosine_factor(progress) for progress in (-1, 0, 0.5, 1, 7)]
     assert values == pytest.approx([1, 1, 0.505, 0.01, 0.01])
 
 

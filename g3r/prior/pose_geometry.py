@@ -1,0 +1,141 @@
+"""Rigid motions, groups of slices and sampling for the pose network, in torch."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+SMALLEST_SINGULAR_SUM = 0.05
+"""Below it (two singular values cancel: the rotation is not determined) gradients are held back."""
+
+
+class _NearestRotation(torch.autograd.Function):
+    """Polar factor of [S, 3, 3] matrices with det +1.
+
+    The gradient is R K with K antisymmetric, from differentiating M = R P with P symmetric. It divides by
+    sums of singular values only; torch's own through `svd` also divides by differences, which are often zero.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        left, singular, right = torch.linalg.svd(matrix)
+        sign = torch.ones_like(singular)
+        sign[:, 2] = torch.sign(torch.linalg.det(left @ right))
+        rotation = (left * sign[:, None]) @ right
+        ctx.save_for_backward(rotation, singular * sign, right)
+        return rotation
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        rotation, singular, right = ctx.saved_tensors
+        turned = right @ rotation.transpose(1, 2) @ gradients[0] @ right.transpose(1, 2)
+        pairs = (singular[:, :, None] + singular[:, None]).clamp_min(SMALLEST_SINGULAR_SUM)
+        antisymmetric = (turned - turned.transpose(1, 2)) / pairs
+        return rotation @ right.transpose(1, 2) @ antisymmetric @ right
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotations nearest to matrices [S, 3, 3] in the Frobenius norm.
+
+    A sum of rotation votes is their maximum-likelihood mean under matrix Fisher distributions, whose
+    magnitudes are the votes' certainty. Source: Levinson et al., "An analysis of SVD for deep rotation
+    estimation", NeurIPS 2020.
+    """
+    return _NearestRotation.apply(matrix)
+
+
+def rotation_from_vector(vector: Tensor) -> Tensor:
+    """Rotations [S, 3, 3] of vectors [S, 3]: the unit quaternion along (1, v / 2); about v rad when small."""
+    quaternion = torch.nn.functional.normalize(
+        torch.cat([torch.ones_like(vector[:, :1]), vector / 2], dim=1), dim=1
+    )
+    w, x, y, z = quaternion.unbind(1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, 1).reshape(-1, 3, 3)
+
+
+def group_mean(value: Tensor, group: Tensor, n_groups: int) -> Tensor:
+    """Means [G, ...] of values [S, ...] by their group's number [S]."""
+    total = value.new_zeros(n_groups, *value.shape[1:]).index_add(0, group, value)
+    count = torch.bincount(group, minlength=n_groups).clamp_min(1).to(value.dtype)
+    return total / count.reshape(-1, *[1] * (value.dim() - 1))
+
+
+def pixel_points_mm(size: int, pixel_mm: float, like: Tensor) -> Tensor:
+    """Positions [N * N, 3] of the pixels of a square image in its own frame."""
+    at = (torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2) * pixel_mm
+    x, y = torch.meshgrid(at, at, indexing="ij")
+    return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+
+
+def moved_points(rotation: Tensor, translation_mm: Tensor, points_mm: Tensor) -> Tensor:
+    """Points [P, 3] after each of S motions, [S, P, 3]."""
+    return points_mm @ rotation.transpose(1, 2) + translation_mm[:, None]
+
+
+def sample_rows(volume: Tensor, points_mm: Tensor, spacing_mm: float, offset: Tensor | int = 0) -> Tensor:
+    """Trilinear samples of a volume centred on the origin, zero outside.
+
+    Args:
+        volume: [..., I, J, K, C]; leading axes are further volumes, chosen by `offset`.
+        points_mm: [S, P, 3].
+        spacing_mm: voxel size.
+        offset: number of the volume for each of the S blocks, [S], or 0.
+
+    Returns:
+        [S, P, C].
+    """
+    shape = torch.tensor(volume.shape[-4:-1], device=volume.device)
+    index = points_mm / spacing_mm + (shape - 1) / 2
+    inside = ((index >= 0) & (index <= shape - 1)).all(-1, keepdim=True)
+    low = index.floor().clamp_min(0).minimum(shape - 2)
+    fraction = (index - low).clamp(0, 1)
+    corner = low.long()
+    n_voxels = int(shape.prod())
+    first = (corner[..., 0] * shape[1] + corner[..., 1]) * shape[2] + corner[..., 2]
+    if isinstance(offset, Tensor):
+        first = first + offset[:, None] * n_voxels
+    rows = volume.reshape(-1, volume.shape[-1])
+    result = torch.zeros((), dtype=volume.dtype, device=volume.device)
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                weight = torch.ones_like(fraction[..., 0])
+                for axis, upper in enumerate((i, j, k)):
+                    weight = weight * (fraction[..., axis] if upper else 1 - fraction[..., axis])
+                step = (i * shape[1] + j) * shape[2] + k
+                corner_value = rows.index_select(0, (first + step).reshape(-1)).reshape(*first.shape, -1)
+                result = result + weight[..., None] * corner_value
+    return result * inside
+
+
+def scattered(
+    points_mm: Tensor,
+    value: Tensor,
+    weight: Tensor,
+    group: Tensor,
+    n_groups: int,
+    shape: int,
+    spacing_mm: float,
+) -> Tensor:
+    """Weighted sums and weights of points in cubes of voxels centred on the origin, [G, I, J, K, 2].
+
+    Args:
+        points_mm: [S, P, 3]; each goes to its nearest voxel.
+        value: [S, P].
+        weight: [S, P]; points of zero weight are skipped.
+        group: [S] volume that a block of points goes to.
+        n_groups: G.
+        shape: voxels per edge.
+        spacing_mm: voxel size.
+    """
+    index = (points_mm / spacing_mm + (shape - 1) / 2).round().long()
+    inside = ((index >= 0) & (index < shape)).all(-1) & (weight > 0)
+    flat = ((group[:, None] * shape + index[..., 0]) * shape + index[..., 1]) * shape + index[..., 2]
+    both = torch.stack([value * weight, weight], -1)[inside]
+    volume = value.new_zeros(n_groups * shape**3, 2).index_add(0, flat[inside], both)
+    return volume.reshape(n_groups, shape, shape, shape, 2)

@@ -1,0 +1,113 @@
+"""From slices to poses in the atlas frame with a trained pose network."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slice_images import SliceImages, slice_images
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import fit_rigid, orthonormal
+
+if TYPE_CHECKING:
+    from g3r.prior.pose_checkpoint import PoseCheckpoint
+    from g3r.prior.pose_network import PoseNetwork, SliceBatch
+
+SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0], [25, 25, 0]], dtype=float)
+"""Points of a slice over which a pose error is averaged."""
+N_REFINEMENTS = 2
+ROBUST_SCALE_MM = 3.0
+"""Slices further than this from their stack's common motion count less in it, in proportion."""
+ROBUST_STEPS = 12
+
+
+def predict_poses(
+    network: "PoseNetwork",
+    meta: "PoseCheckpoint",
+    slices: Slices,
+    time_rank: NDArray[np.float64] | None = None,
+) -> RigidPose:
+    """Pose of each slice's own frame (as `slices.planes.pose`) in the atlas frame.
+
+    Args:
+        network: trained, in evaluation mode.
+        meta: what its file says about it.
+        slices: of all stacks; only their header poses are used.
+        time_rank: [K] order of acquisition in each stack from 0 to 1, if it is known.
+
+    Returns:
+        K poses. They do not change if all headers are moved by one rigid motion, and permuting slices or
+        stacks permutes them.
+    """
+    images = slice_images(slices, meta.pixel_mm, meta.image_size)
+    if time_rank is not None:
+        images.time_rank[:] = time_rank
+    with torch.no_grad():
+        last = network(slice_batch([images]), N_REFINEMENTS)[-1]
+    return as_pose(last.rotation, last.translation_mm) @ images.frame_in_slice.inverse()
+
+
+def slice_batch(sets: Sequence[SliceImages]) -> "SliceBatch":
+    """The slices of several heads as one dict of tensors; stacks are numbered through all of them."""
+    n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
+    first = np.cumsum([0, *n_stacks])
+    batch = {
+        name: torch.from_numpy(np.concatenate([getattr(one, name) for one in sets]).astype(np.float32))
+        for name in ("image", "area_mm2", "position_mm", "thickness_mm", "time_rank", "header_rotation")
+    }
+    batch["image"] = batch["image"][:, None]
+    stack = np.concatenate([one.stack_id + first[k] for k, one in enumerate(sets)])
+    batch["stack"] = torch.from_numpy(stack)
+    batch["set_of_stack"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor(n_stacks))
+    return batch
+
+
+def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:
+    """A network's float32 motions as exact ones."""
+    return RigidPose(orthonormal(rotation.double().cpu().numpy()), translation_mm.double().cpu().numpy())
+
+
+def stack_motions(
+    atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]
+) -> RigidPose:
+    """One motion per stack, atlas frame from world, that most of its slices agree with.
+
+    The start is the slice whose own motion suits the others best in the median, so that a minority of
+    slices that are upside down has no say; then weighted least squares with weights 1 / distance.
+
+    Args:
+        atlas_from_slice: predicted poses [K].
+        world_from_slice: the headers' poses [K] of the same frames.
+        stack_id: [K] 0, 1, ... without gaps.
+    """
+    points = np.broadcast_to(SLICE_POINTS_MM, (len(stack_id), *SLICE_POINTS_MM.shape))
+    predicted, header = atlas_from_slice.apply(points), world_from_slice.apply(points)
+    own = atlas_from_slice @ world_from_slice.inverse()
+    rotation, translation = [], []
+    for stack in range(int(stack_id.max()) + 1):
+        rows = np.flatnonzero(stack_id == stack)
+        source, target = header[rows], predicted[rows]
+        candidates = own.take(rows)
+        moved = candidates.apply(np.broadcast_to(source.reshape(-1, 3), (len(rows), source[..., 0].size, 3)))
+        distance = np.linalg.norm(moved - target.reshape(-1, 3), axis=-1).reshape(len(rows), len(rows), -1)
+        best = int(np.median(distance.mean(-1), axis=1).argmin())
+        motion = candidates.take([best])
+        for _ in range(ROBUST_STEPS):
+            off = np.linalg.norm(motion.apply(source.reshape(1, -1, 3))[0] - target.reshape(-1, 3), axis=-1)
+            weight = 1 / np.maximum(off.reshape(len(rows), -1).mean(1), ROBUST_SCALE_MM)
+            motion = fit_rigid(
+                source.reshape(-1, 3), target.reshape(-1, 3), np.repeat(weight, len(SLICE_POINTS_MM))
+            )
+        rotation.append(motion.rotation[0])
+        translation.append(motion.translation_mm[0])
+    return RigidPose(np.array(rotation), np.array(translation))
+
+
+def pose_errors(predicted: RigidPose, true: RigidPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean distance (mm) of five slice points, and angle (degrees), of each of K poses."""
+    points = np.broadcast_to(SLICE_POINTS_MM, (len(true), *SLICE_POINTS_MM.shape))
+    distance_mm = np.linalg.norm(predicted.apply(points) - true.apply(points), axis=-1).mean(1)
+    return distance_mm, np.rad2deg(np.linalg.norm((predicted.inverse() @ true).rotvec_rad(), axis=1))

@@ -1,0 +1,275 @@
+"""The pose network: a set transformer over all slices of all stacks that puts each into the atlas frame."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from monai.networks.blocks import Convolution, ResidualUnit, TransformerBlock
+from torch import Tensor, nn
+
+from g3r.prior.pose_geometry import (
+    group_mean,
+    moved_points,
+    nearest_rotation,
+    pixel_points_mm,
+    rotation_from_vector,
+    sample_rows,
+    scattered,
+)
+
+ANCHORS_MM = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (0.0, 30.0, 0.0))
+"""Points of a slice's image that stand for its pose: centre, along x, along y."""
+WAVELENGTHS_MM = (200.0, 100.0, 50.0, 25.0)
+"""Of the codes of a slice's position along its stack."""
+TRANSLATION_SCALE_MM = 20.0
+RESIDUAL_SCALE_RAD = 0.3
+RESIDUAL_SCALE_MM = 8.0
+COARSE_SHAPE, COARSE_SPACING_MM = 28, 5.0
+N_CODES = 2 * len(WAVELENGTHS_MM) + 5
+N_POSE_CODES = 12
+
+SliceBatch = Mapping[str, Tensor]
+"""`image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S] (NaN: unknown),
+`stack` [S] (numbered through all sets), `set_of_stack` [G], `header_rotation` [S, 3, 3]: see `SliceImages`
+and `g3r.prior.pose_inference.slice_batch`."""
+
+
+class PoseStep(NamedTuple):
+    """What one step of the network says: poses atlas frame from image frame, and the votes behind them.
+
+    Attributes:
+        rotation: [S, 3, 3].
+        translation_mm: [S, 3].
+        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less sure, the smaller.
+    """
+
+    rotation: Tensor
+    translation_mm: Tensor
+    vote: Tensor
+
+
+class Encoder(nn.Module):
+    """Slice image to token: MONAI's residual units, and a linear layer that still knows what lay where.
+
+    Args:
+        channels: of the three halvings of the image.
+        width: of the token.
+        image_size: pixels per edge, a multiple of 8.
+        extra_channels: further channels at half the image's resolution.
+    """
+
+    def __init__(self, channels: Sequence[int], width: int, image_size: int, extra_channels: int = 0) -> None:
+        super().__init__()
+        first, second, third = channels
+        self.stem = Convolution(2, 1, first, strides=2, kernel_size=3, act="relu", norm="batch")
+        self.extra = (
+            Convolution(2, extra_channels, first, kernel_size=3, act="relu", norm="batch")
+            if extra_channels
+            else None
+        )
+        into = first * (2 if extra_channels else 1)
+        self.body = nn.Sequential(
+            ResidualUnit(2, into, second, strides=2, subunits=2, act="relu", norm="batch"),
+            ResidualUnit(2, second, third, strides=2, subunits=2, act="relu", norm="batch"),
+        )
+        self.token = nn.Linear(third * (image_size // 8) ** 2, width)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, image: Tensor, extra: Tensor | None = None) -> Tensor:
+        """Tokens [S, width] of images [S, 1, N, N] and, if so built, [S, E, N / 2, N / 2]."""
+        # bfloat16 halves the time of a training step; the poses are always computed in float32
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.training):
+            # a convolution on a CPU is faster with channels innermost
+            features = self.stem(image.to(memory_format=torch.channels_last))
+            if self.extra is not None and extra is not None:
+                features = torch.cat([features, self.extra(extra)], 1)
+            token = self.token(self.body(features).flatten(1))
+        return token.float()
+
+
+class SetTransformer(nn.Module):
+    """Tokens of slices to votes: attention in turn among the slices of a stack and among those of a head.
+
+    Args:
+        width: of a token.
+        n_codes: numbers that describe a slice beside its image.
+        n_blocks: transformer blocks; the even ones see one stack, the odd ones all stacks of the head.
+        n_heads: attention heads.
+    """
+
+    def __init__(self, width: int, n_codes: int, n_blocks: int, n_heads: int) -> None:
+        super().__init__()
+        self.code = nn.Sequential(nn.Linear(n_codes, width), nn.ReLU(), nn.Linear(width, width))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(width, 2 * width, n_heads, use_flash_attention=True) for _ in range(n_blocks)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.vote = nn.Linear(width, 18)
+        nn.init.normal_(self.vote.weight, std=0.01)
+        nn.init.zeros_(self.vote.bias)
+
+    def forward(self, token: Tensor, code: Tensor, same_stack: Tensor, same_set: Tensor) -> Tensor:
+        """Votes [S, 18]: rotation of the stack (9), its shift (3), the slice's own turn (3) and shift (3)."""
+        x = (token + self.code(code))[None]
+        for number, block in enumerate(self.blocks):
+            x = block(x, attn_mask=(same_set if number % 2 else same_stack)[None, None])
+        return self.vote(self.norm(x[0]))
+
+
+class PoseNetwork(nn.Module):
+    """Poses of slices in the atlas frame, by a first guess and refinements.
+
+    Nothing but rotations between stacks is taken from the headers, so turning all of them together changes
+    nothing, and neither does the order of slices or stacks. In each step every slice votes for a rotation and
+    shift of its stack; votes of a stack are summed, those of other stacks added through the header's
+    rotations between stacks (first step) or as they are (refinements), and the sum is made a rotation. Then
+    every slice moves a little on its own. Refinements see, at the current poses, the mean heads of the
+    template and a coarse volume made of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
+
+    Args:
+        template_shape: [A, I, J, K] of the template.
+        template_spacing_mm: its voxel size.
+        image_size: N, pixels per edge of a slice image.
+        pixel_mm: edge of these pixels.
+        channels: of the encoder.
+        width: of a token.
+        n_blocks: transformer blocks per step.
+        n_heads: attention heads.
+        n_refinements: refinements with the same weights.
+    """
+
+    template: Tensor
+
+    def __init__(
+        self,
+        template_shape: Sequence[int],
+        template_spacing_mm: float = 3.0,
+        image_size: int = 40,
+        pixel_mm: float = 3.0,
+        channels: Sequence[int] = (24, 48, 96),
+        width: int = 128,
+        n_blocks: int = 3,
+        n_heads: int = 4,
+        n_refinements: int = 1,
+    ) -> None:
+        super().__init__()
+        if (
+            len(template_shape) != 4
+            or image_size % 8
+            or len(channels) != 3
+            or width % n_heads
+            or n_refinements < 1
+        ):
+            raise ValueError(
+                f"got {template_shape=}, {image_size=}, {channels=}, {width=}, {n_heads=}, {n_refinements=}"
+            )
+        self._arguments = {
+            "template_shape": [int(n) for n in template_shape],
+            "template_spacing_mm": float(template_spacing_mm),
+            "image_size": int(image_size),
+            "pixel_mm": float(pixel_mm),
+            "channels": [int(n) for n in channels],
+            "width": int(width),
+            "n_blocks": int(n_blocks),
+            "n_heads": int(n_heads),
+            "n_refinements": int(n_refinements),
+        }
+        self.pixel_mm, self.image_size, self.n_refinements = pixel_mm, image_size, n_refinements
+        self.template_spacing_mm = template_spacing_mm
+        ages, *shape = [int(n) for n in template_shape]
+        # [I, J, K, A]: all ages of a voxel side by side, as sampling wants them
+        self.register_buffer("template", torch.zeros(*shape, ages))
+        self.encoder = Encoder(channels, width, image_size)
+        self.transformer = SetTransformer(width, N_CODES, n_blocks, n_heads)
+        self.refining_encoder = Encoder(channels, width, image_size, ages + 2)
+        self.refining_transformer = SetTransformer(width, N_CODES + N_POSE_CODES, n_blocks, n_heads)
+        # how much the votes of all stacks count beside the stack's own, in the first step and in refinements
+        self.log_share = nn.Parameter(torch.zeros(2))
+
+    def arguments(self) -> dict[str, Any]:
+        """Constructor arguments, in plain values."""
+        return dict(self._arguments)
+
+    def set_template(self, volume: Tensor) -> None:
+        """Take over mean heads [A, I, J, K] on a grid centred on the origin."""
+        self.template.copy_(volume.permute(1, 2, 3, 0))
+
+    def forward(self, batch: SliceBatch, n_refinements: int | None = None) -> list[PoseStep]:
+        """The first guess and what each refinement makes of it."""
+        stack, set_of_stack = batch["stack"], batch["set_of_stack"]
+        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
+        same_stack = stack[:, None] == stack
+        of_set = set_of_stack[stack]
+        same_set = of_set[:, None] == of_set
+        code = slice_codes(batch)
+        header = group_mean(batch["header_rotation"].to(code.dtype), stack, n_stacks)
+
+        vote = self.transformer(self.encoder(batch["image"]), code, same_stack, same_set)
+        votes = vote[:, :9].reshape(-1, 3, 3)
+        matrix = group_mean(votes, stack, n_stacks)
+        # each stack's vote, carried over to the others of its head by the headers
+        carried = group_mean(matrix @ header.transpose(1, 2), set_of_stack, n_sets)[set_of_stack] @ header
+        rotation = nearest_rotation(matrix + self.log_share[0].exp() * carried)[stack]
+        shift = group_mean(vote[:, 9:12], stack, n_stacks)[stack] * TRANSLATION_SCALE_MM
+        along = batch["position_mm"].to(code.dtype)[:, None]
+        steps = [PoseStep(*_with_residual(rotation, shift + rotation[:, :, 2] * along, vote[:, 12:]), votes)]
+
+        for _ in range(self.n_refinements if n_refinements is None else n_refinements):
+            rotation, translation = steps[-1].rotation.detach(), steps[-1].translation_mm.detach()
+            seen = self._seen_at(rotation, translation, batch)
+            pose_code = torch.cat([rotation.flatten(1), translation / 50.0], 1)
+            token = self.refining_encoder(batch["image"], seen)
+            vote = self.refining_transformer(token, torch.cat([code, pose_code], 1), same_stack, same_set)
+            # the pose that a refinement starts from has a vote of its own
+            votes = torch.eye(3, dtype=code.dtype, device=code.device) + vote[:, :9].reshape(-1, 3, 3)
+            matrix = group_mean(votes, stack, n_stacks)
+            shared = group_mean(matrix, set_of_stack, n_sets)[set_of_stack]
+            turn = nearest_rotation(matrix + self.log_share[1].exp() * shared)[stack]
+            shift = group_mean(vote[:, 9:12], stack, n_stacks)[stack] * TRANSLATION_SCALE_MM
+            moved = (turn @ translation[..., None])[..., 0] + shift
+            steps.append(PoseStep(*_with_residual(turn @ rotation, moved, vote[:, 12:]), votes @ rotation))
+        return steps
+
+    @torch.no_grad()
+    def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
+        """What template and other stacks show at the slices' poses, [S, A + 2, N / 2, N / 2]."""
+        half = self.image_size // 2
+        value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
+        points = moved_points(rotation, translation_mm, pixel_points_mm(half, 2 * self.pixel_mm, value))
+        stack, set_of_stack = batch["stack"], batch["set_of_stack"]
+        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
+        sums = scattered(
+            points, value, (value > 0).to(value.dtype), stack, n_stacks, COARSE_SHAPE, COARSE_SPACING_MM
+        )
+        per_set = sums.new_zeros(n_sets, *sums.shape[1:]).index_add(0, set_of_stack, sums)
+        others = (per_set[set_of_stack] - sums).permute(0, 4, 1, 2, 3)
+        blurred = nn.functional.avg_pool3d(others, 3, stride=1, padding=1).permute(0, 2, 3, 4, 1)
+        coarse = sample_rows(blurred.contiguous(), points, COARSE_SPACING_MM, stack)
+        known = coarse[..., 1:] / (coarse[..., 1:] + 0.1)
+        mean = coarse[..., :1] / (coarse[..., 1:] + 0.02)
+        heads = sample_rows(self.template, points, self.template_spacing_mm)
+        seen = torch.cat([heads, mean, known], -1)
+        return seen.reshape(len(value), half, half, -1).permute(0, 3, 1, 2)
+
+
+def slice_codes(batch: SliceBatch) -> Tensor:
+    """What is known of a slice beside its image [S, N_CODES]: position, thickness, area, rank in time."""
+    image = batch["image"]
+    position, thickness, area, rank = (
+        batch[name].to(image.dtype) for name in ("position_mm", "thickness_mm", "area_mm2", "time_rank")
+    )
+    phase = position[:, None] * (2 * torch.pi / position.new_tensor(WAVELENGTHS_MM))
+    known = torch.isfinite(rank)
+    plain = [position / 50.0, thickness / 5.0, area / 5000.0, torch.where(known, 2 * rank - 1, 0.0), known]
+    return torch.cat([torch.sin(phase), torch.cos(phase), torch.stack([p.to(phase) for p in plain], 1)], 1)
+
+
+def anchor_points(rotation: Tensor, translation_mm: Tensor) -> Tensor:
+    """The three points [S, 3, 3] in the atlas frame (mm) by which a slice's pose is known."""
+    return moved_points(rotation, translation_mm, rotation.new_tensor(ANCHORS_MM))
+
+
+def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:
+    """A stack's pose of each slice, followed by the slice's own turn and shift in its own frame."""
+    shift = (rotation @ (vote[:, 3:] * RESIDUAL_SCALE_MM)[..., None])[..., 0]
+    return rotation @ rotation_from_vector(vote[:, :3] * RESIDUAL_SCALE_RAD), translation_mm + shift

@@ -1,0 +1,135 @@
+"""What the trainings share: the optimiser annealed over a budget, the pace of the data, the data in words.
+
+Only the modules with `Module` classes import Lightning; inference never does.
+"""
+
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.callbacks import Timer
+
+
+class AnnealedModule(LightningModule):
+    """A module trained by AdamW over whatever budget the trainer has.
+
+    The learning rate warms up over `warmup_steps`, then follows half a cosine to 1 % by the budget that
+    runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run given 70 minutes ends
+    annealed, however fast the machine.
+
+    Args:
+        learning_rate: peak rate of AdamW.
+        weight_decay: of AdamW.
+        warmup_steps: steps of linear warm-up.
+
+    Raises:
+        ValueError: a rate out of range.
+    """
+
+    def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:
+        super().__init__()
+        if not (learning_rate > 0 and weight_decay >= 0 and warmup_steps >= 0):
+            raise ValueError(f"got {learning_rate=}, {weight_decay=}, {warmup_steps=}")
+        self.learning_rate = learning_rate
+        self.weight_decay = weight_decay
+        self.warmup_steps = warmup_steps
+        self._total_steps = math.inf
+        self._timer: Timer | None = None
+        self._pace = _Pace()
+
+    def n_samples(self, batch: Any) -> int:
+        """Samples of a batch."""
+        raise NotImplementedError
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Note when the data arrived."""
+        self._pace.start_batch()
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Log samples per second and the share of time spent waiting for data."""
+        self._pace.end_batch(self.n_samples(batch))
+        every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
+        if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
+            samples_per_second, waiting = self._pace.read_and_reset()
+            self.log("train/samples_per_second", samples_per_second, prog_bar=True)
+            self.log("train/waiting_for_data", waiting)
+
+    def on_train_epoch_start(self) -> None:
+        """Forget the time spent in validation."""
+        self._pace = _Pace()
+
+    def configure_optimizers(self) -> Any:
+        """Return AdamW with warm-up and a cosine over the trainer's budget."""
+        # Without normalisation layers one batch can have a far larger gradient than those before; with the
+        # usual 0.999 the second moment is then too small and a single step throws the network far off.
+        optimizer = torch.optim.AdamW(
+            self.parameters(),
+            lr=self.learning_rate,
+            betas=(0.9, 0.95),
+            weight_decay=self.weight_decay,
+        )
+        total = self.trainer.estimated_stepping_batches
+        self._total_steps = float(total) if total > 0 else math.inf
+        self._timer = next((c for c in self.trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate_factor)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step", "name": "train/learning_rate"},
+        }
+
+    def _rate_factor(self, step: int) -> float:
+        """Return the learning rate's factor at a step, in (0, 1]."""
+        progress = step / self._total_steps
+        if self._timer is not None:
+            elapsed, remaining = self._timer.time_elapsed(), self._timer.time_remaining()
+            if remaining is not None and elapsed > 0:
+                progress = max(progress, elapsed / (elapsed + max(remaining, 0.0)))
+        return min((step + 1) / (self.warmup_steps + 1), 1.0) * cosine_factor(progress)
+
+
+class _Pace:
+    """Samples per second, and the share of the time in which training waits for data."""
+
+    def __init__(self) -> None:
+        self._since = self._arrived = self._ended = time.monotonic()
+        self._n_samples = 0
+        self._waited_seconds = 0.0
+
+    def start_batch(self) -> None:
+        self._arrived = time.monotonic()
+        self._waited_seconds += self._arrived - self._ended
+
+    def end_batch(self, n_samples: int) -> None:
+        self._ended = time.monotonic()
+        self._n_samples += n_samples
+
+    def read_and_reset(self) -> tuple[float, float]:
+        seconds = max(self._ended - self._since, 1e-9)
+        result = self._n_samples / seconds, min(self._waited_seconds / seconds, 1.0)
+        self._since, self._n_samples, self._waited_seconds = self._ended, 0, 0.0
+        return result
+
+
+def cosine_factor(progress: float, final: float = 0.01) -> float:
+    """Return half a cosine from 1 at progress 0 to `final` at progress 1 and beyond."""
+    return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+
+
+def describe_data(data: object, settings: Mapping[str, Any]) -> str:
+    """Return the data module and its settings in one line, with folders by name only.
+
+    The line ends up in files that are passed on; where the data lay on this machine is nobody's business.
+    """
+    if data is None:
+        return "not recorded"
+    plain = {
+        name: Path(value).name if isinstance(value, (str, Path)) and "/" in str(value) else value
+        for name, value in settings.items()
+        if not name.startswith("_")
+    }
+    listed = ", ".join(f"{name}={value}" for name, value in plain.items())
+    return f"{type(data).__module__}.{type(data).__qualname__}({listed})"
