@@ -8,11 +8,16 @@ VENV ?= .venv
 # e.g. PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the small CPU build of torch
 PIP_ARGS ?=
 ATLAS ?=
+# e.g. PRETRAIN_ARGS="--trainer.max_time 00:00:10:00"; POSE_ARGS likewise, for the pose network
 PRETRAIN_ARGS ?=
+POSE_ARGS ?=
 BENCH_ARGS ?=
 PRIOR ?= runs/prior.pt
+POSE ?= runs/pose.pt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
+best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
 .PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias clean
 
@@ -53,11 +58,11 @@ lint: install ## ruff: style, imports, docstrings
 types: install ## mypy
 	$(BIN)/mypy
 
-pretrain: install ## train the prior on the phantom, or on ATLAS=DIR, and export it to PRIOR=runs/prior.pt
+pretrain: install ## train both networks on the phantom, or on ATLAS=DIR, and export them to POSE and PRIOR
+	$(BIN)/g3r-pretrain fit --config lightning_configs/pose.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(POSE_ARGS)
+	$(BIN)/g3r-export --force "$$($(call best_of,runs/pose))" $(POSE)
 	$(BIN)/g3r-pretrain fit --config lightning_configs/prior.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(PRETRAIN_ARGS)
-	folder=$$(ls -dt runs/prior/version_*/checkpoints | head -n 1); \
-	best=$$(ls -t "$$folder"/best*.ckpt "$$folder"/last.ckpt 2>/dev/null | grep best | head -n 1 || true); \
-	$(BIN)/g3r-export --force "$${best:-$$folder/last.ckpt}" $(PRIOR)
+	$(BIN)/g3r-export --force "$$($(call best_of,runs/prior))" $(PRIOR)
 
 tensorboard: install ## watch the training runs
 	$(BIN)/tensorboard --logdir runs
