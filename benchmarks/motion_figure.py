@@ -26,9 +26,14 @@ LEAST_SHOWN_MM = 0.01
 GAP_SLICES = 4
 """Empty places between two stacks."""
 
-COLOURS = {"headers": "#b8b8b8", "network": "#e69f00", "stacks": "#56b4e9", "slices": "#0072b2",
-           "joint": "#d55e00"}  # fmt: skip
-OTHER_COLOURS = ("#009e73", "#cc79a7", "#000000")
+COLOURS = {
+    "headers": "#b8b8b8", "template": "#009e73", "network": "#e69f00", "stacks": "#56b4e9",
+    "best start": "#f0e442", "runs": "#cc79a7", "slices": "#0072b2", "joint": "#d55e00",
+}  # fmt: skip
+SHOWN = ("headers", "best start", "runs", "slices", "joint")
+"""Those that the figure draws; more dots than these hide each other."""
+
+OTHER_COLOURS = ("#000000", "#7f3c8d", "#3969ac")
 
 
 def places_in_time(n_slices: int, interleave: int = INTERLEAVE) -> NDArray[np.int64]:
@@ -77,6 +82,8 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
                     first - half_gap, first + n_slices - 1 + half_gap, color="#f4f4f4", zorder=-1, lw=0
                 )
         for number, (layer, figures) in enumerate(case["layers"].items()):
+            if layer in COLOURS and layer not in SHOWN:
+                continue
             x, y = _dots(figures["per_slice_mm"], start, width, interleave)
             colour = COLOURS.get(layer, OTHER_COLOURS[number % len(OTHER_COLOURS)])
             legend[layer] = axis.scatter(

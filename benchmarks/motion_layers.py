@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 Options = Mapping[str, Any]
 
 
+_ONE_START = {
+    "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
+    "motion.n_rounds": 0,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Layer:
     """One more layer than the row before.
@@ -38,14 +44,21 @@ class Layer:
 
 
 LAYERS = (
-    Layer("stacks", {"motion.n_rounds": 0}),
+    Layer("template", {**_ONE_START, "motion.template": True}),
+    Layer("network", {**_ONE_START, "motion.network": True}),
+    Layer("stacks", {**_ONE_START, "motion.stacks": True}),
+    Layer("best start", {"motion.runs": False, "motion.n_rounds": 0}),
+    Layer("runs", {"motion.n_rounds": 0}),
     Layer("slices"),
     Layer("joint", full=True),
 )
-"""In the order in which they follow on the headers."""
+"""In the order in which they follow on the headers; the first three each compete with the headers alone."""
 
 WITHOUT: dict[str, Options] = {
+    "template": {"motion.template": False},
+    "network": {"motion.network": False},
     "stacks": {"motion.stacks": False},
+    "runs": {"motion.runs": False},
     "slices": {"motion.n_rounds": 0},
     "joint": {"slice_stage.optimise_poses": False},
     "shading": {"slice_stage.optimise_shading": False},
@@ -147,15 +160,14 @@ def measure_case(
     from benchmarks.runs import changed, reconstructed, registered
 
     header = case.header_error()
-    plain = {key: value for key, value in vars(header).items() if key != "per_slice_mm"}
-    layers = {"headers": {**plain, "per_slice_mm": _listed(header.per_slice_mm)}}
+    layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
     everything: Run | None = None
     for layer in LAYERS:
         changed_settings = changed(settings, layer.options)
         if layer.full:
             run = everything = reconstructed(case, changed_settings, ckpt)
         else:
-            run = registered(case, changed_settings)
+            run = registered(case, changed_settings, ckpt)
         layers[layer.name] = {**run.record(), "per_slice_mm": _listed(run.error.per_slice_mm)}
         print(_line(case.name, f"after {layer.name}", run), flush=True)
     if everything is None:

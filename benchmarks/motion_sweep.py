@@ -25,6 +25,8 @@ LEVELS = ("mild", "moderate", "severe")
 WANTED_SHARE = {"mild": 0.95, "moderate": 0.90, "severe": 0.60}
 """Share of subjects that should end with their median slice under a millimetre."""
 
+UPRIGHT_DEG = 5.0
+
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
 """Weeks that no training has seen."""
 
@@ -139,7 +141,7 @@ def _one(
     header = case.header_error()
     wall, cpu = time.perf_counter(), time.process_time()
     try:
-        run = reconstructed(case, settings, ckpt) if full else registered(case, settings)
+        run = reconstructed(case, settings, ckpt) if full else registered(case, settings, ckpt)
     except G3RError as error:  # a refusal is an honest answer: nothing was moved, and the user was told
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
         run = Run(header, seconds, cpu_seconds, (str(error),))
@@ -161,17 +163,17 @@ def sweep_tables(record: dict[str, Any]) -> str:
     of_level = [[row for row in rows.values() if row["level"] == level] for level in levels]
     full = bool(record["full"])
     head = ["motion", "subjects", "headers", "median < 1 mm", "wanted", "median of medians", "median of p90"]
-    head += ["warned, bad", "warned, good", "silent, bad", "wall s", "CPU s"] + ["PSNR dB"] * full
+    head += ["warned, bad", "warned, good", "silent, bad", "upright", "wall s", "CPU s"] + ["PSNR dB"] * full
     summary = [
         [level, *_summary(level, group), *([_psnr(group)] if full else [])]
         for level, group in zip(levels, of_level, strict=True)
     ]
-    each_head = ["subject", "headers", "median", "p90", "worst slice", "warned", "wall s", "CPU s"]
+    each_head = ["subject", "headers", "median", "p90", "worst slice", "warned", "degrees", "wall s", "CPU s"]
     each_head += ["PSNR dB"] * full
     each = [
         [
             name, f"{row['header_mm']:.1f}", f"{row['median_mm']:.2f}", f"{row['p90_mm']:.2f}",
-            f"{row['worst_mm']:.1f}", "yes" if row["warned"] else "-", f"{row['seconds']:.0f}",
+            f"{row['worst_mm']:.1f}", "yes" if row["warned"] else "-", _degrees(row), f"{row['seconds']:.0f}",
             f"{row['cpu_seconds']:.0f}", *([_psnr([row], 2)] if full else []),
         ]
         for name, row in rows.items()
@@ -179,7 +181,8 @@ def sweep_tables(record: dict[str, Any]) -> str:
     what = "whole reconstructions" if full else "registration alone"
     lines = [
         f"Preset `{record['preset']}`, {what}; {record['jobs']} at a time, {record['threads']} threads each. "
-        "TRE in mm; seconds, headers and PSNR are medians over subjects; bad: median TRE not under 1 mm.",
+        "TRE in mm; seconds, headers and PSNR are medians over subjects; bad: median TRE not under 1 mm; "
+        f"upright: the result stands within {UPRIGHT_DEG:g} degrees of the atlas.",
         "", markdown_table(head, summary), "",
         "<details><summary>Every subject</summary>", "", markdown_table(each_head, each), "", "</details>",
     ]  # fmt: skip
@@ -194,6 +197,7 @@ def _summary(level: str, group: list[dict[str, Any]]) -> list[str]:
         f"{sum(row['warned'] and row['bad'] for row in group)}",
         f"{sum(row['warned'] and not row['bad'] for row in group)}",
         f"{sum(not row['warned'] and row['bad'] for row in group)}",
+        f"{sum(_is_upright(row) for row in group) / len(group):.0%}",
         f"{_middle(group, 'seconds'):.0f}", f"{_middle(group, 'cpu_seconds'):.0f}",
     ]  # fmt: skip
 
@@ -202,6 +206,14 @@ def _psnr(group: list[dict[str, Any]], digits: int = 1) -> str:
     """Median over those that gave a volume."""
     found = [row["psnr_db"] for row in group if "psnr_db" in row]
     return f"{median(found):.{digits}f}" if found else "none"
+
+
+def _is_upright(row: dict[str, Any]) -> bool:
+    return row["orientation_deg"] is not None and row["orientation_deg"] < UPRIGHT_DEG
+
+
+def _degrees(row: dict[str, Any]) -> str:
+    return "-" if row["orientation_deg"] is None else f"{row['orientation_deg']:.1f}"
 
 
 def _middle(group: list[dict[str, Any]], key: str) -> float:

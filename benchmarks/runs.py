@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from g3r._version import __version__
 from g3r.acquisition.images import Volume
 from g3r.acquisition.planes import slices_from_stacks
@@ -17,9 +20,10 @@ from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import compare
 from g3r.evaluation.metrics import Scores
 from g3r.evaluation.pose_error import PoseError
-from g3r.motion import estimate_motion
+from g3r.geometry import RigidPose
+from g3r.motion.confidence import pose_warnings, stack_confidences
 from g3r.presets import PRESETS, ReconstructionSettings
-from g3r.reconstruct import GaussianReconstructor, _percentile_scale, _pose_warnings
+from g3r.reconstruct import GaussianReconstructor, _percentile_scale
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
@@ -36,6 +40,8 @@ class Run:
         warnings: what g3r said against trusting the result.
         scores: of the volume; None where registration alone was run.
         stage_seconds: wall time of each stage of the reconstruction; empty where registration alone was run.
+        orientation_deg: angle between the frame of the poses and that of the atlas, which the truth's voxel
+            axes show.
     """
 
     error: PoseError
@@ -44,6 +50,7 @@ class Run:
     warnings: tuple[str, ...]
     scores: Scores | None = None
     stage_seconds: Mapping[str, float] | None = None
+    orientation_deg: float | None = None
 
     @property
     def is_bad(self) -> bool:
@@ -52,10 +59,9 @@ class Run:
 
     def record(self) -> dict[str, Any]:
         """The figures as plain numbers, without the slices."""
-        error = {k: v for k, v in vars(self.error).items() if k != "per_slice_mm"}
-        worst = max(self.error.per_slice_mm.values())
         result: dict[str, Any] = {
-            **error, "worst_mm": worst,
+            **self.error.figures(), "worst_mm": max(self.error.per_slice_mm.values()),
+            "orientation_deg": self.orientation_deg,
             "seconds": round(self.seconds, 2), "cpu_seconds": round(self.cpu_seconds, 2),
             "warned": bool(self.warnings), "bad": self.is_bad, "warnings": list(self.warnings),
         }  # fmt: skip
@@ -65,18 +71,17 @@ class Run:
         return result
 
 
-def registered(case: SimulatedCase, settings: ReconstructionSettings) -> Run:
+def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
     """Registration alone, as the reconstruction begins with it."""
+    reconstructor = GaussianReconstructor(checkpoint, settings)
     wall, cpu = time.perf_counter(), time.process_time()
     slices = slices_from_stacks(case.stacks)
-    slices = slices.scaled(1 / _percentile_scale(slices))
-    motion_settings = settings.motion
-    if len(case.stacks) == 1:
-        motion_settings = replace(motion_settings, stacks=False, n_rounds=0)
-    motion = estimate_motion(slices, motion_settings)
+    motion = reconstructor.register(slices.scaled(1 / _percentile_scale(slices)))
     seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-    warnings = tuple(_pose_warnings(motion, case.stacks))
-    return Run(case.pose_error(motion.slices), seconds, cpu_seconds, warnings)
+    confidences = stack_confidences(motion, len(case.stacks))
+    warnings = tuple(pose_warnings(motion, confidences, case.stacks))
+    error = case.pose_error(motion.slices)
+    return Run(error, seconds, cpu_seconds, warnings, orientation_deg=orientation_deg(case, error.common))
 
 
 def reconstructed(
@@ -87,12 +92,28 @@ def reconstructed(
     wall, cpu = time.perf_counter(), time.process_time()
     result = reconstructor.reconstruct(case.stacks)
     seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-    volume = Volume(result.volume, result.grid.affine, case.name)
+    error = case.pose_error(result.slices)
+    # the volume may stand in another orientation than the truth, further than alignment reaches
+    volume = Volume(result.volume, _moved(error.common, result.grid.affine), case.name)
     scores = compare(volume, case.truth, case.truth_mask, align=True).scores
     return Run(
-        case.pose_error(result.slices), seconds, cpu_seconds, tuple(result.record["warnings"]), scores,
-        result.record["seconds"],
+        error, seconds, cpu_seconds, tuple(result.record["warnings"]), scores, result.record["seconds"],
+        orientation_deg(case, error.common),
     )  # fmt: skip
+
+
+def _moved(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An affine whose world is moved by one pose."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation[0], pose.translation_mm[0]
+    return matrix @ affine
+
+
+def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
+    """Angle between a result's frame and that of the atlas, which the voxel axes of the truth keep."""
+    axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
+    turn = RigidPose((axes.T @ truth_from_result.rotation[0])[None], np.zeros((1, 3)))
+    return float(np.rad2deg(np.linalg.norm(turn.rotvec_rad())))
 
 
 def preset_settings(name: str) -> ReconstructionSettings:

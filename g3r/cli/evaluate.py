@@ -117,7 +117,7 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
             "shift_mm": comparison.alignment.shift_mm,
         }
     if pose_error:
-        record["poses"] = {k: v for k, v in vars(pose_error).items() if k != "per_slice_mm"}
+        record["poses"] = pose_error.figures()
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         beside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

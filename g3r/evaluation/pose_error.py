@@ -47,6 +47,7 @@ class PoseError:
         n_slices: how many those are.
         n_missing: slices with brain in them that have no estimate.
         per_slice_mm: error of each slice.
+        common: the motion that was removed, one pose; takes the estimate's frame to that of the truth.
     """
 
     mean_mm: float
@@ -55,6 +56,17 @@ class PoseError:
     n_slices: int
     n_missing: int
     per_slice_mm: Mapping[SliceKey, float]
+    common: RigidPose
+
+    def figures(self) -> dict[str, float]:
+        """The figures over all slices, for a record."""
+        return {
+            "mean_mm": self.mean_mm,
+            "median_mm": self.median_mm,
+            "p90_mm": self.p90_mm,
+            "n_slices": self.n_slices,
+            "n_missing": self.n_missing,
+        }
 
 
 def read_poses(path: str | os.PathLike[str]) -> PoseTable:
@@ -138,6 +150,7 @@ def target_registration_error(
         n_slices=len(keys),
         n_missing=len(judged) - len(keys),
         per_slice_mm=dict(zip(keys, per_slice.tolist(), strict=True)),
+        common=common,
     )
 
 

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.motion_figure import draw_slice_errors, jerk_slices, places_in_time
 from benchmarks.motion_layers import case_folders
 from benchmarks.motion_sweep import LEVELS, recipes
+from benchmarks.runs import orientation_deg
 from benchmarks.subjects import SubjectRecipe, simulated_subject
 from benchmarks.subjects import test_data_folder as data_folder
 from g3r.acquisition.images import save_volume
@@ -69,6 +70,9 @@ def test_turned_subject_keeps_its_size(atlas, tmp_path):
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
     assert np.abs(axes).max() < 0.999
+    # a result in scanner space lies as askew as the head; one turned with it stands upright
+    assert orientation_deg(case, RigidPose.identity(1)) > 2
+    assert orientation_deg(case, RigidPose(axes[None], np.ones((1, 3)))) == pytest.approx(0, abs=1e-3)
 
 
 def test_error_of_a_hand_made_case(tmp_path):

@@ -54,6 +54,7 @@ def subject(level, median, p90, *, warned, psnr=None):
     row = {
         "level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90,
         "bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0,
+        "orientation_deg": 2.0 if median < 1 else None if level == "mild" else 90.0,
     }  # fmt: skip
     return row if psnr is None else {**row, "psnr_db": psnr}
 
@@ -69,9 +70,9 @@ def test_sweep_counts_who_was_warned():
     text = motion_sweep.sweep_tables(
         {"preset": "balanced", "full": False, "jobs": 1, "threads": 2, "subjects": rows}
     )
-    assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 0 | 0 | 0 | 20 | 35 |" in text
-    assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 1 | 1 | 1 | 20 | 35 |" in text
-    assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | yes | 20 | 35 |" in text
+    assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 0 | 0 | 0 | 100% | 20 | 35 |" in text
+    assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 1 | 1 | 1 | 50% | 20 | 35 |" in text
+    assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | yes | 90.0 | 20 | 35 |" in text
     assert "moderate" not in text
 
 
