@@ -112,7 +112,7 @@ def test_cropping_does_not_matter(network, meta, slices):
     shift_mm = np.stack([planes.spacing_mm[:, 0], 0 * width, 0 * width], 1)
     frame = RigidPose.from_rotvec(np.zeros((len(slices), 3)), shift_mm)
     header = slices.header_pose @ frame
-    wider = dataclasses.replace(planes, shape=planes.shape + [2, 0]).with_pose(header)
+    wider = dataclasses.replace(planes, shape=planes.shape + np.array([2, 0])).with_pose(header)
     other = dataclasses.replace(
         slices, planes=wider, value=padded(slices.value), mask=padded(slices.mask), header_pose=header
     )
