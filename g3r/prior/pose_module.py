@@ -54,7 +54,7 @@ class PoseModule(AnnealedModule):
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
-        template_shape: [A, I, J, K]; None takes the data module's template.
+        n_ages: number of mean heads in the data module's template.
 
     Raises:
         ValueError: a rate out of range, or from the network.
@@ -71,12 +71,12 @@ class PoseModule(AnnealedModule):
         learning_rate: float = 1e-3,
         weight_decay: float = 1e-3,
         warmup_steps: int = 200,
-        template_shape: Sequence[int] = (6, 39, 45, 43),
+        n_ages: int = 6,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
         self.save_hyperparameters()
         self.network = PoseNetwork(
-            template_shape, channels=channels, width=width, n_blocks=n_blocks, n_heads=n_heads
+            (n_ages, 2, 2, 2), channels=channels, width=width, n_blocks=n_blocks, n_heads=n_heads
         )
         self.weeks: list[float] = []
         self._training_data = "not recorded"
@@ -134,11 +134,11 @@ class PoseModule(AnnealedModule):
 
     # ---- what an export needs -------------------------------------------------------------------------
 
-    def on_fit_start(self) -> None:
+    def setup(self, stage: str) -> None:
         """Take the template and a description from the data module.
 
         Raises:
-            InputError: the data module makes images of another size, or its template has another shape.
+            InputError: the data module makes images of another size, or mean heads of another number of ages.
         """
         data: Any = getattr(self.trainer, "datamodule", None)
         settings = dict(getattr(data, "hparams", None) or {})
@@ -149,13 +149,13 @@ class PoseModule(AnnealedModule):
         self._training_data = describe_data(data, settings)
         if hasattr(data, "template"):
             template = data.template()
-            wanted = tuple(self.network.arguments()["template_shape"])
-            if template.volume.shape != wanted:
+            n_ages = self.network.arguments()["template_shape"][0]
+            if len(template) != n_ages:
                 raise InputError(
-                    f"model.template_shape: {wanted}, but the data's template is {template.volume.shape}; "
-                    f"pass --model.template_shape {list(template.volume.shape)}"
+                    f"model.n_ages: {n_ages}, but the data have mean heads of {len(template)} ages; "
+                    f"pass --model.n_ages {len(template)}"
                 )
-            self.network.set_template(torch.from_numpy(template.volume).to(self.device))
+            self.network.set_template(torch.from_numpy(template.volume))
             self.weeks = [float(week) for week in template.weeks]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -163,7 +163,7 @@ class PoseNetwork(nn.Module):
             raise ValueError(
                 f"got {template_shape=}, {image_size=}, {channels=}, {width=}, {n_heads=}, {n_refinements=}"
             )
-        self._arguments = {
+        self._arguments: dict[str, Any] = {
             "template_shape": [int(n) for n in template_shape],
             "template_spacing_mm": float(template_spacing_mm),
             "image_size": int(image_size),
@@ -191,8 +191,15 @@ class PoseNetwork(nn.Module):
         return dict(self._arguments)
 
     def set_template(self, volume: Tensor) -> None:
-        """Take over mean heads [A, I, J, K] on a grid centred on the origin."""
-        self.template.copy_(volume.permute(1, 2, 3, 0))
+        """Take over mean heads [A, I, J, K] on a grid about the origin; only A is built into the network.
+
+        Raises:
+            ValueError: another number of heads.
+        """
+        if len(volume) != self._arguments["template_shape"][0]:
+            raise ValueError(f"{len(volume)} mean heads; expected {self._arguments['template_shape'][0]}")
+        self._arguments["template_shape"] = list(volume.shape)
+        self.template = volume.permute(1, 2, 3, 0).contiguous().to(self.template)
 
     def forward(self, batch: SliceBatch, n_refinements: int | None = None) -> list[PoseStep]:
         """The first guess and what each refinement makes of it."""
