@@ -37,8 +37,9 @@ def atlas(tmp_path, rng):
 
 
 def test_every_subject_has_a_seed_of_its_own():
-    both = [*recipes(LEVELS, 100), *recipes(LEVELS, 100, turned=True)]
-    assert len({one.seed for one in both}) == len({one.name for one in both}) == 600
+    kinds = [{"turned": turned, "development": dev} for turned in (False, True) for dev in (False, True)]
+    every = [one for kind in kinds for one in recipes(LEVELS, 100, **kind)]
+    assert len({one.seed for one in every}) == len({one.name for one in every}) == 1200
     assert recipes(["severe"], 2)[1] == recipes(LEVELS, 10)[21]
 
 
