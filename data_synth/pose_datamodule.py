@@ -11,8 +11,9 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
-from data_synth.atlas import find_subjects
+from data_synth.atlas import TruthVolume, find_subjects
 from data_synth.datamodule import N_PHANTOMS, EpochSampler
+from data_synth.head_variation import varied_head
 from data_synth.heads import Subject, load_head, phantom_subjects
 from data_synth.slice_sets import Head, SliceSet, draw_slice_set
 from data_synth.template import mean_heads
@@ -25,6 +26,8 @@ logger = logging.getLogger(__name__)
 HEAD_SPACING_MM = 2.0
 """Voxel size of the truth that is sliced; pixels are larger."""
 VAL_MAX_SLICES = 120
+N_VARIANTS = 8
+"""Shapes and contrasts per subject and epoch; making one takes as long as several slice sets."""
 SMALLEST_SHARE = 4
 """A training set has at least this fraction (one over it) of the largest number of slices."""
 
@@ -181,7 +184,8 @@ class SliceSets(Dataset):
         self.sources, self.length, self.seed = list(sources), length, seed
         self.max_slices, self.pixel_mm, self.size = max_slices, pixel_mm, size
         self.recorded, self.in_order = recorded, in_order
-        self._heads: dict[int, Head] = {}
+        self._volumes: dict[int, TruthVolume] = {}
+        self._heads: dict[tuple[int, int, int], Head] = {}
         self._made: dict[int, SliceSet] = {}
 
     def __len__(self) -> int:
@@ -194,13 +198,11 @@ class SliceSets(Dataset):
         epoch, index = divmod(int(number), self.length)
         rng = np.random.default_rng([self.seed, epoch, index])
         which = index % len(self.sources) if self.in_order else int(rng.integers(len(self.sources)))
-        if which not in self._heads:
-            self._heads[which] = Head.from_volume(load_head(self.sources[which], HEAD_SPACING_MM))
         max_slices = self.max_slices
         if not self.in_order:  # many heads of few slices teach more per second than few heads of many
             max_slices = int(rng.integers(max(self.max_slices // SMALLEST_SHARE, 1), self.max_slices + 1))
         made = draw_slice_set(
-            self._heads[which],
+            self._head(which, epoch, -1 if self.in_order else int(rng.integers(N_VARIANTS))),
             rng,
             self.pixel_mm,
             self.size,
@@ -211,6 +213,19 @@ class SliceSets(Dataset):
         if self.in_order:
             self._made[number] = made
         return made
+
+    def _head(self, which: int, epoch: int, variant: int) -> Head:
+        """A subject as it is (variant -1) or one of its variants of this epoch."""
+        key = (which, epoch if variant >= 0 else 0, variant)
+        if key not in self._heads:
+            if which not in self._volumes:
+                self._volumes[which] = load_head(self.sources[which], HEAD_SPACING_MM)
+            volume = self._volumes[which]
+            if variant >= 0:
+                self._heads = {k: head for k, head in self._heads.items() if k[1] == epoch}
+                volume = varied_head(volume, np.random.default_rng([self.seed, epoch, which, variant, 1]))
+            self._heads[key] = Head.from_volume(volume)
+        return self._heads[key]
 
 
 def slice_set_batch(sets: Sequence[SliceSet]) -> dict[str, torch.Tensor]:

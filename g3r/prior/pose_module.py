@@ -1,6 +1,8 @@
 """Training of the pose network."""
 
+import pickle
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
-from g3r.prior.pose_geometry import moved_points, pixel_points_mm, sample_rows
+from g3r.prior.pose_geometry import moved_points, pixel_points_mm, rotation_from_vector, sample_rows
 from g3r.prior.pose_inference import (
     N_REFINEMENTS,
     SLICE_POINTS_MM,
@@ -30,6 +32,10 @@ FULL_AREA_MM2 = 600.0
 """Slices of less area count less in the loss."""
 SECOND_REFINEMENT_SHARE = 0.3
 """Share of training batches that refine twice, so that a refinement also knows good poses."""
+DISTURBED_SHARE = 0.6
+"""Share of heads whose poses are disturbed before a refinement, by at most these deviations per axis."""
+STACK_TURN_RAD, STACK_SHIFT_MM = 0.3, 6.0
+SLICE_TURN_RAD, SLICE_SHIFT_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
 """Weight of the votes' squared error (0 to 3, no unit) beside the distances."""
 N_PANEL_SLICES = 12
@@ -44,6 +50,9 @@ class PoseModule(AnnealedModule):
     squared error of every slice's vote, which teaches a vote to be the mean over what the slice may be: long
     where it is sure, short where it is not.
 
+    The poses that a refinement starts from are disturbed: on heads that it is trained on, the first guess is
+    better than it will be on others.
+
     The template of mean heads comes from the data module's `template()`.
 
     Args:
@@ -55,6 +64,7 @@ class PoseModule(AnnealedModule):
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
         n_ages: number of mean heads in the data module's template.
+        start_from: training checkpoint whose weights to begin with.
 
     Raises:
         ValueError: a rate out of range, or from the network.
@@ -72,12 +82,15 @@ class PoseModule(AnnealedModule):
         weight_decay: float = 1e-3,
         warmup_steps: int = 200,
         n_ages: int = 6,
+        start_from: str | None = None,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
         self.save_hyperparameters()
         self.network = PoseNetwork(
             (n_ages, 2, 2, 2), channels=channels, width=width, n_blocks=n_blocks, n_heads=n_heads
         )
+        if start_from is not None:
+            self._take_weights(Path(start_from))
         self.weeks: list[float] = []
         self._training_data = "not recorded"
         self._scores: list[dict[str, np.ndarray]] = []
@@ -96,7 +109,11 @@ class PoseModule(AnnealedModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the mean point distance of one batch over all steps, and log it for each."""
         n_refinements = 2 if torch.rand(()) < SECOND_REFINEMENT_SHARE else 1
-        steps = self.network(batch, n_refinements)
+
+        def disturb(rotation: Tensor, translation_mm: Tensor) -> tuple[Tensor, Tensor]:
+            return disturbed(rotation, translation_mm, batch["stack"], batch["set_of_stack"])
+
+        steps = self.network(batch, n_refinements, disturb)
         losses = [point_loss(step, batch) for step in steps]
         votes = [vote_loss(step, batch) for step in steps]
         for number in range(2):
@@ -158,6 +175,19 @@ class PoseModule(AnnealedModule):
             self.network.set_template(torch.from_numpy(template.volume))
             self.weeks = [float(week) for week in template.weeks]
 
+    def _take_weights(self, path: Path) -> None:
+        """Begin with the weights of another run; its template is replaced by the data module's."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+            own = self.network.state_dict()
+            taken = {name.removeprefix("network."): value for name, value in state.items()}
+            self.network.load_state_dict({**taken, "template": own["template"]})
+        except (OSError, pickle.UnpicklingError, RuntimeError, LookupError, TypeError) as error:
+            raise InputError(
+                f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
+                "checkpoint of a pose network with the same settings"
+            ) from error
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the description from which `g3r-export` makes a pose checkpoint, in plain values only."""
         metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
@@ -178,6 +208,25 @@ def point_loss(step: PoseStep, batch: Batch) -> Tensor:
     distance = ((moved_points(rotation, translation_mm, points) - true).square().sum(-1) + 1e-4).sqrt()
     weight = (batch["area_mm2"] / FULL_AREA_MM2).clamp(0.1, 1.0)
     return (weight[:, None] * distance).mean() / weight.mean()
+
+
+def disturbed(
+    rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Poses with errors of a random size for each head: common to a stack, and of each slice."""
+    n_stacks, n_sets, n = len(set_of_stack), int(set_of_stack.max()) + 1, len(stack)
+
+    def normal(rows: int) -> Tensor:
+        return torch.randn(rows, 3, dtype=rotation.dtype, device=rotation.device)
+
+    chosen = torch.rand(2, n_sets, 1, dtype=rotation.dtype, device=rotation.device)
+    size = chosen[0] * (chosen[1] < DISTURBED_SHARE)
+    of_stack, of_slice = size[set_of_stack], size[set_of_stack[stack]]
+    turn = rotation_from_vector(normal(n_stacks) * of_stack * STACK_TURN_RAD)[stack]
+    shift = (normal(n_stacks) * of_stack * STACK_SHIFT_MM)[stack]
+    moved = (turn @ translation_mm[..., None])[..., 0] + shift
+    own = rotation_from_vector(normal(n) * of_slice * SLICE_TURN_RAD)
+    return turn @ rotation @ own, moved + normal(n) * of_slice * SLICE_SHIFT_MM
 
 
 def vote_loss(step: PoseStep, batch: Batch) -> Tensor:

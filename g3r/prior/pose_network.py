@@ -1,6 +1,6 @@
 """The pose network: a set transformer over all slices of all stacks that puts each into the atlas frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -32,6 +32,10 @@ SliceBatch = Mapping[str, Tensor]
 """`image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S] (NaN: unknown),
 `stack` [S] (numbered through all sets), `set_of_stack` [G], `header_rotation` [S, 3, 3]: see `SliceImages`
 and `g3r.prior.pose_inference.slice_batch`."""
+
+
+Disturbance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Takes rotations [S, 3, 3] and translations [S, 3] (mm) to others."""
 
 
 class PoseStep(NamedTuple):
@@ -201,8 +205,16 @@ class PoseNetwork(nn.Module):
         self._arguments["template_shape"] = list(volume.shape)
         self.template = volume.permute(1, 2, 3, 0).contiguous().to(self.template)
 
-    def forward(self, batch: SliceBatch, n_refinements: int | None = None) -> list[PoseStep]:
-        """The first guess and what each refinement makes of it."""
+    def forward(
+        self, batch: SliceBatch, n_refinements: int | None = None, disturb: Disturbance | None = None
+    ) -> list[PoseStep]:
+        """The first guess and what each refinement makes of it.
+
+        Args:
+            batch: slices of one or more heads.
+            n_refinements: None takes the constructor's.
+            disturb: changes the poses that a refinement starts from, in training.
+        """
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
         n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
         same_stack = stack[:, None] == stack
@@ -223,6 +235,8 @@ class PoseNetwork(nn.Module):
 
         for _ in range(self.n_refinements if n_refinements is None else n_refinements):
             rotation, translation = steps[-1].rotation.detach(), steps[-1].translation_mm.detach()
+            if disturb is not None:
+                rotation, translation = disturb(rotation, translation)
             seen = self._seen_at(rotation, translation, batch)
             pose_code = torch.cat([rotation.flatten(1), translation / 50.0], 1)
             token = self.refining_encoder(batch["image"], seen)

@@ -110,11 +110,11 @@ def test_items_are_functions_of_seed_and_number():
     )
 
 
-def test_batches(head):
+def test_batches(volume):
     data = SliceSetDataModule(source="phantom", sets_per_epoch=3, batch_size=3, max_slices=12, val_sets=6)
     data.setup()
     for sets in (data.train_sets, data.val_sets):
-        sets._heads = {k: head for k in range(len(sets.sources))}
+        sets._volumes = dict.fromkeys(range(len(sets.sources)), volume)
     batch = next(iter(data.train_dataloader()))
     n = len(batch["image"])
     assert batch["image"].shape == (n, 1, 40, 40)
