@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from g3r.acquisition.timing import acquisition_order
 from g3r.geometry import RigidPose
 
 Array = NDArray[np.float64]
@@ -49,17 +50,6 @@ LEVELS = {
     "moderate": MotionLevel(0.6, 0.3, 2, 6.0, 3.0, 10.0, 5.0),
     "severe": MotionLevel(1.0, 0.5, 4, 15.0, 6.0, 25.0, 10.0, dropout_share=0.06),
 }
-
-
-def acquisition_order(n_slices: int, interleave: int) -> NDArray[np.int64]:
-    """Slice numbers in the order of their acquisition: 1 is sequential, 2 every other one first, and so on.
-
-    Raises:
-        ValueError: an interleave below 1.
-    """
-    if interleave < 1:
-        raise ValueError(f"interleave {interleave}; expected at least 1")
-    return np.concatenate([np.arange(first, n_slices, interleave) for first in range(interleave)])
 
 
 def slice_trajectory(

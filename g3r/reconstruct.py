@@ -28,6 +28,7 @@ from g3r.acquisition.planes import (
 )
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
+from g3r.acquisition.template import AtlasTemplate
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
@@ -35,6 +36,7 @@ from g3r.gaussians import render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
 from g3r.motion import MotionEstimate, estimate_motion
+from g3r.motion.confidence import StackConfidence, pose_warnings, stack_confidences
 from g3r.motion.volume import grid_around
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_prior
@@ -44,19 +46,12 @@ from g3r.result import ReconstructionResult
 logger = logging.getLogger(__name__)
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "prior.pt"
+DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "pose.pt"
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
 LEAST_DISTILLATION = 1e-3
 """Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
-
-UNSURE_NCC = 0.85
-"""Median correlation of a stack's slices with the volume below which its poses are called unsure: 0.93 and
-more where registration worked (simulated and real subjects), around 0.7 where it failed."""
-
-UNSURE_AGREEMENT = 0.2
-"""Correlation of a whole stack with the others, before its slices move, below which it counts as not
-registered: 0.28 and more where it worked, under 0.05 where it failed."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
@@ -78,6 +73,7 @@ class GaussianReconstructor:
     checkpoint: str | os.PathLike[str] | None = None
     settings: ReconstructionSettings | str = "balanced"
     progress: Progress = lambda stage, done, total: None
+    template: AtlasTemplate | None = field(init=False, default=None)
     network: DensityGatedPriorNetwork | None = field(init=False, default=None)
     prior_meta: PriorCheckpoint | None = field(init=False, default=None)
 
@@ -113,22 +109,23 @@ class GaussianReconstructor:
             # registered to a volume made of themselves they drift
             settings = replace(
                 settings,
-                motion=replace(settings.motion, stacks=False, n_rounds=0),
                 slice_stage=replace(settings.slice_stage, optimise_poses=False),
             )
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
             notes.append("slice poses not estimated: a single stack does not determine them")
 
         with clock("motion"):
-            motion = estimate_motion(slices, settings.motion, self._report("motion"))
-        warnings += _pose_warnings(motion, stacks)
+            motion = self.register(slices, settings)
+        confidences = stack_confidences(motion, len(stacks))
+        warnings += pose_warnings(motion, confidences, stacks)
         with clock("coarse"):
             voxel = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
             prior_grid = grid_around(motion.slices, voxel, margin_mm=5.0)
-            coarse, density = coarse_and_density(motion.slices, prior_grid, motion.gain)
+            trust = motion.weight[motion.slices.pixel_plane]
+            coarse, density = coarse_and_density(motion.slices, prior_grid, motion.gain, trust)
             scale = normalisation_scale(coarse, density)
             coarse, slices = coarse / np.float32(scale), motion.slices.scaled(1 / scale)
-            prior_mask = foreground_mask(density, slices, prior_grid)
+            prior_mask = foreground_mask(slices, prior_grid, motion.weight)
         with clock("prior"):
             self.progress("prior", 0, 1)
             prior = self._prior(coarse, density)
@@ -157,13 +154,12 @@ class GaussianReconstructor:
             grid = _output_grid(prior_grid, settings.resolution_mm)
             mask = prior_mask
             if grid is not prior_grid:
-                _, on_grid = coarse_and_density(fit.slices, grid, fit.gain)
-                mask = foreground_mask(on_grid, fit.slices, grid)
+                mask = foreground_mask(fit.slices, grid, fit.weight)
             volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * mask
             if not np.isfinite(volume).all():
                 raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         intensity = first_scale * scale
-        record = self._record(stacks, slices, motion, fit, clock, settings, notes, warnings)
+        record = self._record(stacks, slices, motion, confidences, fit, clock, settings, notes, warnings)
         record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
         for warning in warnings:
             logger.warning(warning)
@@ -172,6 +168,19 @@ class GaussianReconstructor:
             coarse * np.float32(intensity), density, prior_grid, fit.cloud, intensity, fit.slices, fit.gain,
             fit.weight, motion.ncc, record,
         )  # fmt: skip
+
+    def register(self, slices: Slices, settings: ReconstructionSettings | None = None) -> MotionEstimate:
+        """Poses of all slices, with this reconstructor's template and pose network.
+
+        Args:
+            slices: at their header poses, intensities of order one.
+            settings: those of the reconstructor when None.
+        """
+        chosen = settings or self.settings
+        assert isinstance(chosen, ReconstructionSettings)
+        return estimate_motion(
+            slices, chosen.motion, self._report("motion"), template=self.template, proposals={}
+        )
 
     def _prior(self, coarse: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray[np.float32]:
         if self.network is None:
@@ -186,6 +195,7 @@ class GaussianReconstructor:
         stacks: Sequence[Stack],
         slices: Slices,
         motion: MotionEstimate,
+        confidences: list[StackConfidence],
         fit: SliceFit,
         clock: _Clock,
         settings: ReconstructionSettings,
@@ -209,15 +219,22 @@ class GaussianReconstructor:
                     "thickness_mm": stack.thickness_mm,
                     "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
                     "n_slices": int(chosen.sum()),
-                    "agreement_with_other_stacks": motion.stack_agreement[n],
-                    "median_slice_ncc": float(np.median(motion.ncc[chosen])) if chosen.any() else None,
+                    "pose_confidence": confidences[n].record(),
+                    "interleave": motion.interleave[n],
+                    "n_runs": motion.n_runs[n],
                     "n_doubted_slices": int((fit.weight[chosen] < 0.5).sum()),
                 }
                 for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
             ],
             "shading": fit.shading,
             "n_gaussians": len(fit.cloud),
-            "motion": motion.history,
+            "motion": {
+                "start": motion.hypothesis,
+                "held_out_correlation_by_start": motion.hypotheses,
+                "orientation": "scanner" if motion.orientation is None else "standard",
+                "correlation_with_mean_head": motion.orientation and motion.orientation.correlation,
+                "rounds": motion.history,
+            },
             "seconds": clock.seconds,
             "cpu_seconds": clock.cpu_seconds,
             "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
@@ -274,19 +291,3 @@ def _output_grid(prior_grid: VolumeGrid, resolution_mm: float) -> VolumeGrid:
         return prior_grid
     low, high = prior_grid.world([0, 0, 0]), prior_grid.world(np.array(prior_grid.shape) - 1)
     return VolumeGrid.isotropic(low, high, resolution_mm)
-
-
-def _pose_warnings(motion: MotionEstimate, stacks: Sequence[Stack]) -> list[str]:
-    lines = []
-    for n, stack in enumerate(stacks):
-        of_stack = motion.slices.stack_id == n
-        if not of_stack.any():
-            lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
-            continue
-        ncc, agreement = float(np.median(motion.ncc[of_stack])), motion.stack_agreement[n]
-        if len(stacks) > 1 and (ncc < UNSURE_NCC or agreement < UNSURE_AGREEMENT):
-            lines.append(
-                f"{stack.name}: registration probably failed (correlation with the other stacks "
-                f"{agreement:.2f}, of its slices with the volume {ncc:.2f}); do not trust the volume"
-            )
-    return lines

@@ -37,8 +37,8 @@ class AtlasTemplate:
             object.__setattr__(self, name, array)
         if self.volume.ndim != 4 or self.affine.shape != (4, 4) or self.weeks.shape != self.volume.shape[:1]:
             raise ValueError(
-                f"template: volume {self.volume.shape}, affine {self.affine.shape}, weeks {self.weeks.shape}; "
-                "expected [A, I, J, K], [4, 4], [A]"
+                f"template: volume {self.volume.shape}, affine {self.affine.shape}, weeks "
+                f"{self.weeks.shape}; expected [A, I, J, K], [4, 4], [A]"
             )
         if not len(self.volume):
             raise ValueError("template: holds no head")

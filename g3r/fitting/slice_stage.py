@@ -17,7 +17,7 @@ from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
 from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes
-from g3r.motion.estimate import slice_weights
+from g3r.motion.slice_rounds import slice_weights
 
 
 @dataclass(frozen=True)

@@ -1,175 +1,150 @@
-"""Motion, first version: stacks one after the other, then all slices against the volume, coarse to fine."""
+"""Motion of every slice: rival hypotheses, runs between jerks, then each slice for itself, coarse to fine."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.voxel_operator import VoxelOperator
-from g3r.geometry import VolumeGrid
-from g3r.geometry.rigid import fit_rigid
-from g3r.motion.normal_equations import SliceModel
-from g3r.motion.slice_registration import register_slices, try_neighbours
+from g3r.acquisition.template import AtlasTemplate
+from g3r.geometry import RigidPose
+from g3r.motion.hypotheses import MARGIN, choose, in_frame_of, judge, moved, settle, simplify
+from g3r.motion.orientation import Orientation, centred_on_headers, standard_orientation
+from g3r.motion.placement import StackPixels
+from g3r.motion.slice_rounds import SliceRounds, refine_slices
 from g3r.motion.stack_registration import register_stacks
-from g3r.motion.volume import grid_around, solve_volume
+from g3r.motion.template_registration import TemplatePlacement, place_in_template, template_fits
 
 logger = logging.getLogger(__name__)
 
 
-HEADER_REACH_MM = 2.0
-"""Slices further than this from the common motion hardly take part in finding it."""
-
-
 @dataclass(frozen=True)
 class MotionSettings:
-    """How long to search.
+    """Which layers run, and how long they search.
 
     Args:
-        stacks: register stacks to each other first.
-        n_rounds: alternations of volume and slices; 0 keeps the slices where the stacks are.
+        template: place runs of slices in mean heads (needs a template); gives the standard orientation.
+        network: consider the pose network's proposal.
+        stacks: consider stacks registered to each other from many starts.
+        runs: place runs of slices again in the volume of the other stacks.
+        n_rounds: alternations of volume and slices; 0 leaves the slices where the runs are.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
         pixels_at_most: masked pixels in use; larger subjects are thinned on coarse levels.
+        standard_orientation: turn the result into the atlas frame; otherwise it stays in scanner space.
+        seed: of the random search.
     """
 
+    template: bool = True
+    network: bool = True
     stacks: bool = True
+    runs: bool = True
     n_rounds: int = 12
     steps_per_round: int = 5
     finest_voxel_mm: float = 1.2
     pixels_at_most: int = 400_000
+    standard_orientation: bool = True
+    seed: int = 0
 
 
 @dataclass(frozen=True)
 class MotionEstimate:
     """Slices in estimated poses with gain [K], trust [K] in (0, 1] and correlation [K] with the volume.
 
-    stack_agreement: correlation of each stack when it was registered; history: one line of figures a round.
+    Args:
+        slices: in the frame of the result.
+        gain, weight, ncc: see above.
+        held_out: for each stack the correlation with a volume made of the other stacks, outline included;
+            None for a single stack.
+        hypothesis: where the search started.
+        hypotheses: held-out correlation of every hypothesis, stack by stack.
+        interleave: of each stack, as its motion suggests.
+        n_runs: of each stack, between jerks; 1 where it lay still.
+        orientation: how the result was turned; None where it stays in scanner space.
+        history: one line of figures a round.
     """
 
     slices: Slices
     gain: NDArray[np.float64]
     weight: NDArray[np.float64]
     ncc: NDArray[np.float64]
-    stack_agreement: list[float]
-    history: list[dict[str, float]]
+    held_out: list[float] | None
+    hypothesis: str
+    hypotheses: dict[str, list[float]]
+    interleave: list[int]
+    n_runs: list[int]
+    orientation: Orientation | None
+    history: list[dict[str, float]] = field(default_factory=list)
 
 
 def estimate_motion(
-    slices: Slices, settings: MotionSettings, progress: Callable[[int, int], None] = lambda done, total: None
+    slices: Slices,
+    settings: MotionSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    template: AtlasTemplate | None = None,
+    proposals: Mapping[str, RigidPose] | None = None,
 ) -> MotionEstimate:
     """Poses of all slices, from their header poses.
 
     Args:
-        slices: intensities of order one (the 99th percentile near 1).
-        settings: how long to search.
+        slices: intensities of order one (the 99th percentile near 1), at their header poses.
+        settings: which layers, and how long.
         progress: called with (rounds done, rounds in all).
+        template: mean heads; None leaves that layer out.
+        proposals: motions [K] (world from header) by other means, such as the pose network, by name.
     """
-    agreement = [1.0] * len(np.unique(slices.stack_id))
-    if settings.stacks:
-        slices, agreement = register_stacks(slices)
-    gain = np.ones(len(slices))
-    weight = np.ones(len(slices))
-    volume: NDArray[np.float32] | None = None
-    grid: VolumeGrid | None = None
-    history: list[dict[str, float]] = []
-    n_rounds = settings.n_rounds
-    for number in range(n_rounds):
-        progress(number, n_rounds)
-        fraction = number / max(1, n_rounds - 1)
-        # coarse to fine: the capture range is about a voxel of the volume's blur
-        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
-        smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
-        if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
-            grid, volume = grid_around(slices, voxel), None
-        stride = max(
-            1, round(len(slices.pixel_index) / settings.pixels_at_most * (voxel / settings.finest_voxel_mm))
-        )
-        volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
-        model = SliceModel(slices, volume, grid, stride=stride)
-        residual = model.residuals(slices.planes, gain)
-        width = 2 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-        moved = 0
-        if 0.1 < fraction < 0.8:
-            slices, moved = try_neighbours(model, slices, gain, width=width)
-        slices, gain, fit = register_slices(
-            model, slices, gain, n_steps=settings.steps_per_round, width=width
-        )
-        weight = slice_weights(fit.loss)
-        history.append(
-            {"round": number, "voxel_mm": voxel, "residual": width / 2,
-             "median_ncc": float(np.median(fit.ncc)), "moved": moved}
-        )  # fmt: skip
-        logger.info(
-            "slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved
-        )
-    progress(n_rounds, n_rounds)
-    slices = centred_on_headers(slices)
-    ncc = _final_ncc(slices, gain, weight, settings)
-    return MotionEstimate(slices, gain, weight, ncc, agreement, history)
+    rng = np.random.default_rng(settings.seed)
+    parts = StackPixels.of_all(slices)
+    single = len(parts) == 1
+    still = RigidPose.identity(len(slices))
+    placed: TemplatePlacement | None = None
+    if template is not None and settings.template and template_fits(slices, template):
+        placed = place_in_template(slices, parts, template, rng)
 
-
-def centred_on_headers(slices: Slices) -> Slices:
-    """Take out the motion that all slices share, as their headers see it.
-
-    Poses are determined up to one rigid motion of the whole head. This choice keeps the volume where the
-    scanner's coordinates say it is, on (robust) average over all slices.
-    """
-    corners = np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
-    size_mm = slices.planes.shape * slices.planes.spacing_mm
-    half = np.pad(size_mm / 2, ((0, 0), (0, 1)))
-    local = half[:, None, :] * corners
-    here = slices.planes.pose.apply(local).reshape(-1, 3)
-    header = slices.header_pose.apply(local).reshape(-1, 3)
-    area = np.repeat(size_mm.prod(1), len(corners))
-    weight = area
-    for _ in range(10):
-        back = fit_rigid(here, header, weight)
-        away_mm = np.linalg.norm(back.apply(here[None])[0] - header, axis=1)
-        weight = area / (1 + (away_mm / HEADER_REACH_MM) ** 2)
-    return slices.with_pose(back @ slices.planes.pose)
-
-
-def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Trust in each slice [K], going down smoothly where its mean robust loss stands out.
-
-    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero.
-    """
-    median = np.median(loss)
-    spread = 1.4826 * np.median(np.abs(loss - median)) + 0.05 * median + 1e-12
-    excess = np.maximum(0.0, (loss - median) / spread - 2.0)
-    return np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
-
-
-def _volume_of(
-    slices: Slices,
-    grid: VolumeGrid,
-    gain: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    start: NDArray[np.float32] | None,
-    smoothness: float,
-    stride: int,
-) -> NDArray[np.float32]:
-    index = slices.pixel_index[::stride]
-    operator = VoxelOperator(slices.planes, grid, index, (1, 1, 5))
-    value = slices.value[index] / gain[operator.plane]
-    pixel_weight = weight[operator.plane].astype(np.float32)
-    if start is not None:  # pixels far from the present volume (spikes, signal loss) count less
-        residual = value - operator.forward(start)
-        width = 3 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-        pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
-    return solve_volume(
-        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
-    )
-
-
-def _final_ncc(
-    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], settings: MotionSettings
-) -> NDArray[np.float64]:
-    grid = grid_around(slices, settings.finest_voxel_mm)
-    volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
-    return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc
+    motion, name, judged, interleave, n_runs = still, "headers", {}, [1] * len(parts), [1] * len(parts)
+    if not single:
+        hypotheses = {"headers": still}
+        if placed is not None:
+            hypotheses["template"] = placed.motion(len(slices), parts)
+        if settings.network:
+            hypotheses |= dict(proposals or {})
+        if settings.stacks:
+            hypotheses["stacks"] = register_stacks(slices)[0].world_from_header()
+        name, judgements = choose(slices, parts, hypotheses)
+        judged = {key: [p.correlation for p in value.prediction] for key, value in judgements.items()}
+        motion = hypotheses[name]
+        if settings.runs:
+            rivals = [in_frame_of(slices, motion, other) for key, other in hypotheses.items() if key != name]
+            motion, placements = settle(slices, parts, motion, rivals, rng)
+            interleave = [one.runs.interleave for one in placements]
+            motion, shares_one = simplify(slices, parts, motion, interleave)
+            n_runs = [
+                1 if one_motion else one.runs.n_runs
+                for one, one_motion in zip(placements, shares_one, strict=True)
+            ]
+            if judge(slices, parts, motion).cost > judgements[name].cost - MARGIN:
+                motion, n_runs = hypotheses[name], [1] * len(parts)
+    posed = moved(slices, motion)
+    rounds = SliceRounds(
+        0 if single else settings.n_rounds, settings.steps_per_round, settings.finest_voxel_mm,
+        settings.pixels_at_most,
+    )  # fmt: skip
+    fitted = refine_slices(posed, rounds, progress)
+    held_out = None
+    if not single:
+        final = judge(slices, parts, fitted.slices.world_from_header())
+        held_out = [p.correlation for p in final.prediction]
+    orientation = None
+    if placed is not None and settings.standard_orientation:
+        start = placed.motion(len(slices), parts)
+        orientation = standard_orientation(fitted.slices, placed.head, start, rng)
+    result = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
+    return MotionEstimate(
+        result, fitted.gain, fitted.weight, fitted.ncc, held_out, name, judged, interleave, n_runs,
+        orientation, fitted.history,
+    )  # fmt: skip
