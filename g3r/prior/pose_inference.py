@@ -1,6 +1,7 @@
 """From slices to poses in the atlas frame with a trained pose network."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ def predict_poses(
     """
     images = slice_images(slices, meta.pixel_mm, meta.image_size)
     if time_rank is not None:
-        images.time_rank[:] = time_rank
+        images = replace(images, time_rank=np.asarray(time_rank, dtype=float))
     with torch.no_grad():
         last = network(slice_batch([images]), N_REFINEMENTS)[-1]
     return as_pose(last.rotation, last.translation_mm) @ images.frame_in_slice.inverse()

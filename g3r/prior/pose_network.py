@@ -17,8 +17,6 @@ from g3r.prior.pose_geometry import (
     scattered,
 )
 
-ANCHORS_MM = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (0.0, 30.0, 0.0))
-"""Points of a slice's image that stand for its pose: centre, along x, along y."""
 WAVELENGTHS_MM = (200.0, 100.0, 50.0, 25.0)
 """Of the codes of a slice's position along its stack."""
 TRANSLATION_SCALE_MM = 20.0
@@ -283,11 +281,6 @@ def slice_codes(batch: SliceBatch) -> Tensor:
     known = torch.isfinite(rank)
     plain = [position / 50.0, thickness / 5.0, area / 5000.0, torch.where(known, 2 * rank - 1, 0.0), known]
     return torch.cat([torch.sin(phase), torch.cos(phase), torch.stack([p.to(phase) for p in plain], 1)], 1)
-
-
-def anchor_points(rotation: Tensor, translation_mm: Tensor) -> Tensor:
-    """The three points [S, 3, 3] in the atlas frame (mm) by which a slice's pose is known."""
-    return moved_points(rotation, translation_mm, rotation.new_tensor(ANCHORS_MM))
 
 
 def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:

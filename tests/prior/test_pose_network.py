@@ -13,7 +13,7 @@ from g3r.prior.pose_geometry import (
     sample_rows,
     scattered,
 )
-from g3r.prior.pose_network import ANCHORS_MM, PoseNetwork, anchor_points
+from g3r.prior.pose_network import PoseNetwork
 
 SMALL = {"template_shape": (2, 9, 9, 9), "channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2}
 
@@ -105,14 +105,6 @@ def test_scattering_keeps_sums(rng):
     volume = scattered(points, value, weight, torch.tensor([0, 1, 0]), 2, 11, 2.0)
     torch.testing.assert_close(volume[..., 0].sum(), (value * weight).sum())
     torch.testing.assert_close(volume[1, ..., 1].sum(), weight[1].sum())
-
-
-def test_anchor_points_tell_the_pose():
-    rotation, shift = rotations(4), torch.randn(4, 3, dtype=torch.float64)
-    anchors = anchor_points(rotation, shift)
-    torch.testing.assert_close(anchors[:, 0], shift)
-    torch.testing.assert_close((anchors[:, 1] - anchors[:, 0]) / ANCHORS_MM[1][0], rotation[:, :, 0])
-    torch.testing.assert_close((anchors[:, 2] - anchors[:, 0]) / ANCHORS_MM[2][1], rotation[:, :, 1])
 
 
 def test_every_step_gives_rigid_poses():

@@ -17,7 +17,14 @@ lightning = pytest.importorskip("lightning.pytorch", reason="the training extra 
 from lightning.pytorch.loggers import TensorBoardLogger  # noqa: E402
 from torch.utils.data import DataLoader  # noqa: E402
 
-from g3r.prior.pose_module import PoseModule, point_loss, scores_of, summary, vote_loss  # noqa: E402
+from g3r.prior.pose_module import (  # noqa: E402
+    PoseModule,
+    disturbed,
+    point_loss,
+    scores_of,
+    summary,
+    vote_loss,
+)
 from g3r.prior.pose_network import PoseStep  # noqa: E402
 
 SMALL = {"channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2, "warmup_steps": 1, "n_ages": 2}
@@ -174,6 +181,29 @@ def test_loss_is_a_distance_in_mm():
     batch = sample(0)
     off = PoseStep(batch["true_rotation"], batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]), None)
     assert float(point_loss(off, batch)) == pytest.approx(5.0, abs=1e-3)
+
+
+def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are():
+    torch.manual_seed(1)
+    n_heads, per_stack = 40, 3
+    set_of_stack = torch.arange(n_heads).repeat_interleave(2)
+    stack = torch.arange(2 * n_heads).repeat_interleave(per_stack)
+    rotation = torch.eye(3).expand(len(stack), 3, 3)
+    turned, moved = disturbed(rotation, torch.zeros(len(stack), 3), stack, set_of_stack)
+    torch.testing.assert_close(turned @ turned.transpose(1, 2), rotation, atol=1e-5, rtol=0)
+    changed = (moved.abs().sum(1) > 0).reshape(n_heads, -1)
+    assert (changed.all(1) | ~changed.any(1)).all()
+    assert 5 < changed.all(1).sum() < n_heads - 5
+
+
+def test_starting_from_other_weights(trained, tmp_path):
+    fresh = PoseModule(**SMALL, start_from=str(trained[1]))
+    for one, other in zip(fresh.network.parameters(), trained[2].network.parameters(), strict=True):
+        torch.testing.assert_close(one, other.cpu())
+    with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
+        PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
+    with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
+        PoseModule(**{**SMALL, "width": 64}, start_from=str(trained[1]))
 
 
 def test_the_configuration_fits(pytestconfig):
