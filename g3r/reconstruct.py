@@ -28,7 +28,6 @@ from g3r.acquisition.planes import (
 )
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
-from g3r.acquisition.template import AtlasTemplate
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
@@ -39,8 +38,10 @@ from g3r.motion import MotionEstimate, estimate_motion
 from g3r.motion.confidence import StackConfidence, pose_warnings, stack_confidences
 from g3r.motion.volume import grid_around
 from g3r.presets import PRESETS, ReconstructionSettings
-from g3r.prior import PriorCheckpoint, estimate_prior, load_prior
+from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.pose_checkpoint import PoseCheckpoint
+from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
 
 logger = logging.getLogger(__name__)
@@ -65,6 +66,7 @@ class GaussianReconstructor:
         checkpoint: prior file written by g3r-export; the weights that ship with the package when None.
         settings: see `ReconstructionSettings`, or the name of a preset.
         progress: called with (stage, done, total) as each stage goes on.
+        pose_checkpoint: pose network and mean heads, written by g3r-export; those shipped when None.
 
     Raises:
         InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
@@ -73,7 +75,9 @@ class GaussianReconstructor:
     checkpoint: str | os.PathLike[str] | None = None
     settings: ReconstructionSettings | str = "balanced"
     progress: Progress = lambda stage, done, total: None
-    template: AtlasTemplate | None = field(init=False, default=None)
+    pose_checkpoint: str | os.PathLike[str] | None = None
+    pose_network: PoseNetwork | None = field(init=False, default=None)
+    pose_meta: PoseCheckpoint | None = field(init=False, default=None)
     network: DensityGatedPriorNetwork | None = field(init=False, default=None)
     prior_meta: PriorCheckpoint | None = field(init=False, default=None)
 
@@ -89,6 +93,9 @@ class GaussianReconstructor:
             )
         if self.settings.use_prior:
             self.network, self.prior_meta = load_prior(Path(self.checkpoint or DEFAULT_CHECKPOINT))
+        if self.settings.motion.template or self.settings.motion.network:
+            path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
+            self.pose_network, self.pose_meta = load_pose_network(path)
 
     def reconstruct(self, stacks: Sequence[Stack]) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
@@ -178,8 +185,13 @@ class GaussianReconstructor:
         """
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
+        proposals = {}
+        if self.pose_network is not None and chosen.motion.network:
+            pose = predict_poses(self.pose_network, self.pose_meta, slices)
+            proposals["network"] = pose @ slices.header_pose.inverse()
+        template = self.pose_meta.template if self.pose_meta else None
         return estimate_motion(
-            slices, chosen.motion, self._report("motion"), template=self.template, proposals={}
+            slices, chosen.motion, self._report("motion"), template=template, proposals=proposals
         )
 
     def _prior(self, coarse: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray[np.float32]:

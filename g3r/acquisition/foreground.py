@@ -13,8 +13,8 @@ from g3r.geometry import VolumeGrid
 
 INSIDE_SHARE = 1 / 3
 """Share of the slices over a voxel that must call it brain: one of three stacks. At one half, where the edge
-of a mask lies, the volume is right to 1 %, but the outermost voxels are lost here and there and with them 1 to
-4 dB; generous by half a voxel (3 to 6 % more volume), it costs nothing (docs/method.md, "Mask")."""
+of a mask lies, the volume is right to 1 %, but the outermost voxels are lost here and there, and with them 1
+to 4 dB; this is generous by half a voxel (3 to 6 % more volume; docs/method.md, "Mask")."""
 
 LEAST_DENSITY = 0.1
 """Coverage (1 is one gapless stack) below which nobody is asked: what no slice has seen is not brain."""

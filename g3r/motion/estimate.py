@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.template import AtlasTemplate
 from g3r.geometry import RigidPose
+from g3r.motion.flattening import flattened
 from g3r.motion.hypotheses import MARGIN, choose, in_frame_of, judge, moved, settle, simplify
 from g3r.motion.orientation import Orientation, centred_on_headers, standard_orientation
 from g3r.motion.placement import StackPixels
@@ -27,6 +28,7 @@ class MotionSettings:
     """Which layers run, and how long they search.
 
     Args:
+        flatten: divide slow trends of intensity out of each stack before it is registered.
         template: place runs of slices in mean heads (needs a template); gives the standard orientation.
         network: consider the pose network's proposal.
         stacks: consider stacks registered to each other from many starts.
@@ -39,6 +41,7 @@ class MotionSettings:
         seed: of the random search.
     """
 
+    flatten: bool = True
     template: bool = True
     network: bool = True
     stacks: bool = True
@@ -99,6 +102,9 @@ def estimate_motion(
         proposals: motions [K] (world from header) by other means, such as the pose network, by name.
     """
     rng = np.random.default_rng(settings.seed)
+    given = slices
+    if settings.flatten:
+        slices = flattened(slices)
     parts = StackPixels.of_all(slices)
     single = len(parts) == 1
     still = RigidPose.identity(len(slices))
@@ -143,7 +149,8 @@ def estimate_motion(
     if placed is not None and settings.standard_orientation:
         start = placed.motion(len(slices), parts)
         orientation = standard_orientation(fitted.slices, placed.head, start, rng)
-    result = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
+    posed = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
+    result = given.with_pose(posed.planes.pose)
     return MotionEstimate(
         result, fitted.gain, fitted.weight, fitted.ncc, held_out, name, judged, interleave, n_runs,
         orientation, fitted.history,

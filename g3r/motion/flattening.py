@@ -1,0 +1,68 @@
+"""A first guess of each stack's shading from its own intensities, before any pose is known.
+
+Coils make one side of a stack brighter. Registration compares intensities of stacks that were shaded
+differently, so even 15 % of shading moves whole stacks to wrong places. A second-order polynomial fitted to a
+stack's log intensities removes it together with the anatomy's own slow trend, which registration does not
+need. Only registration sees the flattened slices: the fit to the slices models the shading itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+
+LENGTH_MM = 40.0
+"""Unit of the coordinates, about half a head."""
+
+DARKEST = 0.1
+"""Pixels under this share of a stack's mean count as this bright: a logarithm has no zero."""
+
+FIELD_RANGE = (0.4, 2.5)
+"""A field outside of this is the fit's extrapolation, not a coil's."""
+
+N_ROUNDS = 10
+
+
+def flattened(slices: Slices) -> Slices:
+    """The slices with the slow in-plane trend of each stack's intensities divided out.
+
+    The trend is x, y, x^2, xy, y^2 (in the stack's header frame, about the middle of its masked pixels)
+    fitted to log intensity, Cauchy-weighted so that anatomy far from the mean counts little; slices keep
+    their gains.
+    """
+    planes = slices.planes.with_pose(slices.header_pose)
+    plane, world_mm = planes.plane_id(), planes.pixel_world_mm()
+    stack_of_pixel = slices.stack_id[plane]
+    value = slices.value.copy()
+    for stack in np.unique(slices.stack_id):
+        pixels = np.flatnonzero(stack_of_pixel == stack)
+        inside = slices.mask[pixels]
+        axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
+        in_plane = world_mm[pixels] @ axes / LENGTH_MM
+        x, y = (in_plane - in_plane[inside].mean(0)).T
+        terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
+        bright = slices.value[pixels].astype(np.float64)
+        level = float(bright[inside].mean())
+        if not level > 0:
+            continue
+        coefficients = _robust_fit(terms[inside], np.log(np.maximum(bright[inside], DARKEST * level)))
+        value[pixels] = bright / np.exp(terms @ coefficients).clip(*FIELD_RANGE)
+    return replace(slices, value=value.astype(np.float32))
+
+
+def _robust_fit(terms: NDArray[np.float64], log_value: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients [5] of the terms [P, 5], beside a free constant."""
+    basis = np.c_[terms, np.ones(len(terms))]
+    weight = np.ones(len(basis))
+    ridge = 1e-6 * len(basis) * np.eye(basis.shape[1])  # a stack that is a line of pixels has no y
+    for _ in range(N_ROUNDS):
+        weighted = basis * weight[:, None]
+        found = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ log_value)
+        residual = log_value - basis @ found
+        width = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+        weight = 1 / (1 + (residual / width) ** 2)
+    return found[:5]
