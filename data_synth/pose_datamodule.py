@@ -15,7 +15,8 @@ from data_synth.atlas import TruthVolume, find_subjects
 from data_synth.datamodule import N_PHANTOMS, EpochSampler
 from data_synth.head_variation import varied_head
 from data_synth.heads import Subject, load_head, phantom_subjects
-from data_synth.slice_sets import Head, SliceSet, draw_slice_set
+from data_synth.slice_sampling import Head
+from data_synth.slice_sets import SliceSet, draw_slice_set
 from data_synth.template import mean_heads
 from data_synth.trajectories import RecordedTrajectory, load_trajectories
 from g3r.acquisition.template import AtlasTemplate

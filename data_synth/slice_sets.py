@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from data_synth.atlas import TruthVolume
 from data_synth.motion import LEVELS, slice_trajectory
+from data_synth.slice_sampling import Head, sample_masks, sample_slices
 from data_synth.trajectories import RecordedTrajectory, timed_trajectory
 from g3r.acquisition.slice_images import SliceImages
 from g3r.acquisition.timing import acquisition_order
@@ -30,34 +28,8 @@ LEVEL_SHARE = {"none": 0.15, "mild": 0.25, "moderate": 0.35, "severe": 0.25}
 TIMED_OFFSET_DEG, TIMED_OFFSET_MM = 20.0, 5.0
 """Stacks that follow a trajectory in time: largest standard deviation of a stack's turn, and its shift's."""
 SMALLEST_AREA_MM2 = 60.0
-THROUGH_PLANE = np.array([-1 / 3, 0.0, 1 / 3])
-"""Sample positions through the slice in units of its thickness: a box in thirds."""
-IN_PLANE = np.array([-0.25, 0.25])
-"""Sub-samples of a pixel per axis."""
-MASK_BLUR_VOXELS = 1.0
 LOOK_PIXEL_MM, LOOK_SIZE = 5.0, 36
 """The quick look at where in the field of view the head is."""
-
-
-@dataclass(frozen=True)
-class Head:
-    """A truth volume ready for fast sampling.
-
-    Args:
-        data: [I, J, K] float32.
-        soft_mask: [I, J, K] float32 mask, blurred so that a threshold makes it wider or narrower.
-        affine: [4, 4] atlas frame from index.
-    """
-
-    data: NDArray[np.float32]
-    soft_mask: NDArray[np.float32]
-    affine: Array
-
-    @classmethod
-    def from_volume(cls, volume: TruthVolume) -> Head:
-        """The head of a volume in the atlas frame."""
-        soft = gaussian_filter(volume.mask.astype(np.float32), MASK_BLUR_VOXELS)
-        return cls(np.ascontiguousarray(volume.data), np.ascontiguousarray(soft), volume.affine)
 
 
 @dataclass(frozen=True)
@@ -259,103 +231,3 @@ def _random_intensities(
     sigma = np.float32(rng.uniform(0.0, 0.06))
     noise = rng.standard_normal((2, *image.shape), dtype=np.float32) * sigma
     return np.hypot(image * field + noise[0], noise[1]) * inside
-
-
-def sample_slices(
-    head: Head,
-    index_from_atlas: Array,
-    pose: RigidPose,
-    thickness_mm: Array,
-    pixel_mm: float,
-    size: int,
-    threshold: float = 0.5,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images [K, N, N], averaged over pixel and thickness, and the mask's share of each pixel."""
-    linear = index_from_atlas[:3, :3]
-    axes = linear @ pose.rotation
-    origin = pose.translation_mm @ linear.T + index_from_atlas[:3, 3]
-    return _sample(
-        head.data,
-        head.soft_mask,
-        np.ascontiguousarray(axes, dtype=np.float32),
-        np.ascontiguousarray(origin, dtype=np.float32),
-        np.asarray(thickness_mm, dtype=np.float32),
-        np.float32(pixel_mm),
-        size,
-        np.float32(threshold),
-        IN_PLANE.astype(np.float32),
-        THROUGH_PLANE.astype(np.float32),
-    )
-
-
-def sample_masks(
-    head: Head, index_from_atlas: Array, pose: RigidPose, pixel_mm: float, size: int, threshold: float
-) -> NDArray[np.float32]:
-    """Whether each pixel's centre lies in the mask [K, N, N], 0 or 1."""
-    linear = index_from_atlas[:3, :3]
-    axes = np.ascontiguousarray(linear @ pose.rotation, dtype=np.float32)
-    origin = np.ascontiguousarray(pose.translation_mm @ linear.T + index_from_atlas[:3, 3], dtype=np.float32)
-    return _sample_mask(head.soft_mask, axes, origin, np.float32(pixel_mm), size, np.float32(threshold))
-
-
-@nb.njit(cache=True, fastmath=True)
-def _sample_mask(soft_mask, axes, origin, pixel, size, threshold):
-    inside = np.zeros((len(origin), size, size), np.float32)
-    middle = np.float32((size - 1) / 2)
-    for s in range(len(origin)):
-        for i in range(size):
-            u = (np.float32(i) - middle) * pixel
-            for j in range(size):
-                v = (np.float32(j) - middle) * pixel
-                x = origin[s, 0] + axes[s, 0, 0] * u + axes[s, 0, 1] * v
-                y = origin[s, 1] + axes[s, 1, 0] * u + axes[s, 1, 1] * v
-                z = origin[s, 2] + axes[s, 2, 0] * u + axes[s, 2, 1] * v
-                if _trilinear(soft_mask, x, y, z) > threshold:
-                    inside[s, i, j] = 1.0
-    return inside
-
-
-@nb.njit(cache=True, fastmath=True)
-def _trilinear(volume, x, y, z):
-    if x < 0 or y < 0 or z < 0:
-        return np.float32(0)
-    i, j, k = int(x), int(y), int(z)
-    if i + 1 >= volume.shape[0] or j + 1 >= volume.shape[1] or k + 1 >= volume.shape[2]:
-        return np.float32(0)
-    a, b, c = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    one = np.float32(1)
-    low = (one - b) * ((one - c) * volume[i, j, k] + c * volume[i, j, k + 1])
-    low += b * ((one - c) * volume[i, j + 1, k] + c * volume[i, j + 1, k + 1])
-    high = (one - b) * ((one - c) * volume[i + 1, j, k] + c * volume[i + 1, j, k + 1])
-    high += b * ((one - c) * volume[i + 1, j + 1, k] + c * volume[i + 1, j + 1, k + 1])
-    return (one - a) * low + a * high
-
-
-@nb.njit(cache=True, fastmath=True)
-def _sample(data, soft_mask, axes, origin, thickness, pixel, size, threshold, in_plane, through):
-    n = len(origin)
-    image = np.zeros((n, size, size), np.float32)
-    inside = np.zeros((n, size, size), np.float32)
-    share = np.float32(1.0 / in_plane.size**2)
-    middle = np.float32((size - 1) / 2)
-    for s in range(n):
-        for i in range(size):
-            for j in range(size):
-                for p in in_plane:
-                    for q in in_plane:
-                        u = (np.float32(i) - middle + p) * pixel
-                        v = (np.float32(j) - middle + q) * pixel
-                        x = origin[s, 0] + axes[s, 0, 0] * u + axes[s, 0, 1] * v
-                        y = origin[s, 1] + axes[s, 1, 0] * u + axes[s, 1, 1] * v
-                        z = origin[s, 2] + axes[s, 2, 0] * u + axes[s, 2, 1] * v
-                        if _trilinear(soft_mask, x, y, z) <= threshold:
-                            continue
-                        inside[s, i, j] += share
-                        total = np.float32(0)
-                        for t in through:
-                            w = t * thickness[s]
-                            total += _trilinear(
-                                data, x + axes[s, 0, 2] * w, y + axes[s, 1, 2] * w, z + axes[s, 2, 2] * w
-                            )
-                        image[s, i, j] += share * total / np.float32(through.size)
-    return image, inside

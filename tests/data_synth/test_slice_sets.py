@@ -9,7 +9,8 @@ from data_synth.heads import PhantomSubject, load_head
 from data_synth.motion import LEVELS
 from data_synth.pose_datamodule import SliceSetDataModule, SliceSets
 from data_synth.simulator import StackSettings, simulate_stacks
-from data_synth.slice_sets import Head, draw_slice_set
+from data_synth.slice_sampling import Head, sample_slices
+from data_synth.slice_sets import draw_slice_set
 from data_synth.trajectories import (
     JERK_DEG,
     QUIET_DEG,
@@ -82,7 +83,7 @@ def test_the_same_images_as_at_inference(volume, head, rng):
         np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion])
     )
     pose = moved @ slices.header_pose @ images.frame_in_slice
-    fast, _ = slice_sets.sample_slices(head, np.linalg.inv(head.affine), pose, images.thickness_mm, 3.0, 40)
+    fast, _ = sample_slices(head, np.linalg.inv(head.affine), pose, images.thickness_mm, 3.0, 40)
     for image, other in zip(images.image, fast, strict=True):
         if (other > 0).sum() > 60:
             assert np.corrcoef(image.ravel(), other.ravel())[0, 1] > 0.95
