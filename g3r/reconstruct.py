@@ -35,7 +35,12 @@ from g3r.gaussians import render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
 from g3r.motion import MotionEstimate, estimate_motion
-from g3r.motion.confidence import StackConfidence, pose_warnings, stack_confidences
+from g3r.motion.confidence import (
+    StackConfidence,
+    pose_warnings,
+    registration_summary,
+    stack_confidences,
+)
 from g3r.motion.volume import grid_around
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
@@ -125,6 +130,10 @@ class GaussianReconstructor:
             motion = self.register(slices, settings)
         confidences = stack_confidences(motion, len(stacks))
         warnings += pose_warnings(motion, confidences, stacks)
+        if settings.motion.standard_orientation and motion.orientation is None:
+            notes.append(
+                "standard orientation unknown: no mean head fits well; the volume stays in scanner space"
+            )
         with clock("coarse"):
             voxel = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
             prior_grid = grid_around(motion.slices, voxel, margin_mm=5.0)
@@ -186,7 +195,7 @@ class GaussianReconstructor:
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
         proposals = {}
-        if self.pose_network is not None and chosen.motion.network:
+        if self.pose_network is not None and self.pose_meta is not None and chosen.motion.network:
             pose = predict_poses(self.pose_network, self.pose_meta, slices)
             proposals["network"] = pose @ slices.header_pose.inverse()
         template = self.pose_meta.template if self.pose_meta else None
@@ -240,6 +249,10 @@ class GaussianReconstructor:
             ],
             "shading": fit.shading,
             "n_gaussians": len(fit.cloud),
+            "registration": {
+                "trusted": all(one.sure for one in confidences),
+                "summary": registration_summary(confidences),
+            },
             "motion": {
                 "start": motion.hypothesis,
                 "held_out_correlation_by_start": motion.hypotheses,

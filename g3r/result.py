@@ -28,6 +28,10 @@ SLICE_COLUMNS = (
 DOUBTED_WEIGHT = 0.5
 """Slices trusted less than this get a reason in slices.tsv."""
 
+LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
+"""A doubted slice with a gain below the first has lost signal; one with less than the second of its stack's
+median of pixels is small; one that correlates less than the third with the volume shows something else."""
+
 OUTPUT_NAMES = (
     "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz", "gaussians.npz",
     "slices.tsv", "run.json", "sections.png",
@@ -103,7 +107,9 @@ class ReconstructionResult:
         if self.grid is self.prior_grid:
             on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
             rows = {**on_mask, "volume": self.volume}
-        save_sections(folder / "sections.png", rows, self.grid.affine, self.mask)
+        doubted = self.record.get("registration", {}).get("trusted") is False
+        title = "REGISTRATION DOUBTFUL: do not trust this volume (see run.json)" if doubted else ""
+        save_sections(folder / "sections.png", rows, self.grid.affine, self.mask, title=title)
 
     def slice_table(self) -> str:
         """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, mm)."""
@@ -113,10 +119,20 @@ class ReconstructionResult:
         for k in range(len(self.slices)):
             pose = [f"{x:.9g}" for x in (*rotvec[k], *motion.translation_mm[k])]
             trust = [f"{x:.4g}" for x in (self.gain[k], self.weight[k], self.ncc[k])]
-            reason = "high residual" if self.weight[k] < DOUBTED_WEIGHT else "-"
+            reason = self._reason(k) if self.weight[k] < DOUBTED_WEIGHT else "-"
             number = [str(self.slices.stack_id[k]), str(self.slices.slice_index[k])]
             lines.append("\t".join([*number, *pose, *trust, reason]))
         return "\n".join(lines) + "\n"
+
+    def _reason(self, k: int) -> str:
+        """Why slice k is trusted little, as far as its figures tell."""
+        n_pixels = np.bincount(self.slices.pixel_plane, minlength=len(self.slices))
+        typical = np.median(n_pixels[self.slices.stack_id == self.slices.stack_id[k]])
+        if self.gain[k] < LOST_SIGNAL_GAIN:
+            return "signal loss"
+        if n_pixels[k] < SMALL_SHARE * typical:
+            return "does not fit, small slice"
+        return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
 
 
 def check_output_folder(folder: Path, *, replace: bool) -> None:

@@ -39,6 +39,15 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument(
+        "--pose-ckpt",
+        metavar="POSE.pt",
+        help="pose network and mean heads from g3r-export (default: shipped)",
+    )
+    parser.add_argument(
+        "--space", choices=("standard", "scanner"), default="standard",
+        help="volume in standard orientation (RAS, mid-sagittal plane in the middle) or in scanner space",
+    )  # fmt: skip
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
     parser.add_argument(
         "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
@@ -105,7 +114,7 @@ def _run(options: argparse.Namespace) -> int:
 
         _use_threads(options.threads)
         settings = _settings(options)
-        reconstructor = GaussianReconstructor(options.ckpt, settings)
+        reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
     with _bars(quiet=options.quiet) as progress:
         reconstructor.progress = progress
         if options.dry_run:
@@ -113,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
         result = reconstructor.reconstruct(stacks)
     result.record["command"] = {
         "stacks": [stack.name for stack in stacks], "preset": options.preset, "seed": options.seed,
-        "threads": options.threads,
+        "threads": options.threads, "space": options.space,
     }  # fmt: skip
     result.save(folder, replace=options.force)
     if options.tensorboard:
@@ -121,6 +130,7 @@ def _run(options: argparse.Namespace) -> int:
     seconds = sum(result.record["seconds"].values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
+    print(f"poses:   {result.record['registration']['summary']}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
     return 0
 
@@ -155,8 +165,10 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
     from g3r.presets import PRESETS
 
+    preset = PRESETS[options.preset]
     return replace(
-        PRESETS[options.preset],
+        preset,
+        motion=replace(preset.motion, standard_orientation=options.space == "standard", seed=options.seed),
         resolution_mm=options.resolution,
         seed=options.seed,
         use_prior=not options.no_prior,

@@ -79,3 +79,15 @@ def pose_warnings(
                 f"{one.doubted_share:.0%} of its slices fit badly); do not trust the volume"
             )
     return lines
+
+
+def registration_summary(confidences: Sequence[StackConfidence]) -> str:
+    """One line on all stacks."""
+    if len(confidences) == 1:
+        return "a single stack: slices stay where the header says, nothing checks them"
+    n_sure = sum(one.sure for one in confidences)
+    figures = ", ".join(
+        "none" if one.held_out_correlation is None else f"{one.held_out_correlation:.2f}"
+        for one in confidences
+    )
+    return f"{n_sure} of {len(confidences)} stacks are registered; correlation with the others: {figures}"
