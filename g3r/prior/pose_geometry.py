@@ -125,7 +125,7 @@ def scattered(
     """Weighted sums and weights of points in cubes of voxels centred on the origin, [G, I, J, K, 2].
 
     Args:
-        points_mm: [S, P, 3]; each goes to its nearest voxel.
+        points_mm: [S, P, 3]; each is shared among the eight voxels around it, outside it is lost.
         value: [S, P].
         weight: [S, P]; points of zero weight are skipped.
         group: [S] volume that a block of points goes to.
@@ -133,9 +133,46 @@ def scattered(
         shape: voxels per edge.
         spacing_mm: voxel size.
     """
-    index = (points_mm / spacing_mm + (shape - 1) / 2).round().long()
-    inside = ((index >= 0) & (index < shape)).all(-1) & (weight > 0)
-    flat = ((group[:, None] * shape + index[..., 0]) * shape + index[..., 1]) * shape + index[..., 2]
+    index = points_mm / spacing_mm + (shape - 1) / 2
+    low = index.floor().long()
+    inside = ((low >= 0) & (low < shape - 1)).all(-1) & (weight > 0)
+    fraction = (index - low)[inside]
+    corner = low[inside]
+    first = ((group[:, None].expand_as(inside)[inside] * shape + corner[:, 0]) * shape + corner[:, 1]) * shape
+    first = first + corner[:, 2]
     both = torch.stack([value * weight, weight], -1)[inside]
-    volume = value.new_zeros(n_groups * shape**3, 2).index_add(0, flat[inside], both)
+    volume = value.new_zeros(n_groups * shape**3, 2)
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                share = torch.ones_like(fraction[:, 0])
+                for axis, upper in enumerate((i, j, k)):
+                    share = share * (fraction[:, axis] if upper else 1 - fraction[:, axis])
+                volume.index_add_(0, first + (i * shape + j) * shape + k, both * share[:, None])
     return volume.reshape(n_groups, shape, shape, shape, 2)
+
+
+def smoothed(volume: Tensor) -> Tensor:
+    """Volumes [A, I, J, K] blurred by 1/4, 1/2, 1/4 along each axis, zero outside."""
+    for axis in (1, 2, 3):
+        padded = torch.nn.functional.pad(volume, [0, 0] * (3 - axis) + [1, 1])
+        n = volume.shape[axis]
+        volume = sum(w * padded.narrow(axis, k, n) for k, w in enumerate((0.25, 0.5, 0.25)))  # type: ignore[assignment]
+    return volume
+
+
+def best_age(heads: Tensor, value: Tensor, group: Tensor, n_groups: int) -> Tensor:
+    """Which of A mean heads correlates best with the slices of each set, [G].
+
+    Args:
+        heads: [S, P, A] the mean heads at the pixels.
+        value: [S, P] the pixels.
+        group: [S] set of each slice.
+        n_groups: G.
+    """
+    pixel = value[..., None]
+    moments = torch.stack(
+        [pixel.expand_as(heads), heads, pixel**2 * torch.ones_like(heads), heads**2, pixel * heads]
+    )
+    v, h, vv, hh, vh = group_mean(moments.mean(2).permute(1, 0, 2), group, n_groups).unbind(1)
+    return ((vh - v * h) / ((vv - v**2) * (hh - h**2)).clamp_min(1e-12).sqrt()).argmax(1)

@@ -1,5 +1,6 @@
 """Training of the pose network."""
 
+import logging
 import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ from g3r.prior.pose_inference import (
 from g3r.prior.pose_network import PoseNetwork, PoseStep
 from g3r.prior.training import AnnealedModule, describe_data
 
+logger = logging.getLogger(__name__)
+
 Batch = Mapping[str, Tensor]
 """A `SliceBatch` with `true_rotation` [S, 3, 3] and `true_translation_mm` [S, 3]."""
 
@@ -30,7 +33,7 @@ POSE_EXPORT_KEY = "g3r_pose"
 """Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
 FULL_AREA_MM2 = 600.0
 """Slices of less area count less in the loss."""
-SECOND_REFINEMENT_SHARE = 0.3
+SECOND_REFINEMENT_SHARE = 0.2
 """Share of training batches that refine twice, so that a refinement also knows good poses."""
 DISTURBED_SHARE = 0.6
 """Share of heads whose poses are disturbed before a refinement, by at most these deviations per axis."""
@@ -140,9 +143,9 @@ class PoseModule(AnnealedModule):
         """Log medians over all slices and stacks, and by the number of stacks; send the row of images."""
         for name, value in summary(self._scores).items():
             self.log(f"val/{name}", value, prog_bar=name == "slice_mm")
-        for logger in self.loggers:
-            if isinstance(logger, TensorBoardLogger) and self._panel is not None:
-                logger.experiment.add_image(
+        for board in self.loggers:
+            if isinstance(board, TensorBoardLogger) and self._panel is not None:
+                board.experiment.add_image(
                     "val/slices, and the template where they are put",
                     self._panel,
                     global_step=self.global_step,
@@ -176,16 +179,20 @@ class PoseModule(AnnealedModule):
             self.weeks = [float(week) for week in template.weeks]
 
     def _take_weights(self, path: Path) -> None:
-        """Begin with the weights of another run; its template is replaced by the data module's."""
+        """Begin with the weights of another run where they fit; the template comes from the data module."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
             own = self.network.state_dict()
             taken = {name.removeprefix("network."): value for name, value in state.items()}
-            self.network.load_state_dict({**taken, "template": own["template"]})
+            taken = {name: v for name, v in taken.items() if name in own and v.shape == own[name].shape}
+            fresh = sorted(own.keys() - taken.keys() - {"template"})
+            if fresh:
+                logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
+            self.network.load_state_dict({**own, **taken, "template": own["template"]})
         except (OSError, pickle.UnpicklingError, RuntimeError, LookupError, TypeError) as error:
             raise InputError(
                 f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
-                "checkpoint of a pose network with the same settings"
+                "checkpoint of a pose network"
             ) from error
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from monai.networks.blocks import Convolution, ResidualUnit, TransformerBlock
 from torch import Tensor, nn
 
 from g3r.prior.pose_geometry import (
+    best_age,
     group_mean,
     moved_points,
     nearest_rotation,
@@ -15,6 +16,7 @@ from g3r.prior.pose_geometry import (
     rotation_from_vector,
     sample_rows,
     scattered,
+    smoothed,
 )
 
 WAVELENGTHS_MM = (200.0, 100.0, 50.0, 25.0)
@@ -25,6 +27,9 @@ RESIDUAL_SCALE_MM = 8.0
 COARSE_SHAPE, COARSE_SPACING_MM = 28, 5.0
 N_CODES = 2 * len(WAVELENGTHS_MM) + 5
 N_POSE_CODES = 12
+SIDE_MM = 4.0
+"""How far beside the slice's plane a refinement also looks at the mean head."""
+N_SEEN = 7
 
 SliceBatch = Mapping[str, Tensor]
 """`image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S] (NaN: unknown),
@@ -125,8 +130,8 @@ class PoseNetwork(nn.Module):
     nothing, and neither does the order of slices or stacks. In each step every slice votes for a rotation and
     shift of its stack; votes of a stack are summed, those of other stacks added through the header's
     rotations between stacks (first step) or as they are (refinements), and the sum is made a rotation. Then
-    every slice moves a little on its own. Refinements see, at the current poses, the mean heads of the
-    template and a coarse volume made of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
+    every slice moves a little on its own. Refinements see, at the current poses, the template's mean head of
+    the best age and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
 
     Args:
         template_shape: [A, I, J, K] of the template.
@@ -183,7 +188,7 @@ class PoseNetwork(nn.Module):
         self.register_buffer("template", torch.zeros(*shape, ages))
         self.encoder = Encoder(channels, width, image_size)
         self.transformer = SetTransformer(width, N_CODES, n_blocks, n_heads)
-        self.refining_encoder = Encoder(channels, width, image_size, ages + 2)
+        self.refining_encoder = Encoder(channels, width, image_size, N_SEEN)
         self.refining_transformer = SetTransformer(width, N_CODES + N_POSE_CODES, n_blocks, n_heads)
         # how much the votes of all stacks count beside the stack's own, in the first step and in refinements
         self.log_share = nn.Parameter(torch.zeros(2))
@@ -251,24 +256,46 @@ class PoseNetwork(nn.Module):
 
     @torch.no_grad()
     def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
-        """What template and other stacks show at the slices' poses, [S, A + 2, N / 2, N / 2]."""
+        """What the template and the other stacks show at the slices' poses, [S, N_SEEN, N / 2, N / 2].
+
+        The mean head of the age that suits a set's slices best, in the slice's plane and beside it, and a
+        coarse volume of the other stacks; both also as differences from the slice.
+        """
         half = self.image_size // 2
         value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
-        points = moved_points(rotation, translation_mm, pixel_points_mm(half, 2 * self.pixel_mm, value))
+        plane = pixel_points_mm(half, 2 * self.pixel_mm, value)
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
-        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
-        sums = scattered(
-            points, value, (value > 0).to(value.dtype), stack, n_stacks, COARSE_SHAPE, COARSE_SPACING_MM
-        )
-        per_set = sums.new_zeros(n_sets, *sums.shape[1:]).index_add(0, set_of_stack, sums)
-        others = (per_set[set_of_stack] - sums).permute(0, 4, 1, 2, 3)
-        blurred = nn.functional.avg_pool3d(others, 3, stride=1, padding=1).permute(0, 2, 3, 4, 1)
-        coarse = sample_rows(blurred.contiguous(), points, COARSE_SPACING_MM, stack)
-        known = coarse[..., 1:] / (coarse[..., 1:] + 0.1)
-        mean = coarse[..., :1] / (coarse[..., 1:] + 0.02)
-        heads = sample_rows(self.template, points, self.template_spacing_mm)
-        seen = torch.cat([heads, mean, known], -1)
+        heads = smoothed(self.template.permute(3, 0, 1, 2))
+        points = moved_points(rotation, translation_mm, plane)
+        # a quarter of the pixels is enough to tell an age
+        some = sample_rows(heads.permute(1, 2, 3, 0), points[:, ::4], self.template_spacing_mm)
+        age = best_age(some, value[:, ::4], set_of_stack[stack], int(set_of_stack.max()) + 1)
+        head = [
+            sample_rows(
+                heads[..., None],
+                moved_points(rotation, translation_mm, plane + plane.new_tensor([0.0, 0.0, side_mm])),
+                self.template_spacing_mm,
+                age[set_of_stack[stack]],
+            )
+            for side_mm in (-SIDE_MM, 0.0, SIDE_MM)
+        ]
+        mean, known = self._others_at(points, value, stack, set_of_stack)
+        slice_ = value[..., None]
+        seen = torch.cat([*head, slice_ - head[1], mean, (slice_ - mean) * known, known], -1)
         return seen.reshape(len(value), half, half, -1).permute(0, 3, 1, 2)
+
+    def _others_at(
+        self, points_mm: Tensor, value: Tensor, stack: Tensor, set_of_stack: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Coarse volume of the head's other stacks at the pixels [S, P, 1], and where it is known, 0 to 1."""
+        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
+        weight = (value > 0).to(value.dtype)
+        sums = scattered(points_mm, value, weight, stack, n_stacks, COARSE_SHAPE, COARSE_SPACING_MM)
+        per_set = sums.new_zeros(n_sets, *sums.shape[1:]).index_add(0, set_of_stack, sums)
+        others = per_set[set_of_stack] - sums
+        coarse = sample_rows(others, points_mm, COARSE_SPACING_MM, stack)
+        weight = coarse[..., 1:].clamp_min(0)
+        return coarse[..., :1] / (weight + 0.02), weight / (weight + 0.1)
 
 
 def slice_codes(batch: SliceBatch) -> Tensor:

@@ -7,11 +7,13 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from g3r.prior.pose_geometry import (
+    best_age,
     group_mean,
     nearest_rotation,
     rotation_from_vector,
     sample_rows,
     scattered,
+    smoothed,
 )
 from g3r.prior.pose_network import PoseNetwork
 
@@ -105,6 +107,22 @@ def test_scattering_keeps_sums(rng):
     volume = scattered(points, value, weight, torch.tensor([0, 1, 0]), 2, 11, 2.0)
     torch.testing.assert_close(volume[..., 0].sum(), (value * weight).sum())
     torch.testing.assert_close(volume[1, ..., 1].sum(), weight[1].sum())
+
+
+def test_smoothing_keeps_sums_and_symmetry():
+    volume = torch.zeros(1, 7, 7, 7)
+    volume[0, 3, 3, 3] = 8.0
+    blurred = smoothed(volume)
+    assert float(blurred.sum()) == pytest.approx(8.0)
+    assert float(blurred[0, 3, 3, 3]) == pytest.approx(1.0)
+    torch.testing.assert_close(blurred, blurred.flip(1, 2, 3))
+
+
+def test_best_age_is_the_one_that_correlates(rng):
+    heads = torch.from_numpy(rng.random((6, 30, 3)))
+    value = torch.cat([0.5 * heads[:4, :, 2] + 0.3, 2 * heads[4:, :, 0]])
+    value = value + 0.05 * torch.from_numpy(rng.random((6, 30)))
+    assert best_age(heads, value, torch.tensor([0, 0, 0, 0, 1, 1]), 2).tolist() == [2, 0]
 
 
 def test_every_step_gives_rigid_poses():
