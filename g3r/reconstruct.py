@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-import platform
-import resource
-import time
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from g3r._version import __version__
 from g3r.acquisition.foreground import foreground_mask
 from g3r.acquisition.planes import (
-    SMALLEST_SLICE_PIXELS,
     Slices,
     slices_from_stacks,
     volume_from_pixels,
@@ -30,17 +22,16 @@ from g3r.acquisition.scatter import coarse_and_density, confidence, normalisatio
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
-from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.fitting.slice_stage import fit_slices
 from g3r.gaussians import render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
 from g3r.motion import MotionEstimate, estimate_motion
 from g3r.motion.confidence import (
-    StackConfidence,
     pose_warnings,
-    registration_summary,
     stack_confidences,
 )
+from g3r.motion.prior_registration import register_to_prior
 from g3r.motion.volume import grid_around
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
@@ -48,6 +39,7 @@ from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.pose_checkpoint import PoseCheckpoint
 from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
+from g3r.run_record import Clock, left_out_notes, run_record
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +53,18 @@ LEAST_DISTILLATION = 1e-3
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Slices and V_coarse in normalised intensities (given ones over `scale`), M_rho and mask [I, J, K]."""
+
+    slices: Slices
+    coarse: NDArray[np.float32]
+    density: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    grid: VolumeGrid
+    scale: float
 
 
 @dataclass
@@ -110,21 +114,19 @@ class GaussianReconstructor:
             NumericalError: a fit that broke down.
         """
         assert isinstance(self.settings, ReconstructionSettings)
-        settings, clock, notes, warnings = self.settings, _Clock(), [], []
+        settings, clock, notes, warnings = self.settings, Clock(), [], []
         rng = np.random.default_rng(settings.seed)
         slices = slices_from_stacks(stacks)
-        notes += _left_out(stacks, slices)
+        notes += left_out_notes(stacks, slices)
         first_scale = _percentile_scale(slices)
         slices = slices.scaled(1 / first_scale)
         if len(stacks) == 1:
-            # a single stack says nothing about where its slices are relative to each other across planes;
-            # registered to a volume made of themselves they drift
+            # registered to a volume made of themselves, slices of a single stack drift
             settings = replace(
                 settings,
                 slice_stage=replace(settings.slice_stage, optimise_poses=False),
             )
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
-            notes.append("slice poses not estimated: a single stack does not determine them")
 
         with clock("motion"):
             motion = self.register(slices, settings)
@@ -135,17 +137,25 @@ class GaussianReconstructor:
                 "standard orientation unknown: no mean head fits well; the volume stays in scanner space"
             )
         with clock("coarse"):
-            voxel = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
-            prior_grid = grid_around(motion.slices, voxel, margin_mm=5.0)
-            trust = motion.weight[motion.slices.pixel_plane]
-            coarse, density = coarse_and_density(motion.slices, prior_grid, motion.gain, trust)
-            scale = normalisation_scale(coarse, density)
-            coarse, slices = coarse / np.float32(scale), motion.slices.scaled(1 / scale)
-            prior_mask = foreground_mask(slices, prior_grid, motion.weight)
+            start = self._start(motion.slices, motion.gain, motion.weight)
         with clock("prior"):
             self.progress("prior", 0, 1)
-            prior = self._prior(coarse, density)
+            prior = self._prior(start)
             self.progress("prior", 1, 1)
+        gain, scale = motion.gain, start.scale
+        if len(stacks) == 1 and settings.use_prior and settings.motion.runs:
+            with clock("slices to prior"):
+                nudged, gain, believed = register_to_prior(start.slices, gain, prior, start.grid)
+                if believed:
+                    start = self._start(nudged, gain, motion.weight)
+                    scale *= start.scale
+                    prior = self._prior(start)
+            notes.append(
+                "slices of the single stack were registered to the prior volume" if believed else
+                "slices of the single stack stay in line: the prior volume gives no reason to move them"
+            )  # fmt: skip
+        slices, prior_mask, prior_grid = start.slices, start.mask, start.grid
+        coarse, density = start.coarse, start.density
         with clock("fit to prior"):
             cloud = seed_cloud(
                 prior, prior_mask, prior_grid, _gaussian_spacing_mm(slices, settings), settings.flat_gradient
@@ -163,7 +173,7 @@ class GaussianReconstructor:
                 )
                 distil_to = VolumeTarget.of(prior, unmeasured.astype(np.float32), prior_grid)
             fit = fit_slices(
-                cloud, slices, motion.gain, motion.weight, distil_to, settings.slice_stage, rng,
+                cloud, slices, gain, motion.weight, distil_to, settings.slice_stage, rng,
                 self._report("fit to slices"),
             )  # fmt: skip
         with clock("volume"):
@@ -175,7 +185,10 @@ class GaussianReconstructor:
             if not np.isfinite(volume).all():
                 raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         intensity = first_scale * scale
-        record = self._record(stacks, slices, motion, confidences, fit, clock, settings, notes, warnings)
+        record = run_record(
+            settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
+            warnings,
+        )  # fmt: skip
         record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
         for warning in warnings:
             logger.warning(warning)
@@ -203,105 +216,29 @@ class GaussianReconstructor:
             slices, chosen.motion, self._report("motion"), template=template, proposals=proposals
         )
 
-    def _prior(self, coarse: NDArray[np.float32], density: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _start(self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]) -> _Start:
+        assert isinstance(self.settings, ReconstructionSettings)
+        voxel = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
+        grid = grid_around(slices, voxel, margin_mm=5.0)
+        coarse, density = coarse_and_density(slices, grid, gain, weight[slices.pixel_plane])
+        scale = normalisation_scale(coarse, density)
+        slices = slices.scaled(1 / scale)
+        mask = foreground_mask(slices, grid, weight)
+        return _Start(slices, coarse / np.float32(scale), density, mask, grid, scale)
+
+    def _prior(self, start: _Start) -> NDArray[np.float32]:
         if self.network is None:
-            return coarse
-        return estimate_prior(self.network, coarse, density)
+            return start.coarse
+        return estimate_prior(self.network, start.coarse, start.density)
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)
-
-    def _record(
-        self,
-        stacks: Sequence[Stack],
-        slices: Slices,
-        motion: MotionEstimate,
-        confidences: list[StackConfidence],
-        fit: SliceFit,
-        clock: _Clock,
-        settings: ReconstructionSettings,
-        notes: list[str],
-        warnings: list[str],
-    ) -> dict[str, Any]:
-        """run.json: what is needed to judge the result and to run it again; file names only, no paths."""
-        of_stack = [slices.stack_id == n for n in range(len(stacks))]
-        return {
-            "g3r": __version__,
-            "versions": {
-                "python": platform.python_version(),
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-            },
-            "settings": asdict(settings),
-            "prior": asdict(self.prior_meta) if self.prior_meta else None,
-            "stacks": [
-                {
-                    "name": stack.name,
-                    "thickness_mm": stack.thickness_mm,
-                    "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
-                    "n_slices": int(chosen.sum()),
-                    "pose_confidence": confidences[n].record(),
-                    "interleave": motion.interleave[n],
-                    "n_runs": motion.n_runs[n],
-                    "n_doubted_slices": int((fit.weight[chosen] < 0.5).sum()),
-                }
-                for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
-            ],
-            "shading": fit.shading,
-            "n_gaussians": len(fit.cloud),
-            "registration": {
-                "trusted": all(one.sure for one in confidences),
-                "summary": registration_summary(confidences),
-            },
-            "motion": {
-                "start": motion.hypothesis,
-                "held_out_correlation_by_start": motion.hypotheses,
-                "orientation": "scanner" if motion.orientation is None else "standard",
-                "correlation_with_mean_head": motion.orientation and motion.orientation.correlation,
-                "rounds": motion.history,
-            },
-            "seconds": clock.seconds,
-            "cpu_seconds": clock.cpu_seconds,
-            "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            "notes": notes,
-            "warnings": warnings,
-        }
-
-
-class _Clock:
-    """Wall and CPU seconds of each stage, and a line in the log when it ends."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.cpu_seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str):
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.seconds[stage] = round(time.perf_counter() - wall, 3)
-        self.cpu_seconds[stage] = round(time.process_time() - cpu, 3)
-        logger.info("%s: %.1f s", stage, self.seconds[stage])
 
 
 def _gaussian_spacing_mm(slices: Slices, settings: ReconstructionSettings) -> float:
     """Cell edge per Gaussian: the settings' number of (typical) pixels, as cubes of equal volume."""
     covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
     return settings.gaussian_spacing_pixels * float(np.median(covered_mm3)) ** (1 / 3)
-
-
-def _left_out(stacks: Sequence[Stack], slices: Slices) -> list[str]:
-    """A line for each stack of which slices were left out for want of masked pixels."""
-    lines = []
-    for n, stack in enumerate(stacks):
-        marked = np.flatnonzero(stack.mask.any((0, 1)))
-        missing = sorted(set(marked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
-        if missing:
-            numbers = ", ".join(map(str, missing))
-            lines.append(
-                f"{stack.name}: slices {numbers} left out, fewer than {SMALLEST_SLICE_PIXELS} masked pixels"
-            )
-    return lines
 
 
 def _percentile_scale(slices: Slices) -> float:

@@ -30,6 +30,7 @@ ALLOWED = {
     "bench": BELOW_FITTING | {"fitting", "evaluation"},
 }
 OPEN_TO_ALL = {"errors", "_version"}
+ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "presets"}
 ROOMS = {*ALLOWED, "result", "reconstruct", "cli"}
 ALLOWED["result"] = ROOMS - {"reconstruct", "cli", "result"}
 ALLOWED["reconstruct"] = ROOMS - {"cli", "reconstruct"}

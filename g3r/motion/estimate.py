@@ -13,7 +13,16 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.template import AtlasTemplate
 from g3r.geometry import RigidPose
 from g3r.motion.flattening import flattened
-from g3r.motion.hypotheses import MARGIN, choose, in_frame_of, judge, moved, settle, simplify
+from g3r.motion.hypotheses import (
+    MARGIN,
+    choose,
+    in_frame_of,
+    judge,
+    moved,
+    one_motion_or_runs,
+    settle,
+    simplify,
+)
 from g3r.motion.orientation import Orientation, centred_on_headers, standard_orientation
 from g3r.motion.placement import StackPixels
 from g3r.motion.slice_rounds import SliceRounds, refine_slices
@@ -135,6 +144,15 @@ def estimate_motion(
             ]
             if judge(slices, parts, motion).cost > judgements[name].cost - MARGIN:
                 motion, n_runs = hypotheses[name], [1] * len(parts)
+    elif placed is not None and settings.runs:
+        # no other stack holds a single one together; a mean head does, roughly
+        only, head = placed.placement[0], placed.head
+        interleave = [only.runs.interleave]
+        motion, is_one = one_motion_or_runs(
+            slices, parts[0], only.motion, interleave[0], head.volume, head.grid
+        )
+        n_runs = [1 if is_one else only.runs.n_runs]
+        name = "headers" if is_one else "template"
     posed = moved(slices, motion)
     rounds = SliceRounds(
         0 if single else settings.n_rounds, settings.steps_per_round, settings.finest_voxel_mm,
@@ -148,7 +166,7 @@ def estimate_motion(
     orientation = None
     if placed is not None and settings.standard_orientation:
         start = placed.motion(len(slices), parts)
-        orientation = standard_orientation(fitted.slices, placed.head, start, rng)
+        orientation = standard_orientation(fitted.slices, placed.heads, start, rng)
     posed = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
     result = given.with_pose(posed.planes.pose)
     return MotionEstimate(

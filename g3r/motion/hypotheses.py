@@ -199,15 +199,39 @@ def simplify(
     for part, order in zip(parts, interleave, strict=True):
         posed = moved(slices, motion)
         volume, grid = volume_without(posed, part.stack, 2.4)
-        own = motion.take(part.rows)
-        rigid = _one_motion(slices.take(part.rows), own, volume, grid)
-        free = predict(part, own, volume, grid, order)
-        still = predict(part, rigid, volume, grid, order)
-        shared.append(still.cost <= free.cost + MARGIN)
-        logger.info("stack %d: one motion costs %.0f, runs %.0f", part.stack, still.cost, free.cost)
-        if shared[-1]:
-            motion = _put(motion, part.rows, rigid)
+        own, is_one = one_motion_or_runs(slices, part, motion.take(part.rows), order, volume, grid)
+        motion = _put(motion, part.rows, own)
+        shared.append(is_one)
     return motion, shared
+
+
+def one_motion_or_runs(
+    slices: Slices,
+    part: StackPixels,
+    motion: RigidPose,
+    interleave: int,
+    volume: NDArray[np.float32],
+    grid: VolumeGrid,
+) -> tuple[RigidPose, bool]:
+    """One motion for all slices of a stack where a volume predicts them as well by it; otherwise its runs.
+
+    Args:
+        slices: of all stacks.
+        part: the stack.
+        motion: [K] of its slices (world from header), in runs.
+        interleave: its acquisition order.
+        volume: [I, J, K] that the stack did not help to make.
+        grid: its grid.
+
+    Returns:
+        Motions [K], and whether they are all one.
+    """
+    rigid = _one_motion(slices.take(part.rows), motion, volume, grid)
+    free = predict(part, motion, volume, grid, interleave)
+    still = predict(part, rigid, volume, grid, interleave)
+    is_one = still.cost <= free.cost + MARGIN
+    logger.info("stack %d: one motion costs %.0f, runs %.0f", part.stack, still.cost, free.cost)
+    return (rigid, True) if is_one else (motion, False)
 
 
 def _one_motion(stack: Slices, motion: RigidPose, volume: NDArray[np.float32], grid: VolumeGrid) -> RigidPose:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +47,13 @@ class Orientation:
 
 
 def standard_orientation(
-    slices: Slices, head: FittedHead, start: RigidPose, rng: np.random.Generator
+    slices: Slices, heads: Sequence[FittedHead], start: RigidPose, rng: np.random.Generator
 ) -> Orientation | None:
-    """Turn all slices together so that the head stands as the mean head does.
+    """Turn all slices together so that the head stands as a mean head does.
 
     Args:
         slices: at their final poses, in any frame.
-        head: mean head of the subject's size.
+        heads: mean heads of the subject's size; the one that fits best decides.
         start: motions [K] (world from header) into the atlas frame, roughly.
         rng: source of randomness.
 
@@ -61,17 +62,25 @@ def standard_orientation(
     """
     present = slices.world_from_header()
     common = in_frame_of(slices, start, present) @ present.inverse()
-    motion = common.take([0])
     pixels = SearchPixels.of(slices)
-    for turn_deg, shift_mm in ROUNDS:
-        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, turn_deg, shift_mm, rng)
-        agreement = correlation(pixels.moments(head.volume, head.grid, candidate).sum(1))
-        motion = candidate.take([int(agreement.argmax())])
-    best = float(agreement.max())
+    found = [(*_turned_to(head, pixels, common.take([0]), rng), head) for head in heads]
+    best, motion, head = max(found, key=lambda one: one[0])
     logger.info("standard orientation: correlation %.2f with the mean head of %.0f weeks", best, head.weeks)
     if best < SURE_CORRELATION:
         return None
     return Orientation(slices.with_pose(motion @ slices.planes.pose), best, head.weeks, head.scale)
+
+
+def _turned_to(
+    head: FittedHead, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
+) -> tuple[float, RigidPose]:
+    """Best correlation of all slices with a head, and the motion that gives it."""
+    agreement = np.zeros(1)
+    for turn_deg, shift_mm in ROUNDS:
+        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, turn_deg, shift_mm, rng)
+        agreement = correlation(pixels.moments(head.volume, head.grid, candidate).sum(1))
+        motion = candidate.take([int(agreement.argmax())])
+    return float(agreement.max()), motion
 
 
 def centred_on_headers(slices: Slices) -> Slices:

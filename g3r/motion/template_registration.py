@@ -70,11 +70,13 @@ class TemplatePlacement:
     Args:
         placement: of each stack.
         head: that was used.
+        heads: those of about the subject's size.
         correlation: of all slices with it, at the places found.
     """
 
     placement: list[Placement]
     head: FittedHead
+    heads: list[FittedHead]
     correlation: float
 
     def motion(self, n_slices: int, parts: list[StackPixels]) -> RigidPose:
@@ -99,7 +101,9 @@ def place_in_template(
         template: mean heads.
         rng: source of randomness.
     """
-    head = best_head(slices, parts, template)
+    heads = near_heads(slices, template)
+    few = uniform_rotations(N_ORIENTATIONS // 4)
+    head = max(heads, key=lambda one: float(_whole_correlation(parts, one, few).max()))
     whole = head_orientations(parts, head)
     # several orientations fit about as well: the headers do not hold the stacks together
     by_stack = len(whole) > 1
@@ -111,7 +115,7 @@ def place_in_template(
         own_moments(part.pixels, head.volume, head.grid, one.motion)
         for part, one in zip(parts, placement, strict=True)
     ]
-    return TemplatePlacement(placement, head, float(correlation(np.concatenate(moments).sum(0))))
+    return TemplatePlacement(placement, head, heads, float(correlation(np.concatenate(moments).sum(0))))
 
 
 def template_fits(slices: Slices, template: AtlasTemplate) -> bool:
@@ -124,13 +128,11 @@ def template_fits(slices: Slices, template: AtlasTemplate) -> bool:
     return fits
 
 
-def best_head(slices: Slices, parts: list[StackPixels], template: AtlasTemplate) -> FittedHead:
-    """The mean head, of those of about the subject's size, that some orientation fits best."""
+def near_heads(slices: Slices, template: AtlasTemplate) -> list[FittedHead]:
+    """The three mean heads of about the subject's size, scaled to it."""
     volume_mm3 = head_volume_mm3(slices)
     candidates = [fitted_head(template, n, volume_mm3) for n in range(len(template))]
-    near = sorted(candidates, key=lambda h: abs(np.log(h.scale)))[:3]
-    rotation = uniform_rotations(N_ORIENTATIONS // 4)
-    return max(near, key=lambda h: float(_whole_correlation(parts, h, rotation).max()))
+    return sorted(candidates, key=lambda head: abs(np.log(head.scale)))[:3]
 
 
 def head_volume_mm3(slices: Slices) -> float:
