@@ -97,6 +97,7 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Time what is done inside."""
         wall, cpu = time.perf_counter(), time.process_time()
         yield
         self.seconds[stage] = round(time.perf_counter() - wall, 3)
