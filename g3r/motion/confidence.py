@@ -18,8 +18,9 @@ UNSURE_HELD_OUT = 0.6
 """Correlation of a stack with a volume of the others, outline included, below which it counts as not
 registered."""
 
-UNSURE_DOUBTED_SHARE = 0.35
-"""Share of slices of a stack that fit badly above which its poses are called unsure."""
+UNSURE_DOUBTED_SHARE = 0.6
+"""Share of slices of a stack that fit badly above which its poses are called unsure; up to 0.4 in good
+reconstructions of real stacks."""
 
 DOUBTED_WEIGHT = 0.5
 
