@@ -32,6 +32,10 @@ ROUNDS = (
 WIDE_REFINEMENT = ((12.0, 5.0), (8.0, 4.0))
 """Random turns (degrees) and shifts (mm) after a search of the whole sphere."""
 
+IN_PLACE = 0.75
+"""Held-out correlation of a stack above which it is not searched for elsewhere: stacks that lie the wrong way
+reach 0.65, stacks in place 0.7 to 0.9."""
+
 MARGIN = 100.0
 """A stack's slices get motions of their own, or leave where a hypothesis put them, only for a cost (logarithm
 of odds) lower by at least this. Runs that fit noise gain 10 to 30, a single true jerk several hundred."""
@@ -173,7 +177,10 @@ def _searched_widely(
     others = posed.take(posed.stack_id != part.stack)
     target = others.planes.pixel_world_mm(others.pixel_index).mean(0)
     best = motion.take(part.rows)
-    cost = predict(part, best, volume, grid, calmest_interleave(part, best)).cost
+    present = predict(part, best, volume, grid, calmest_interleave(part, best))
+    if present.correlation > IN_PLACE:
+        return best
+    cost = present.cost
     for base in stack_orientations(part, target, volume, grid):
         found = place_around(part, base, target, volume, grid)
         for turn_deg, shift_mm in WIDE_REFINEMENT:
