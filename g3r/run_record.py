@@ -42,6 +42,8 @@ def run_record(
 ) -> dict[str, Any]:
     """run.json: what is needed to judge the result and to run it again; file names only, no paths."""
     of_stack = [slices.stack_id == n for n in range(len(stacks))]
+    # motion has an entry for each stack that has slices, which not every given one need have
+    place = {int(stack): k for k, stack in enumerate(np.unique(slices.stack_id))}
     return {
         "g3r": __version__,
         "versions": {
@@ -61,8 +63,8 @@ def run_record(
                 "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
                 "n_slices": int(chosen.sum()),
                 "pose_confidence": confidences[n].record(),
-                "interleave": motion.interleave[n],
-                "n_runs": motion.n_runs[n],
+                "interleave": motion.interleave[place[n]] if n in place else None,
+                "n_runs": motion.n_runs[place[n]] if n in place else None,
                 "n_doubted_slices": int((fit.weight[chosen] < 0.5).sum()),
             }
             for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.foreground import foreground_mask
 from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
@@ -165,23 +164,3 @@ def test_normalisation_scale_is_the_99th_percentile_of_what_was_seen():
 def test_normalisation_scale_refuses(coarse, density, message):
     with pytest.raises(InputError, match=message):
         normalisation_scale(coarse, density)
-
-
-@pytest.mark.parametrize("distance_mm", [3.0, 5.0])
-def test_the_foreground_is_the_masked_cube_even_with_gaps(distance_mm: float):
-    slices = slices_from_stacks([cube_stack(distance_mm=distance_mm)])
-    grid = VolumeGrid.isotropic([-30] * 3, [30] * 3, 1.5)
-    _, density = coarse_and_density(slices, grid)
-    mask = foreground_mask(density, slices, grid)
-    # generous on purpose (INSIDE_SHARE below one half): up to 1.5 mm more on each face, never less
-    volume_mm3 = mask.sum() * grid.voxel_volume_mm3
-    assert (SIZE_MM - 1) ** 3 < volume_mm3 < (SIZE_MM + 3) ** 3
-    middle = tuple(slice(n // 2 - 6, n // 2 + 6) for n in grid.shape)
-    assert mask[middle].all()
-
-
-def test_the_foreground_of_nothing_is_refused():
-    slices = slices_from_stacks([cube_stack()])
-    grid = VolumeGrid.isotropic([500] * 3, [520] * 3, 2.0)
-    with pytest.raises(InputError, match="no voxel is covered"):
-        foreground_mask(coarse_and_density(slices, grid)[1], slices, grid)

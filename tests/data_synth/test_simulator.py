@@ -9,7 +9,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from data_synth.motion import (
     LEVELS,
     MotionLevel,
-    acquisition_order,
     draw_residual_kind,
     residual_errors,
     slice_trajectory,
@@ -21,6 +20,7 @@ from data_synth.simulator import (
     simulate_stacks,
 )
 from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.timing import acquisition_order
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
@@ -184,12 +184,6 @@ def test_empty_mask_and_unknown_motion() -> None:
 
 
 class TestMotion:
-    @pytest.mark.parametrize("interleave", [1, 2, 3])
-    def test_every_slice_is_taken_once(self, interleave: int) -> None:
-        order = acquisition_order(11, interleave)
-        assert sorted(order) == list(range(11))
-        assert (np.diff(order)[: 11 // interleave - 1] == interleave).all()
-
     def test_neighbours_in_time_move_together(self) -> None:
         level = MotionLevel(walk_mm=1.0, walk_deg=1.0)
         rng = np.random.default_rng(0)
