@@ -143,8 +143,14 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
     assert all(seconds >= 0 for seconds in record["seconds"].values())
     assert record["peak_memory_bytes"] > 1e7
     assert record["command"]["preset"] == "draft"
-    for key in ("versions", "warnings", "notes", "loss", "motion"):
+    for key in ("versions", "warnings", "notes", "loss", "motion", "registration"):
         assert key in record
+    assert record["registration"]["trusted"] is True
+    assert record["motion"]["orientation"] in ("standard", "scanner")
+    for stack in record["stacks"]:
+        assert stack["pose_confidence"]["sure"] is True
+        assert stack["interleave"] in (1, 2, 3)
+        assert 1 <= stack["n_runs"] <= stack["n_slices"]
 
 
 def test_the_picture_is_a_picture(reconstructed: Path):
@@ -203,15 +209,44 @@ def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int
     np.testing.assert_array_equal(scaled.slices.planes.center_mm, plain.slices.planes.center_mm)
 
 
-def test_a_single_stack_keeps_its_header_poses_and_says_why(subject: Path):
+@pytest.mark.parametrize("standard", [False, True])
+def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path, standard: bool):
+    """All slices stay in line; as a whole they are turned only where the standard orientation is wanted."""
     stack = load_stack(files(subject, "stack")[0], files(subject, "mask")[0], 4.0)
-    result = GaussianReconstructor(settings=quick_settings()).reconstruct([stack])
+    settings = quick_settings()
+    settings = replace(settings, motion=replace(settings.motion, standard_orientation=standard))
+    result = GaussianReconstructor(settings=settings).reconstruct([stack])
     assert any("single stack" in note for note in result.record["notes"])
     motion = result.slices.world_from_header()
-    np.testing.assert_allclose(motion.translation_mm, 0, atol=1e-9)
-    np.testing.assert_allclose(motion.rotvec_rad(), 0, atol=1e-9)
+    relative = motion.take([0]).inverse() @ motion if standard else motion
+    np.testing.assert_allclose(relative.translation_mm, 0, atol=1e-6)
+    np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=1e-7)
+    assert result.record["motion"]["orientation"] == ("standard" if standard else "scanner")
+    assert result.record["stacks"][0]["pose_confidence"]["held_out_correlation"] is None
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].std() > 0
+
+
+def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Path):
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    few = np.zeros_like(stacks[0].mask)
+    few[20:23, 20:23, 5] = True
+    settings = quick_settings()
+    motion = replace(
+        settings.motion, template=False, network=False, stacks=False, runs=False, n_rounds=1
+    )  # fmt: skip
+    settings = replace(settings, resolution_mm=2.5, motion=motion)
+    result = GaussianReconstructor(settings=settings).reconstruct(
+        [replace(stacks[0], mask=few), stacks[1], stacks[2]]
+    )
+    record = result.record
+    assert [one["n_slices"] > 0 for one in record["stacks"]] == [False, True, True]
+    assert record["stacks"][0]["interleave"] is None
+    assert record["stacks"][0]["pose_confidence"]["sure"] is False
+    assert record["stacks"][2]["n_runs"] == 1
+    assert any(stacks[0].name in line for line in record["warnings"])
 
 
 def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):

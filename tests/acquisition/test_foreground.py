@@ -1,0 +1,170 @@
+"""The mask of the result: the slices vote, each where it lies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import label
+
+from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.geometry import RigidPose, VolumeGrid
+
+RADII_MM = np.array([27.0, 32.0, 24.0])
+TRUE_MM3 = 4 / 3 * np.pi * RADII_MM.prod()
+GRID = VolumeGrid.isotropic([-42] * 3, [42] * 3, 1.5)
+WORLD = GRID.world(np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1))
+TURNS = (
+    np.eye(3),
+    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+)
+
+
+def depth(world: np.ndarray) -> np.ndarray:
+    """1 at the ellipsoid's middle, 0 on its surface."""
+    return 1 - np.linalg.norm(world / RADII_MM, axis=-1)
+
+
+def ellipsoid_stack(
+    turn: np.ndarray = TURNS[0],
+    *,
+    thickness_mm: float = 3.0,
+    gap_mm: float = 0.0,
+    left_handed: bool = False,
+    low_mm: float = -44.0,
+    hole: bool = False,
+) -> Stack:
+    """A stack that covers the ellipsoid from `low_mm` upwards along its third axis."""
+    spacing = np.array([1.2, 1.2, thickness_mm + gap_mm])
+    n = np.append(np.full(2, 74), int((44 - low_mm) / spacing[2]))
+    axes = turn * ([1, 1, -1] if left_handed else [1, 1, 1])
+    affine = np.eye(4)
+    affine[:3, :3] = axes * spacing
+    corner = np.array([-43.8, -43.8, -44.0 if left_handed else low_mm])
+    affine[:3, 3] = axes @ corner
+    index = np.stack(np.meshgrid(*[np.arange(k) for k in n], indexing="ij"), -1)
+    world = VolumeGrid(tuple(n), affine).world(index)
+    mask = depth(world) > 0
+    if hole:
+        mask &= np.linalg.norm(world, axis=-1) > 5
+    image = (100 + index.sum(-1)).astype(np.float32)
+    return Stack(image, mask, affine, thickness_mm)
+
+
+def volume_of(mask: np.ndarray) -> float:
+    return float(mask.sum() * GRID.voxel_volume_mm3)
+
+
+@pytest.mark.parametrize("n_stacks", [1, 2, 3])
+@pytest.mark.parametrize(("thickness_mm", "gap_mm"), [(2.2, 0.0), (4.0, 0.0), (3.0, 2.0)])
+def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: float):
+    stacks = [ellipsoid_stack(t, thickness_mm=thickness_mm, gap_mm=gap_mm) for t in TURNS[:n_stacks]]
+    mask = foreground_mask(slices_from_stacks(stacks), GRID)
+    # generous (INSIDE_SHARE below one half) by a share of the slice distance, with one stack as with three
+    excess_mm = np.cbrt(RADII_MM.prod()) * (np.cbrt(volume_of(mask) / TRUE_MM3) - 1)
+    assert 0 < excess_mm < 0.27 * (thickness_mm + gap_mm)
+    if thickness_mm + gap_mm < 3:
+        assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.08)
+    assert mask[depth(WORLD) > 0.05].all()  # gaps are closed
+    assert not mask[depth(WORLD) < -0.2].any()
+    assert label(mask)[1] == 1
+
+
+def test_a_left_handed_header_ends_where_a_right_handed_one_does():
+    right, left = (
+        foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)]), GRID)
+        for flag in (False, True)
+    )
+    assert volume_of(left) == pytest.approx(volume_of(right), rel=0.02)
+    assert (left != right).sum() < 0.05 * right.sum()
+
+
+def test_beyond_the_ends_of_a_stack_there_is_no_brain():
+    """The slices end inside of the head: the mask ends with them, not half a slice distance later."""
+    slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)])
+    mask = foreground_mask(slices, GRID)
+    assert mask[(WORLD[..., 2] > 2) & (depth(WORLD) > 0.15)].all()
+    assert not mask[WORLD[..., 2] < -3.5].any()
+
+
+def test_a_slice_without_weight_has_no_vote():
+    """A slice that lies wrongly would put brain beside the head and a hole into it."""
+    slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
+    good = foreground_mask(slices, GRID)
+    away = np.abs(slices.planes.center_mm @ TURNS[0][:, 2]) < 8
+    away &= slices.stack_id == 0
+    assert 3 <= away.sum() <= 6
+    center = slices.planes.center_mm.copy()
+    center[away] += [0, 0, 24.0]
+    astray = slices.with_pose(RigidPose(slices.planes.rotation, center))
+    weight = np.where(away, 0.0, 1.0)
+    trusting, careful = foreground_mask(astray, GRID), foreground_mask(astray, GRID, weight)
+    assert (careful != good).sum() < 0.5 * (trusting != good).sum()
+    # where they lie or what they show makes no difference
+    elsewhere = slices.with_pose(RigidPose(slices.planes.rotation, center + away[:, None] * 5.0))
+    np.testing.assert_array_equal(foreground_mask(elsewhere, GRID, weight), careful)
+    half = foreground_mask(slices, GRID, np.full(len(slices), 0.5))
+    assert (half != good).mean() < 0.002  # a common factor says nothing
+
+
+def test_what_one_stack_alone_has_seen_stays_inside():
+    """Partial coverage: two stacks that stop half-way have no say in what they did not cover."""
+    whole = ellipsoid_stack(TURNS[0])
+    partly = [ellipsoid_stack(t, low_mm=0.0) for t in TURNS[1:]]
+    slices = slices_from_stacks([whole, *partly])
+    mask = foreground_mask(slices, GRID)
+    uncovered = (WORLD @ TURNS[1][:, 2] < -8) & (WORLD @ TURNS[2][:, 2] < -8) & (depth(WORLD) > 0.1)
+    assert uncovered.sum() > 500
+    assert mask[uncovered].all()
+    assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.08)
+
+
+def test_what_most_stacks_call_outside_is_outside():
+    stacks = [ellipsoid_stack(t) for t in TURNS]
+    spilt = stacks[0].mask | (np.arange(stacks[0].mask.shape[0]) < 22)[:, None, None]
+    wrong = replace(stacks[0], mask=spilt)
+    many = [wrong, *stacks[1:], *stacks[1:]]
+    mask = foreground_mask(slices_from_stacks(many), GRID)
+    # the others' surroundings reach a few mm beyond their masks; there they outvote the one
+    near = (depth(WORLD) < -0.12) & (depth(WORLD) > -0.2)
+    assert mask[near].mean() < 0.1
+
+
+def test_holes_are_filled_and_only_the_largest_piece_stays():
+    whole, stack = slices_from_stacks([ellipsoid_stack()]), ellipsoid_stack(hole=True)
+    crumb = stack.mask.copy()
+    crumb[2:8, 2:8, 4:7] = True
+    mask = foreground_mask(slices_from_stacks([replace(stack, mask=crumb)]), GRID)
+    assert mask[np.linalg.norm(WORLD, axis=-1) < 5].all()
+    assert label(mask)[1] == 1
+    assert volume_of(mask) == pytest.approx(volume_of(foreground_mask(whole, GRID)), rel=0.01)
+
+
+def test_the_mask_moves_with_the_slices():
+    slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
+    shift = np.array([3.0, -4.5, 1.5])  # whole voxels
+    moved = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + shift))
+    here, there = foreground_mask(slices, GRID), foreground_mask(moved, GRID)
+    np.testing.assert_array_equal(np.roll(here, (2, -3, 1), (0, 1, 2)), there)
+
+
+@pytest.mark.parametrize("n_slices", [1, 2])
+def test_one_or_two_slices_are_enough(n_slices: int):
+    slices = slices_from_stacks([ellipsoid_stack()])
+    middle = int(np.argmin(np.abs(slices.planes.center_mm[:, 2])))
+    few = slices.take(np.arange(middle, middle + n_slices))
+    mask = foreground_mask(few, GRID)
+    thickness_mm = volume_of(mask) / (np.pi * RADII_MM[0] * RADII_MM[1])
+    assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 6  # beyond a lone slice nobody is asked
+
+
+def test_the_foreground_of_nothing_is_refused():
+    slices = slices_from_stacks([ellipsoid_stack()])
+    far = VolumeGrid.isotropic([500] * 3, [520] * 3, 2.0)
+    with pytest.raises(InputError, match="no voxel is covered"):
+        foreground_mask(slices, far)
+    with pytest.raises(InputError, match="no voxel is covered"):
+        foreground_mask(slices, GRID, np.zeros(len(slices)))
