@@ -15,10 +15,10 @@ from g3r.errors import InputError
 from g3r.geometry import RigidPose
 from g3r.prior.pose_geometry import moved_points, pixel_points_mm, rotation_from_vector, sample_rows
 from g3r.prior.pose_inference import (
-    N_REFINEMENTS,
     SLICE_POINTS_MM,
     as_pose,
     pose_errors,
+    poses_of,
     stack_motions,
 )
 from g3r.prior.pose_network import PoseNetwork, PoseStep
@@ -132,12 +132,12 @@ class PoseModule(AnnealedModule):
         self._scores = []
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score one head: errors of slices after each step, and of stacks after the robust fit."""
-        poses = self.network(batch, N_REFINEMENTS)
-        self._scores.append(scores_of(poses, batch))
-        self.log("val/mm_loss", point_loss(poses[-1], batch), batch_size=1)
+        """Score one head: errors of slices, as inference finds them, and of stacks after the robust fit."""
+        steps = self.network(batch)
+        self._scores.append(scores_of(as_pose(*steps[0][:2]), poses_of(self.network, batch), batch))
+        self.log("val/mm_loss", point_loss(steps[-1], batch), batch_size=1)
         if batch_idx == 0:
-            self._panel = panel(poses[-1], batch, self.network)
+            self._panel = panel(steps[-1], batch, self.network)
 
     def on_validation_epoch_end(self) -> None:
         """Log medians over all slices and stacks, and by the number of stacks; send the row of images."""
@@ -243,10 +243,9 @@ def vote_loss(step: PoseStep, batch: Batch) -> Tensor:
     return (weight * squared).mean() / weight.mean()
 
 
-def scores_of(poses: Sequence[PoseStep], batch: Batch) -> dict[str, np.ndarray]:
-    """Errors of one head's slices (mm, degrees) after the first and last step, and of its stacks."""
+def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.ndarray]:
+    """Errors of one head's slices (mm, degrees) after the first step and at last, and of its stacks."""
     true = as_pose(batch["true_rotation"], batch["true_translation_mm"])
-    first, last = as_pose(*poses[0][:2]), as_pose(*poses[-1][:2])
     stack = batch["stack"].cpu().numpy()
     rotation = batch["header_rotation"].double().cpu().numpy()
     header = as_pose(

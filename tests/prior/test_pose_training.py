@@ -17,6 +17,7 @@ lightning = pytest.importorskip("lightning.pytorch", reason="the training extra 
 from lightning.pytorch.loggers import TensorBoardLogger  # noqa: E402
 from torch.utils.data import DataLoader  # noqa: E402
 
+from g3r.prior.pose_inference import as_pose  # noqa: E402
 from g3r.prior.pose_module import (  # noqa: E402
     PoseModule,
     disturbed,
@@ -171,7 +172,8 @@ def test_losses_and_scores_of_true_poses():
     step = exact_step(batch)
     assert float(point_loss(step, batch)) == pytest.approx(0.01)  # the root's softening
     assert float(vote_loss(step, batch)) == 0.0
-    scores = summary([scores_of([step, step], batch)])
+    true = as_pose(step.rotation, step.translation_mm)
+    scores = summary([scores_of(true, true, batch)])
     assert scores["slice_mm"] < 1e-3
     assert scores["stack_deg_2"] < 1e-2
     assert scores["stacks_within_20deg"] == 1.0
