@@ -120,7 +120,8 @@ class GaussianReconstructor:
         notes += left_out_notes(stacks, slices)
         first_scale = _percentile_scale(slices)
         slices = slices.scaled(1 / first_scale)
-        if len(stacks) == 1:
+        single = len(np.unique(slices.stack_id)) == 1
+        if single:
             # registered to a volume made of themselves, slices of a single stack drift
             settings = replace(
                 settings,
@@ -143,7 +144,7 @@ class GaussianReconstructor:
             prior = self._prior(start)
             self.progress("prior", 1, 1)
         gain, scale = motion.gain, start.scale
-        if len(stacks) == 1 and settings.use_prior and settings.motion.runs:
+        if single and settings.use_prior and settings.motion.runs:
             with clock("slices to prior"):
                 nudged, gain, believed = register_to_prior(start.slices, gain, prior, start.grid)
                 if believed:
@@ -154,6 +155,8 @@ class GaussianReconstructor:
                 "slices of the single stack were registered to the prior volume" if believed else
                 "slices of the single stack stay in line: the prior volume gives no reason to move them"
             )  # fmt: skip
+        elif single:
+            notes.append("slices of the single stack stay where the mean head or the header has them")
         slices, prior_mask, prior_grid = start.slices, start.mask, start.grid
         coarse, density = start.coarse, start.density
         with clock("fit to prior"):

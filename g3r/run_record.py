@@ -19,7 +19,7 @@ from g3r.acquisition.planes import SMALLEST_SLICE_PIXELS, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.slice_stage import SliceFit
 from g3r.motion import MotionEstimate
-from g3r.motion.confidence import StackConfidence, registration_summary
+from g3r.motion.confidence import StackConfidence, registration_summary, registration_trusted
 from g3r.presets import ReconstructionSettings
 from g3r.prior import PriorCheckpoint
 from g3r.prior.pose_checkpoint import PoseCheckpoint
@@ -72,7 +72,7 @@ def run_record(
         "shading": fit.shading,
         "n_gaussians": len(fit.cloud),
         "registration": {
-            "trusted": all(one.sure for one in confidences),
+            "trusted": registration_trusted(confidences),
             "summary": registration_summary(confidences),
         },
         "motion": {

@@ -14,7 +14,7 @@ from g3r.geometry import VolumeGrid
 INSIDE_SHARE = 1 / 3
 """Share of the slices over a voxel that must call it brain: one of three stacks. At one half, where the edge
 of a mask lies, the volume is right to 1 %, but the outermost voxels are lost here and there, and with them 1
-to 4 dB; this is generous by half a voxel (3 to 6 % more volume; docs/method.md, "Mask")."""
+to 4 dB; this is generous by about a quarter of the distance of slices (docs/method.md, "Mask")."""
 
 LEAST_DENSITY = 0.1
 """Coverage (1 is one gapless stack) below which nobody is asked: what no slice has seen is not brain."""
@@ -89,14 +89,11 @@ def _ends(slices: Slices) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     ends, steps = [], []
     for stack in np.unique(slices.stack_id):
         rows = np.flatnonzero(slices.stack_id == stack)
-        if len(rows) < 2:
-            continue
         header = slices.header_pose
         along = header.translation_mm[rows[-1]] - header.translation_mm[rows[0]]
         normal = header.rotation[rows[0]][:, 2]
-        step_mm = float(along @ normal) / max(
-            int(slices.slice_index[rows[-1]] - slices.slice_index[rows[0]]), 1
-        )
+        n_steps = int(slices.slice_index[rows[-1]] - slices.slice_index[rows[0]])
+        step_mm = float(along @ normal) / n_steps if n_steps else float(slices.thickness_mm[rows[0]])
         for row, sign in ((rows[0], -1.0), (rows[-1], 1.0)):
             ends.append(row)
             steps.append(sign * step_mm * slices.planes.rotation[row][:, 2])

@@ -14,7 +14,7 @@ from g3r.motion.estimate import MotionEstimate
 UNSURE_NCC = 0.85
 """Median correlation of a stack's slices with the volume below which its poses are called unsure."""
 
-UNSURE_HELD_OUT = 0.6
+UNSURE_HELD_OUT = 0.65
 """Correlation of a stack with a volume of the others, outline included, below which it counts as not
 registered."""
 
@@ -30,13 +30,14 @@ class StackConfidence:
     """What speaks for the poses of one stack.
 
     Args:
-        sure: whether every figure is where it is for stacks that are registered.
+        sure: whether every figure is where it is for stacks that are registered; None for a single stack,
+            which nothing checks.
         held_out_correlation: with a volume of the other stacks; None for a single stack.
         median_slice_ncc: of its slices with the volume of all; None without slices.
         doubted_share: slices that weigh less than a half.
     """
 
-    sure: bool
+    sure: bool | None
     held_out_correlation: float | None
     median_slice_ncc: float | None
     doubted_share: float
@@ -58,9 +59,9 @@ def stack_confidences(motion: MotionEstimate, n_stacks: int) -> list[StackConfid
         held_out = None if motion.held_out is None else motion.held_out[present.index(n)]
         ncc = float(np.median(motion.ncc[of_stack]))
         doubted = float((motion.weight[of_stack] < DOUBTED_WEIGHT).mean())
-        sure = held_out is None or (
-            held_out >= UNSURE_HELD_OUT and ncc >= UNSURE_NCC and doubted <= UNSURE_DOUBTED_SHARE
-        )
+        sure = None
+        if held_out is not None:
+            sure = held_out >= UNSURE_HELD_OUT and ncc >= UNSURE_NCC and doubted <= UNSURE_DOUBTED_SHARE
         found.append(StackConfidence(sure, held_out, ncc, doubted))
     return found
 
@@ -73,7 +74,7 @@ def pose_warnings(
     for stack, one in zip(stacks, confidences, strict=True):
         if one.median_slice_ncc is None:
             lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
-        elif not one.sure:
+        elif one.sure is False:
             lines.append(
                 f"{stack.name}: registration probably failed (correlation with the other stacks "
                 f"{one.held_out_correlation:.2f}, of its slices with the volume {one.median_slice_ncc:.2f}, "
@@ -82,11 +83,18 @@ def pose_warnings(
     return lines
 
 
+def registration_trusted(confidences: Sequence[StackConfidence]) -> bool | None:
+    """Whether all stacks are sure; None where nothing checks them (a single stack)."""
+    if any(one.sure is False for one in confidences):
+        return False
+    return True if all(one.sure for one in confidences) else None
+
+
 def registration_summary(confidences: Sequence[StackConfidence]) -> str:
     """One line on all stacks."""
-    if len(confidences) == 1:
-        return "a single stack: slices stay where the header says, nothing checks them"
-    n_sure = sum(one.sure for one in confidences)
+    if registration_trusted(confidences) is None:
+        return "a single stack: no other stack checks where its slices lie"
+    n_sure = sum(bool(one.sure) for one in confidences)
     figures = ", ".join(
         "none" if one.held_out_correlation is None else f"{one.held_out_correlation:.2f}"
         for one in confidences

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,54 +13,16 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.template import AtlasTemplate
 from g3r.geometry import RigidPose
 from g3r.motion.flattening import flattened
-from g3r.motion.hypotheses import (
-    MARGIN,
-    choose,
-    in_frame_of,
-    judge,
-    moved,
-    one_motion_or_runs,
-    settle,
-    simplify,
-)
+from g3r.motion.hypotheses import calmest_interleave, in_frame_of, judge, moved, put
 from g3r.motion.orientation import Orientation, centred_on_headers, standard_orientation
 from g3r.motion.placement import StackPixels
-from g3r.motion.slice_rounds import SliceRounds, refine_slices
-from g3r.motion.stack_registration import register_stacks
-from g3r.motion.template_registration import TemplatePlacement, place_in_template, template_fits
+from g3r.motion.runs import SAME_PLACE_MM, changes_in_time
+from g3r.motion.search import search, search_single
+from g3r.motion.settings import MotionSettings
+from g3r.motion.slice_rounds import FittedSlices, SliceRounds, refine_slices
+from g3r.motion.template_registration import template_fits
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class MotionSettings:
-    """Which layers run, and how long they search.
-
-    Args:
-        flatten: divide slow trends of intensity out of each stack before it is registered.
-        template: place runs of slices in mean heads (needs a template); gives the standard orientation.
-        network: consider the pose network's proposal.
-        stacks: consider stacks registered to each other from many starts.
-        runs: place runs of slices again in the volume of the other stacks.
-        n_rounds: alternations of volume and slices; 0 leaves the slices where the runs are.
-        steps_per_round: Gauss-Newton steps of the slices in a round.
-        finest_voxel_mm: voxel of the last rounds.
-        pixels_at_most: masked pixels in use; larger subjects are thinned on coarse levels.
-        standard_orientation: turn the result into the atlas frame; otherwise it stays in scanner space.
-        seed: of the random search.
-    """
-
-    flatten: bool = True
-    template: bool = True
-    network: bool = True
-    stacks: bool = True
-    runs: bool = True
-    n_rounds: int = 12
-    steps_per_round: int = 5
-    finest_voxel_mm: float = 1.2
-    pixels_at_most: int = 400_000
-    standard_orientation: bool = True
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -74,7 +36,7 @@ class MotionEstimate:
             None for a single stack.
         hypothesis: where the search started.
         hypotheses: held-out correlation of every hypothesis, stack by stack.
-        interleave: of each stack, as its motion suggests.
+        interleave: of each stack, as its motion suggests; None where it lay still, which suggests nothing.
         n_runs: of each stack, between jerks; 1 where it lay still.
         orientation: how the result was turned; None where it stays in scanner space.
         history: one line of figures a round.
@@ -87,7 +49,7 @@ class MotionEstimate:
     held_out: list[float] | None
     hypothesis: str
     hypotheses: dict[str, list[float]]
-    interleave: list[int]
+    interleave: list[int | None]
     n_runs: list[int]
     orientation: Orientation | None
     history: list[dict[str, float]] = field(default_factory=list)
@@ -110,49 +72,19 @@ def estimate_motion(
         template: mean heads; None leaves that layer out.
         proposals: motions [K] (world from header) by other means, such as the pose network, by name.
     """
-    rng = np.random.default_rng(settings.seed)
     given = slices
     if settings.flatten:
         slices = flattened(slices)
     parts = StackPixels.of_all(slices)
     single = len(parts) == 1
-    still = RigidPose.identity(len(slices))
-    placed: TemplatePlacement | None = None
-    if template is not None and settings.template and template_fits(slices, template):
-        placed = place_in_template(slices, parts, template, rng)
-
-    motion, name, judged, interleave, n_runs = still, "headers", {}, [1] * len(parts), [1] * len(parts)
-    if not single:
-        hypotheses = {"headers": still}
-        if placed is not None:
-            hypotheses["template"] = placed.motion(len(slices), parts)
-        if settings.network:
-            hypotheses |= dict(proposals or {})
-        if settings.stacks:
-            hypotheses["stacks"] = register_stacks(slices)[0].world_from_header()
-        name, judgements = choose(slices, parts, hypotheses)
-        judged = {key: [p.correlation for p in value.prediction] for key, value in judgements.items()}
-        motion = hypotheses[name]
-        if settings.runs:
-            rivals = [in_frame_of(slices, motion, other) for key, other in hypotheses.items() if key != name]
-            motion, placements = settle(slices, parts, motion, rivals, rng)
-            interleave = [one.runs.interleave for one in placements]
-            motion, shares_one = simplify(slices, parts, motion, interleave)
-            n_runs = [
-                1 if one_motion else one.runs.n_runs
-                for one, one_motion in zip(placements, shares_one, strict=True)
-            ]
-            if judge(slices, parts, motion).cost > judgements[name].cost - MARGIN:
-                motion, n_runs = hypotheses[name], [1] * len(parts)
-    elif placed is not None and settings.runs:
-        # no other stack holds a single one together; a mean head does, roughly
-        only, head = placed.placement[0], placed.head
-        interleave = [only.runs.interleave]
-        motion, is_one = one_motion_or_runs(
-            slices, parts[0], only.motion, interleave[0], head.volume, head.grid
-        )
-        n_runs = [1 if is_one else only.runs.n_runs]
-        name = "headers" if is_one else "template"
+    if template is not None and not (settings.template and template_fits(slices, template)):
+        template = None
+    if single:
+        found = search_single(slices, parts[0], settings, template)
+    else:
+        found = search(slices, parts, settings, template, proposals or {})
+    motion, placed = found.motion, found.placed
+    n_runs, interleave = _runs_of(parts, motion)
     posed = moved(slices, motion)
     rounds = SliceRounds(
         0 if single else settings.n_rounds, settings.steps_per_round, settings.finest_voxel_mm,
@@ -161,15 +93,57 @@ def estimate_motion(
     fitted = refine_slices(posed, rounds, progress)
     held_out = None
     if not single:
-        final = judge(slices, parts, fitted.slices.world_from_header())
-        held_out = [p.correlation for p in final.prediction]
+        fitted, held_out = _kept_where_better(slices, parts, motion, fitted)
     orientation = None
     if placed is not None and settings.standard_orientation:
         start = placed.motion(len(slices), parts)
+        rng = np.random.default_rng(settings.seed)
         orientation = standard_orientation(fitted.slices, placed.heads, start, rng)
     posed = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
     result = given.with_pose(posed.planes.pose)
     return MotionEstimate(
-        result, fitted.gain, fitted.weight, fitted.ncc, held_out, name, judged, interleave, n_runs,
-        orientation, fitted.history,
+        result, fitted.gain, fitted.weight, fitted.ncc, held_out, found.hypothesis, found.hypotheses,
+        interleave, n_runs, orientation, fitted.history,
     )  # fmt: skip
+
+
+LARGEST_LOSS = 0.02
+"""A stack whose held-out correlation falls by more than this as its slices move goes back to its runs."""
+
+
+def _kept_where_better(
+    slices: Slices, parts: list[StackPixels], motion: RigidPose, fitted: FittedSlices
+) -> tuple[FittedSlices, list[float]]:
+    """The fitted slices, stacks that lost by it back at their runs, and held-out correlations.
+
+    Slices of few pixels and thick ones fit noise, and where nothing moved there is nothing to gain.
+    """
+    before = judge(slices, parts, motion)
+    refined = fitted.slices.world_from_header()
+    after = judge(slices, parts, refined)
+    lost = [
+        part
+        for part, old, new in zip(parts, before.prediction, after.prediction, strict=True)
+        if new.correlation < old.correlation - LARGEST_LOSS
+    ]
+    if not lost:
+        return fitted, [p.correlation for p in after.prediction]
+    # the refined slices as a whole may have drifted from the runs; stacks that go back must follow
+    motion = in_frame_of(slices, refined, motion)
+    for part in lost:
+        logger.info("stack %d: slices go back to their runs", part.stack)
+        refined = put(refined, part.rows, motion.take(part.rows))
+    final = judge(slices, parts, refined)
+    return replace(fitted, slices=moved(slices, refined)), [p.correlation for p in final.prediction]
+
+
+def _runs_of(parts: list[StackPixels], motion: RigidPose) -> tuple[list[int], list[int | None]]:
+    """Number of runs of each stack, and the acquisition order under which they are fewest."""
+    n_runs, interleave = [], list[int | None]()
+    for part in parts:
+        own = motion.take(part.rows)
+        order = calmest_interleave(part, own)
+        moves = changes_in_time(own, part.slice_index, part.pixels.center_mm, order)
+        n_runs.append(1 + int((moves > SAME_PLACE_MM).sum()))
+        interleave.append(order if n_runs[-1] > 1 else None)
+    return n_runs, interleave

@@ -150,7 +150,7 @@ def settle(
     """
     placements: list[Placement] = []
     for part in parts:
-        motion = _put(motion, part.rows, _searched_widely(slices, part, motion, rng))
+        motion = put(motion, part.rows, _searched_widely(slices, part, motion, rng))
     for number, (turn_deg, shift_mm, voxel_mm) in enumerate(ROUNDS):
         placements = []
         for part in parts:
@@ -160,7 +160,7 @@ def settle(
                 part, motion.take(part.rows), volume, grid,
                 turn_deg=turn_deg, shift_mm=shift_mm, rng=rng, proposals=rival,
             )  # fmt: skip
-            motion = _put(motion, part.rows, one.motion)
+            motion = put(motion, part.rows, one.motion)
             placements.append(one)
     return motion, placements
 
@@ -207,7 +207,7 @@ def simplify(
         posed = moved(slices, motion)
         volume, grid = volume_without(posed, part.stack, 2.4)
         own, is_one = one_motion_or_runs(slices, part, motion.take(part.rows), order, volume, grid)
-        motion = _put(motion, part.rows, own)
+        motion = put(motion, part.rows, own)
         shared.append(is_one)
     return motion, shared
 
@@ -250,7 +250,8 @@ def _one_motion(stack: Slices, motion: RigidPose, volume: NDArray[np.float32], g
     return pose @ stack.header_pose.inverse()
 
 
-def _put(motion: RigidPose, rows: NDArray[np.int64], new: RigidPose) -> RigidPose:
+def put(motion: RigidPose, rows: NDArray[np.int64], new: RigidPose) -> RigidPose:
+    """Motions [K] with those of some rows replaced."""
     rotation, translation = motion.rotation.copy(), motion.translation_mm.copy()
     rotation[rows], translation[rows] = new.rotation, new.translation_mm
     return RigidPose(rotation, translation)

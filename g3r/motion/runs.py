@@ -31,6 +31,9 @@ DISTANCE_PRICE = 8.0
 STEADY_MM = 4.0
 """Below about this, movement between slices is ordinary."""
 
+SAME_PLACE_MM = 1e-3
+"""Motions nearer to each other than this are one."""
+
 WINDOW = 5
 """Slices in time that are looked at together when candidates are chosen."""
 BEST_PER_WINDOW = 6
@@ -121,19 +124,16 @@ def changes_in_time(
     motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64], interleave: int
 ) -> NDArray[np.float64]:
     """How far the head moved [K - 1] (mm) between slices of a stack that were taken one after the other."""
-    order = time_orders(slice_index)[interleave]
-    ordered = motion.take(order)
-    return np.array(
-        [
-            head_distance_mm(ordered.take([t]), ordered.take([t + 1]), center_mm)[0, 0]
-            for t in range(len(order) - 1)
-        ]
-    )
+    ordered = motion.take(time_orders(slice_index)[interleave])
+    place = ordered.rotation @ center_mm + ordered.translation_mm
+    shift = (np.diff(place, axis=0) ** 2).sum(1)
+    trace = np.einsum("tij,tij->t", ordered.rotation[:-1], ordered.rotation[1:])
+    return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
 def price_of_changes(distance_mm: NDArray[np.float64]) -> float:
     """Price of all movements [K - 1] (mm) of a stack; none costs nothing."""
-    return float(_price(distance_mm[distance_mm > 1e-3]).sum())
+    return float(_price(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
 
 
 def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:
@@ -144,7 +144,7 @@ def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -
     found = [cost.argmin(1)]
     for order in orders.values():
         running = np.concatenate([np.zeros((1, cost.shape[1])), np.cumsum(cost[order], axis=0)])
-        for first in range(0, n - width + 1, 2):
+        for first in {*range(0, n - width + 1, 2), n - width}:
             window = running[first + width] - running[first]
             found.append(np.argpartition(window, count - 1)[:count])
     return np.unique(np.concatenate(found))
