@@ -93,7 +93,8 @@ def estimate_motion(
     fitted = refine_slices(posed, rounds, progress)
     held_out = None
     if not single:
-        fitted, held_out = _kept_where_better(slices, parts, motion, fitted)
+        still = [part.stack for part, n in zip(parts, n_runs, strict=True) if n == 1]
+        fitted, held_out = _kept_where_better(slices, parts, still, motion, fitted)
     orientation = None
     if placed is not None and settings.standard_orientation:
         start = placed.motion(len(slices), parts)
@@ -108,15 +109,20 @@ def estimate_motion(
 
 
 LARGEST_LOSS = 0.02
-"""A stack whose held-out correlation falls by more than this as its slices move goes back to its runs."""
+"""A still stack whose held-out correlation falls by more than this as its slices move goes back in line."""
 
 
 def _kept_where_better(
-    slices: Slices, parts: list[StackPixels], motion: RigidPose, fitted: FittedSlices
+    slices: Slices,
+    parts: list[StackPixels],
+    still: list[int],
+    motion: RigidPose,
+    fitted: FittedSlices,
 ) -> tuple[FittedSlices, list[float]]:
-    """The fitted slices, stacks that lost by it back at their runs, and held-out correlations.
+    """The fitted slices, still stacks that lost by it back in line, and held-out correlations of all.
 
-    Slices of few pixels and thick ones fit noise, and where nothing moved there is nothing to gain.
+    Small and thick slices fit noise, and where nothing moved there is nothing to gain. Stacks that did move
+    are not asked: a few slices that went astray lower their correlation, while all others gain.
     """
     before = judge(slices, parts, motion)
     refined = fitted.slices.world_from_header()
@@ -124,14 +130,14 @@ def _kept_where_better(
     lost = [
         part
         for part, old, new in zip(parts, before.prediction, after.prediction, strict=True)
-        if new.correlation < old.correlation - LARGEST_LOSS
+        if part.stack in still and new.correlation < old.correlation - LARGEST_LOSS
     ]
     if not lost:
         return fitted, [p.correlation for p in after.prediction]
     # the refined slices as a whole may have drifted from the runs; stacks that go back must follow
     motion = in_frame_of(slices, refined, motion)
     for part in lost:
-        logger.info("stack %d: slices go back to their runs", part.stack)
+        logger.info("stack %d: slices go back in line", part.stack)
         refined = put(refined, part.rows, motion.take(part.rows))
     final = judge(slices, parts, refined)
     return replace(fitted, slices=moved(slices, refined)), [p.correlation for p in final.prediction]
