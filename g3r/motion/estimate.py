@@ -19,7 +19,7 @@ from g3r.motion.placement import StackPixels
 from g3r.motion.runs import SAME_PLACE_MM, changes_in_time
 from g3r.motion.search import search, search_single
 from g3r.motion.settings import MotionSettings
-from g3r.motion.slice_rounds import FittedSlices, SliceRounds, refine_slices
+from g3r.motion.slice_rounds import FittedSlices, SliceRounds, correlation_with_all, refine_slices
 from g3r.motion.template_registration import template_fits
 
 logger = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ def estimate_motion(
     held_out = None
     if not single:
         still = [part.stack for part, n in zip(parts, n_runs, strict=True) if n == 1]
-        fitted, held_out = _kept_where_better(slices, parts, still, motion, fitted)
+        fitted, held_out = _kept_where_better(slices, parts, still, motion, fitted, settings.finest_voxel_mm)
     orientation = None
     if placed is not None and settings.standard_orientation:
         start = placed.motion(len(slices), parts)
@@ -111,6 +111,10 @@ def estimate_motion(
 LARGEST_LOSS = 0.02
 """A still stack whose held-out correlation falls by more than this as its slices move goes back in line."""
 
+LEAST_GAIN_NCC = 0.015
+"""... and so does one whose slices correlate better with the volume of all by less than this, in the median:
+0.004 to 0.010 where nothing moved (they fit noise), 0.02 to 0.05 with mild motion."""
+
 
 def _kept_where_better(
     slices: Slices,
@@ -118,6 +122,7 @@ def _kept_where_better(
     still: list[int],
     motion: RigidPose,
     fitted: FittedSlices,
+    voxel_mm: float,
 ) -> tuple[FittedSlices, list[float]]:
     """The fitted slices, still stacks that lost by it back in line, and held-out correlations of all.
 
@@ -126,21 +131,30 @@ def _kept_where_better(
     """
     before = judge(slices, parts, motion)
     refined = fitted.slices.world_from_header()
+    equal = np.ones(len(slices))
+    in_line = correlation_with_all(moved(slices, motion), equal, equal, voxel_mm)
     after = judge(slices, parts, refined)
     lost = [
         part
         for part, old, new in zip(parts, before.prediction, after.prediction, strict=True)
-        if part.stack in still and new.correlation < old.correlation - LARGEST_LOSS
+        if part.stack in still
+        and (
+            new.correlation < old.correlation - LARGEST_LOSS
+            or np.median(fitted.ncc[part.rows]) < np.median(in_line[part.rows]) + LEAST_GAIN_NCC
+        )
     ]
     if not lost:
         return fitted, [p.correlation for p in after.prediction]
     # the refined slices as a whole may have drifted from the runs; stacks that go back must follow
     motion = in_frame_of(slices, refined, motion)
+    gain, weight = fitted.gain.copy(), fitted.weight.copy()
     for part in lost:
         logger.info("stack %d: slices go back in line", part.stack)
         refined = put(refined, part.rows, motion.take(part.rows))
+        gain[part.rows], weight[part.rows] = 1.0, 1.0  # what the refined poses said of them
     final = judge(slices, parts, refined)
-    return replace(fitted, slices=moved(slices, refined)), [p.correlation for p in final.prediction]
+    kept = replace(fitted, slices=moved(slices, refined), gain=gain, weight=weight)
+    return kept, [p.correlation for p in final.prediction]
 
 
 def _runs_of(parts: list[StackPixels], motion: RigidPose) -> tuple[list[int], list[int | None]]:

@@ -89,7 +89,7 @@ def refine_slices(
             "slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved
         )
     progress(rounds.n_rounds, rounds.n_rounds)
-    ncc = _final_ncc(slices, gain, weight, rounds.finest_voxel_mm)
+    ncc = correlation_with_all(slices, gain, weight, rounds.finest_voxel_mm)
     return FittedSlices(slices, gain, weight, ncc, history)
 
 
@@ -137,9 +137,10 @@ def _volume_of(
     )
 
 
-def _final_ncc(
+def correlation_with_all(
     slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
 ) -> NDArray[np.float64]:
+    """Correlation of each slice [K] with a volume made of all of them."""
     grid = grid_around(slices, voxel_mm)
     volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
     return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc
