@@ -61,6 +61,7 @@ WITHOUT: dict[str, Options] = {
     "runs": {"motion.runs": False},
     "slices": {"motion.n_rounds": 0},
     "joint": {"slice_stage.optimise_poses": False},
+    "slices and joint": {"motion.n_rounds": 0, "slice_stage.optimise_poses": False},
     "shading": {"slice_stage.optimise_shading": False},
 }
 """What is switched off, one at a time, in a whole reconstruction."""
