@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.command import parser_of, run_command
 from benchmarks.tables import markdown_table, put_into, write_json, write_text
-from g3r.errors import G3RError
 
 if TYPE_CHECKING:
     from benchmarks.subjects import SubjectRecipe
@@ -49,31 +48,22 @@ def recipes(n_repeats: int = 1) -> list[SubjectRecipe]:
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.motion_bias", formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description="Reconstruct subjects with weak and strong shading, with the shading estimated and not. "
+    parser = parser_of(
+        "motion_bias",
+        "Reconstruct subjects with weak and strong shading, with the shading estimated and not. "
         "Needs the atlas in the folder that G3R_TEST_DATA names.",
-    )  # fmt: skip
+        DEFAULT_FOLDER,
+    )
     parser.add_argument("--repeats", type=int, default=1, metavar="N", help="subjects of each volume")
     parser.add_argument("--motion-only", action="store_true", help="registration alone, no volume")
-    parser.add_argument("--preset", default="balanced", help="settings")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
-    parser.add_argument("--threads", type=int, help="(None: all cores)")
     parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="simulated subjects")
-    parser.add_argument("--output", type=Path, default=DEFAULT_FOLDER, help="for bias.json and bias.md")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = build_parser().parse_args(argv)
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
-    try:
-        return _run(options)
-    except G3RError as error:
-        print(f"motion_bias: {error}", file=sys.stderr)
-        return error.exit_code
+    return run_command("motion_bias", _run, options)
 
 
 def _run(options: argparse.Namespace) -> int:

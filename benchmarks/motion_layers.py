@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,8 +10,9 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.command import parser_of, run_command
 from benchmarks.tables import markdown_table, put_into, write_json, write_text
-from g3r.errors import G3RError, InputError
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from benchmarks.runs import Run
@@ -76,19 +76,15 @@ DEFAULT_FOLDER = Path("runs") / "bench" / "motion-layers"
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.motion_layers", formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description="Pose errors after each layer of registration, and the volume with a layer left out, on "
+    parser = parser_of(
+        "motion_layers",
+        "Pose errors after each layer of registration, and the volume with a layer left out, on "
         "the cases in the folder that G3R_TEST_DATA names.",
-    )  # fmt: skip
+        DEFAULT_FOLDER,
+    )
     parser.add_argument("--cases", nargs="+", metavar="GLOB", default=["*"], help="which of them")
-    parser.add_argument("--preset", default="balanced", help="settings")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
     parser.add_argument("--no-without", action="store_true", help="skip the runs with a layer left out")
-    parser.add_argument("--threads", type=int, help="(None: all cores)")
-    parser.add_argument("--output", type=Path, default=DEFAULT_FOLDER, help="for layers.json and layers.md")
     parser.add_argument("--keep", action="store_true", help="keep cases that layers.json holds already")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw the error of every slice")
     return parser
 
@@ -96,12 +92,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = build_parser().parse_args(argv)
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
-    try:
-        return _run(options)
-    except G3RError as error:
-        print(f"motion_layers: {error}", file=sys.stderr)
-        return error.exit_code
+    return run_command("motion_layers", _run, options)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.command import parser_of, run_command
 from benchmarks.tables import markdown_table, put_into, write_json, write_text
 from g3r.errors import G3RError, InputError
 
@@ -63,11 +64,12 @@ def recipes(
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.motion_sweep", formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        description="Simulate random subjects at each level of motion and measure how well they are "
+    parser = parser_of(
+        "motion_sweep",
+        "Simulate random subjects at each level of motion and measure how well they are "
         "registered. Needs the atlas in the folder that G3R_TEST_DATA names.",
-    )  # fmt: skip
+        DEFAULT_FOLDER,
+    )
     parser.add_argument("--levels", nargs="+", choices=LEVELS, default=list(LEVELS), help="of motion")
     parser.add_argument("--subjects", type=int, default=10, metavar="N", help="at each level, at most 100")
     parser.add_argument("--turned", action="store_true", help="heads lie in random orientations")
@@ -75,13 +77,8 @@ def build_parser() -> argparse.ArgumentParser:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--motion-only", action="store_true", help="registration alone (what is done anyway)")
     what.add_argument("--full", action="store_true", help="whole reconstructions, with PSNR")
-    parser.add_argument("--preset", default="balanced", help="settings")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior for --full (None: the one shipped)")
     parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="simulated subjects")
-    parser.add_argument("--output", type=Path, default=DEFAULT_FOLDER, help="for sweep.json and sweep.md")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
     parser.add_argument("--jobs", type=int, default=1, help="subjects at the same time")
-    parser.add_argument("--threads", type=int, help="of each (None: the cores shared out)")
     return parser
 
 
@@ -93,12 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--subjects {options.subjects}; expected 1 to 100")
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}; expected at least 1")
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
-    try:
-        return _run(options)
-    except G3RError as error:
-        print(f"motion_sweep: {error}", file=sys.stderr)
-        return error.exit_code
+    return run_command("motion_sweep", _run, options)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -12,20 +12,16 @@ import torchio as tio
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from data_synth.atlas import find_subjects
 from data_synth.dataset import (
     IMAGE_KEYS,
     HeadPatchSampler,
     SyntheticSubjects,
     central_crop,
 )
-from data_synth.heads import Subject, phantom_subjects
+from data_synth.heads import Subject, phantom_subjects, training_and_validation
 from g3r.errors import InputError
 
 logger = logging.getLogger(__name__)
-
-N_PHANTOMS = 24
-"""Phantoms made for training; each varies further by augmentation."""
 
 QUEUE_SUBJECTS = 4
 """Subjects whose patches are mixed in the queue."""
@@ -143,19 +139,11 @@ class StackSynthesisDataModule(LightningDataModule):
 
     def _sources(self) -> tuple[list[Subject], list[Subject]]:
         h: Any = self.hparams
-        train: list[Subject]
-        val: list[Subject]
+        train, val = training_and_validation(
+            h.source, h.include, h.exclude, h.val_include, h.val_exclude, h.val_subjects, h.seed
+        )
         if h.source == "phantom":
-            return (
-                [*phantom_subjects(N_PHANTOMS, h.seed, "training")],
-                [*phantom_subjects(h.val_subjects, h.seed, "validation")],
-            )
-        train = [*find_subjects(h.source, h.include or (), [*(h.exclude or ()), *(h.val_include or ())])]
-        if h.val_include:
-            val = [*find_subjects(h.source, h.val_include, h.val_exclude or ())]
-        else:
-            val = [*train]
-            logger.warning("no val_include given: validating on other simulations of the training subjects")
+            return train, val
         # spread over the names, which mostly sort by age
         step = max(1, len(val) // h.val_subjects)
         val = val[step // 2 :: step][: h.val_subjects]

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import center_of_mass
 
-from data_synth.atlas import AtlasSubject, TruthVolume, cropped, load_subject
+from data_synth.atlas import AtlasSubject, TruthVolume, cropped, find_subjects, load_subject
 from data_synth.phantom import fetal_brain_phantom
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
+
+logger = logging.getLogger(__name__)
+
+N_PHANTOMS = 24
+"""Phantoms made for training; each varies further by augmentation."""
 
 WEEKS_RANGE = (15.0, 45.0)
 """Gestational ages that a number in a subject's name may mean."""
@@ -34,6 +41,42 @@ def phantom_subjects(n: int, seed: int, split: str) -> list[PhantomSubject]:
     first = 10_000 * seed + (5_000 if split == "validation" else 0)
     ages = 21 + 17 * (np.arange(n) + 0.5) / n
     return [PhantomSubject(f"phantom-{w:.1f}w-{first + k}", float(w), first + k) for k, w in enumerate(ages)]
+
+
+def training_and_validation(
+    source: str,
+    include: Sequence[str] | None,
+    exclude: Sequence[str] | None,
+    val_include: Sequence[str] | None,
+    val_exclude: Sequence[str] | None,
+    n_val_phantoms: int,
+    seed: int,
+) -> tuple[list[Subject], list[Subject]]:
+    """Subjects to train on and subjects to validate on.
+
+    Args:
+        source: `phantom`, or an atlas folder.
+        include: glob patterns of names for training; none takes all.
+        exclude: glob patterns of names not to train on.
+        val_include: glob patterns of names to validate on, which are not trained on; without any, the
+            training subjects are taken, and a warning says so.
+        val_exclude: glob patterns of names not to validate on.
+        n_val_phantoms: phantoms to validate on.
+        seed: of the phantoms.
+
+    Raises:
+        InputError: no such folder, or nothing in it passes the patterns.
+    """
+    if source == "phantom":
+        return (
+            [*phantom_subjects(N_PHANTOMS, seed, "training")],
+            [*phantom_subjects(n_val_phantoms, seed, "validation")],
+        )
+    train: list[Subject] = [*find_subjects(source, include or (), [*(exclude or ()), *(val_include or ())])]
+    if val_include:
+        return train, [*find_subjects(source, val_include, val_exclude or ())]
+    logger.warning("no val_include given: validating on other simulations of the training subjects")
+    return train, [*train]
 
 
 def weeks_of(subject: Subject) -> float:

@@ -11,10 +11,10 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
-from data_synth.atlas import TruthVolume, find_subjects
-from data_synth.datamodule import N_PHANTOMS, EpochSampler
+from data_synth.atlas import TruthVolume
+from data_synth.datamodule import EpochSampler
 from data_synth.head_variation import varied_head
-from data_synth.heads import Subject, load_head, phantom_subjects
+from data_synth.heads import Subject, load_head, training_and_validation
 from data_synth.slice_sampling import Head
 from data_synth.slice_sets import SliceSet, draw_slice_set
 from data_synth.template import mean_heads
@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 HEAD_SPACING_MM = 2.0
 """Voxel size of the truth that is sliced; pixels are larger."""
 VAL_MAX_SLICES = 120
+N_VAL_PHANTOMS = 8
 N_VARIANTS = 8
 """Shapes and contrasts per subject and epoch; making one takes as long as several slice sets."""
 SMALLEST_SHARE = 4
@@ -138,20 +139,9 @@ class SliceSetDataModule(LightningDataModule):
     def _sources(self) -> tuple[list[Subject], list[Subject]]:
         h: Any = self.hparams
         if self._subjects is None:
-            if h.source == "phantom":
-                self._subjects = (
-                    [*phantom_subjects(N_PHANTOMS, h.seed, "training")],
-                    [*phantom_subjects(8, h.seed, "validation")],
-                )
-            else:
-                left_out = [*(h.exclude or ()), *(h.val_include or ())]
-                train: list[Subject] = [*find_subjects(h.source, h.include or (), left_out)]
-                if h.val_include:
-                    val: list[Subject] = [*find_subjects(h.source, h.val_include)]
-                else:
-                    val = [*train]
-                    logger.warning("no val_include given: validating on other sets of the training subjects")
-                self._subjects = (train, val)
+            self._subjects = training_and_validation(
+                h.source, h.include, h.exclude, h.val_include, None, N_VAL_PHANTOMS, h.seed
+            )
         return self._subjects
 
 

@@ -32,6 +32,7 @@ from g3r.motion.confidence import (
     stack_confidences,
 )
 from g3r.motion.prior_registration import register_to_prior
+from g3r.motion.template_registration import head_volume_mm3
 from g3r.motion.volume import grid_around
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
@@ -135,7 +136,8 @@ class GaussianReconstructor:
         warnings += pose_warnings(motion, confidences, stacks)
         if settings.motion.standard_orientation and motion.orientation is None:
             notes.append(
-                "standard orientation unknown: no mean head fits well; the volume stays in scanner space"
+                "standard orientation unknown, the volume stays in scanner space: no mean head fits the "
+                f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
             )
         with clock("coarse"):
             start = self._start(motion.slices, motion.gain, motion.weight)

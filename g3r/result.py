@@ -25,12 +25,12 @@ SLICE_COLUMNS = (
     "stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason",
 )  # fmt: skip
 
-DOUBTED_WEIGHT = 0.5
+FULL_WEIGHT = 0.99
 """Slices trusted less than this get a reason in slices.tsv."""
 
 LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
-"""A doubted slice with a gain below the first has lost signal; one with less than the second of its stack's
-median of pixels is small; one that correlates less than the third with the volume shows something else."""
+"""A down-weighted slice with a gain below the first has lost signal; one with less than the second of its
+stack's median of pixels is small; one that correlates less than the third with the volume does not fit."""
 
 OUTPUT_NAMES = (
     "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz", "gaussians.npz",
@@ -119,7 +119,7 @@ class ReconstructionResult:
         for k in range(len(self.slices)):
             pose = [f"{x:.9g}" for x in (*rotvec[k], *motion.translation_mm[k])]
             trust = [f"{x:.4g}" for x in (self.gain[k], self.weight[k], self.ncc[k])]
-            reason = self._reason(k) if self.weight[k] < DOUBTED_WEIGHT else "-"
+            reason = self._reason(k) if self.weight[k] < FULL_WEIGHT else "-"
             number = [str(self.slices.stack_id[k]), str(self.slices.slice_index[k])]
             lines.append("\t".join([*number, *pose, *trust, reason]))
         return "\n".join(lines) + "\n"

@@ -100,8 +100,8 @@ def estimate_motion(
         start = placed.motion(len(slices), parts)
         rng = np.random.default_rng(settings.seed)
         orientation = standard_orientation(fitted.slices, placed.heads, start, rng)
-    posed = centred_on_headers(fitted.slices) if orientation is None else orientation.slices
-    result = given.with_pose(posed.planes.pose)
+    pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
+    result = given.with_pose(pose)
     return MotionEstimate(
         result, fitted.gain, fitted.weight, fitted.ncc, held_out, found.hypothesis, found.hypotheses,
         interleave, n_runs, orientation, fitted.history,

@@ -188,7 +188,7 @@ def _searched_widely(
                 part, found.motion, volume, grid, turn_deg=turn_deg, shift_mm=shift_mm, rng=rng
             )
         new = predict(part, found.motion, volume, grid, found.runs.interleave).cost
-        logger.info("stack %d: present place costs %.0f, another %.0f", part.stack, cost, new)
+        logger.debug("stack %d: present place costs %.0f, another %.0f", part.stack, cost, new)
         if new < cost:
             best, cost = found.motion, new
     return best
@@ -237,7 +237,7 @@ def one_motion_or_runs(
     free = predict(part, motion, volume, grid, interleave)
     still = predict(part, rigid, volume, grid, interleave)
     is_one = still.cost <= free.cost + MARGIN
-    logger.info("stack %d: one motion costs %.0f, runs %.0f", part.stack, still.cost, free.cost)
+    logger.debug("stack %d: one motion costs %.0f, runs %.0f", part.stack, still.cost, free.cost)
     return (rigid, True) if is_one else (motion, False)
 
 

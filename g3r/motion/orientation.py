@@ -31,16 +31,16 @@ N_CANDIDATES = 1000
 
 @dataclass(frozen=True)
 class Orientation:
-    """The slices in the atlas frame (RAS, the mid-sagittal plane at x = 0), and how well they fit it.
+    """Poses of all slices in the atlas frame (RAS, the mid-sagittal plane at x = 0), and how well they fit.
 
     Args:
-        slices: all of them.
+        pose: [K] of the slices' own frames.
         correlation: with the mean head, outline included.
         weeks: age of the mean head.
         scale: by which it was enlarged to fit.
     """
 
-    slices: Slices
+    pose: RigidPose
     correlation: float
     weeks: float
     scale: float
@@ -68,7 +68,7 @@ def standard_orientation(
     logger.info("standard orientation: correlation %.2f with the mean head of %.0f weeks", best, head.weeks)
     if best < SURE_CORRELATION:
         return None
-    return Orientation(slices.with_pose(motion @ slices.planes.pose), best, head.weeks, head.scale)
+    return Orientation(motion @ slices.planes.pose, best, head.weeks, head.scale)
 
 
 def _turned_to(

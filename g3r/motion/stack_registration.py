@@ -56,7 +56,7 @@ def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
         rotation[moving], center[moving] = pose.rotation, pose.translation_mm
         slices = slices.with_pose(RigidPose(rotation, center))
         done.append(stack)
-        logger.info("stack %d registered, correlation %.3f", stack, ncc)
+        logger.debug("stack %d registered, correlation %.3f", stack, ncc)
     return slices, [agreement[int(s)] for s in stacks]
 
 

@@ -234,7 +234,7 @@ def _consistent(parts: list[StackPixels], options: list[list[tuple[float, Placem
             best = (total, choice)
     assert best is not None
     chosen = [options[k][n] for k, n in enumerate(best[1])]
-    logger.info("placed in the mean head at costs %s", " ".join(f"{cost:.0f}" for cost, _ in chosen))
+    logger.debug("placed in the mean head at costs %s", " ".join(f"{cost:.0f}" for cost, _ in chosen))
     return [one for _, one in chosen]
 
 

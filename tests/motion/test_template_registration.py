@@ -66,7 +66,7 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     # the atlas frame is that of the phantom, but for the turn
     upright = standard_orientation(slices, placed.heads, motion, rng)
     assert upright is not None
-    back = upright.slices.world_from_header()
+    back = upright.pose @ slices.planes.pose.inverse()
     np.testing.assert_allclose(back.rotation, back.rotation[:1].repeat(len(back), 0), atol=1e-9)
     assert turn_angle_deg(back.rotation[0] @ rotation) < 5
     middle = back.apply(np.tile(PLACE_MM, (len(back), 1)))[0]
