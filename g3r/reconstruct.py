@@ -107,20 +107,26 @@ class GaussianReconstructor:
             path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
             self.pose_network, self.pose_meta = load_pose_network(path)
 
-    def reconstruct(self, stacks: Sequence[Stack]) -> ReconstructionResult:
+    def reconstruct(
+        self, stacks: Sequence[Stack], motion: MotionEstimate | None = None
+    ) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
 
+        Args:
+            stacks: one or more, of one head.
+            motion: what `register_stacks` (here or elsewhere) found for the same stacks, to fit
+                several times to one registration; found here when None. Slices of a single stack still move
+                to the prior volume afterwards, where there is one.
+
         Raises:
-            InputError: stacks that cannot be used.
+            InputError: stacks that cannot be used, or a motion of other slices.
             NumericalError: a fit that broke down.
         """
         assert isinstance(self.settings, ReconstructionSettings)
         settings, clock, notes, warnings = self.settings, Clock(), [], []
         rng = np.random.default_rng(settings.seed)
-        slices = slices_from_stacks(stacks)
+        slices, first_scale = _normalised_slices(stacks)
         notes += left_out_notes(stacks, slices)
-        first_scale = _percentile_scale(slices)
-        slices = slices.scaled(1 / first_scale)
         single = len(np.unique(slices.stack_id)) == 1
         if single:
             # registered to a volume made of themselves, slices of a single stack drift
@@ -131,7 +137,11 @@ class GaussianReconstructor:
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
 
         with clock("motion"):
-            motion = self.register(slices, settings)
+            if motion is None:
+                motion = self.register(slices, settings)
+            else:
+                motion = _motion_of(slices, motion)
+                notes.append("motion was given, not estimated here")
         confidences = stack_confidences(motion, len(stacks))
         warnings += pose_warnings(motion, confidences, stacks)
         if settings.motion.standard_orientation and motion.orientation is None:
@@ -203,6 +213,14 @@ class GaussianReconstructor:
             fit.weight, motion.ncc, record,
         )  # fmt: skip
 
+    def register_stacks(self, stacks: Sequence[Stack]) -> MotionEstimate:
+        """Poses of all slices of some stacks, as `reconstruct` finds them and takes them.
+
+        Raises:
+            InputError: stacks that cannot be used.
+        """
+        return self.register(_normalised_slices(stacks)[0])
+
     def register(self, slices: Slices, settings: ReconstructionSettings | None = None) -> MotionEstimate:
         """Poses of all slices, with this reconstructor's template and pose network.
 
@@ -244,6 +262,31 @@ def _gaussian_spacing_mm(slices: Slices, settings: ReconstructionSettings) -> fl
     """Cell edge per Gaussian: the settings' number of (typical) pixels, as cubes of equal volume."""
     covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
     return settings.gaussian_spacing_pixels * float(np.median(covered_mm3)) ** (1 / 3)
+
+
+def _normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
+    """Slices of order one at their header poses, and what they were divided by."""
+    slices = slices_from_stacks(stacks)
+    scale = _percentile_scale(slices)
+    return slices.scaled(1 / scale), scale
+
+
+def _motion_of(slices: Slices, motion: MotionEstimate) -> MotionEstimate:
+    """A motion estimate with the pixels of the slices to be fitted.
+
+    Raises:
+        InputError: the two are not about the same slices.
+    """
+    found = motion.slices
+    if not (
+        np.array_equal(found.stack_id, slices.stack_id)
+        and np.array_equal(found.slice_index, slices.slice_index)
+    ):
+        raise InputError(
+            f"motion of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
+            "register the same stacks with the same masks"
+        )
+    return replace(motion, slices=slices.with_pose(found.planes.pose))
 
 
 def _percentile_scale(slices: Slices) -> float:

@@ -194,6 +194,19 @@ def quick_settings() -> ReconstructionSettings:
     )  # fmt: skip
 
 
+def test_one_registration_serves_several_fits(subject: Path):
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    reconstructor = GaussianReconstructor(settings=quick_settings())
+    motion = reconstructor.register_stacks(stacks)
+    whole, again = reconstructor.reconstruct(stacks), reconstructor.reconstruct(stacks, motion)
+    np.testing.assert_array_equal(again.volume, whole.volume)
+    assert any("motion was given" in note for note in again.record["notes"])
+    with pytest.raises(InputError, match="motion of"):
+        reconstructor.reconstruct(stacks[:2], motion)
+
+
 @pytest.mark.parametrize("power", [-20, 20])
 def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int):
     """A power of two (about 1e-6 and 1e6) rounds nothing: no constant may have a hidden unit."""
