@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import nibabel as nib
 import numpy as np
@@ -20,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 IMAGE_NAMES = ("t2", "T2", "T2w", "image", "volume", "truth")
 MASK_ENDINGS = ("_mask", "-mask")
+VENTRICLES = 2
+"""Label of the ventricles in a `labels` file beside the image, as in the atlases of Fidon et al. (2021)."""
 EXTENSIONS = (".nii.gz", ".nii")
 
 
@@ -30,6 +33,7 @@ class AtlasSubject:
     name: str
     image: Path
     mask: Path
+    labels: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -41,12 +45,16 @@ class TruthVolume:
         data: [I, J, K] float32; the 99.5th percentile in the mask is 1, outside it is zero.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
+        labels: [I, J, K] uint8 tissues, where they are known.
+        ventricles: [I, J, K], where they are known.
     """
 
     name: str
     data: NDArray[np.float32]
     mask: NDArray[np.bool_]
     affine: NDArray[np.float64]
+    labels: NDArray[np.uint8] | None = None
+    ventricles: NDArray[np.bool_] | None = None
 
 
 def find_subjects(
@@ -55,7 +63,7 @@ def find_subjects(
     """Volumes with masks below a folder, by name.
 
     Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or
-    X-mask.nii.gz.
+    X-mask.nii.gz. SUBJECT/labels.nii.gz, if there is one, holds the tissues.
 
     Args:
         folder: the root of the tree.
@@ -74,7 +82,9 @@ def find_subjects(
         for mask in sorted(root.rglob(f"*mask{extension}")):
             image, name = _image_of(mask, extension, root)
             if image is not None and name not in found:
-                found[name] = AtlasSubject(name, image, mask)
+                labels = mask.with_name(f"labels{extension}")
+                known = labels if labels.exists() and mask.name == f"mask{extension}" else None
+                found[name] = AtlasSubject(name, image, mask, known)
     if not found:
         raise InputError(
             f"{root}: no volume with a mask found; expected SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, "
@@ -111,9 +121,19 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
     data = nib.orientations.apply_orientation(data, turn)
     mask = nib.orientations.apply_orientation(mask, turn).astype(bool)
 
+    labels = None
+    if subject.labels is not None:
+        of_file = load_volume(subject.labels)
+        if of_file.data.shape != volume.data.shape:
+            raise InputError(
+                f"{subject.labels}: shape {of_file.data.shape}, but the image has {volume.data.shape}; "
+                "expected labels on the image's grid"
+            )
+        labels = nib.orientations.apply_orientation(np.rint(of_file.data), turn).astype(np.uint8)
+
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if spacing_mm is not None and np.abs(spacing - spacing_mm).max() > 1e-3:
-        data, mask, affine = _resampled(data, mask, affine, spacing, spacing_mm)
+        data, mask, labels, affine = _resampled(data, mask, labels, affine, spacing, spacing_mm)
         if not mask.any():
             raise InputError(f"{subject.mask}: mask is empty at {spacing_mm:g} mm; use a finer spacing")
     bright = float(np.percentile(data[mask], 99.5))
@@ -122,7 +142,8 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
             f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image"
         )
     data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
-    return TruthVolume(subject.name, data, mask, affine)
+    ventricles = None if labels is None else (labels == VENTRICLES) & mask
+    return TruthVolume(subject.name, data, mask, affine, labels, ventricles)
 
 
 def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
@@ -132,8 +153,12 @@ def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     affine = volume.affine.copy()
     affine[:3, 3] += affine[:3, :3] @ (low - margin_voxels)
+
+    def cut(array: NDArray[Any] | None) -> Any:
+        return None if array is None else np.pad(array[box], margin_voxels)
+
     return TruthVolume(
-        volume.name, np.pad(volume.data[box], margin_voxels), np.pad(volume.mask[box], margin_voxels), affine
+        volume.name, cut(volume.data), cut(volume.mask), affine, cut(volume.labels), cut(volume.ventricles)
     )
 
 
@@ -162,10 +187,11 @@ def _matches(name: str, patterns: Sequence[str]) -> bool:
 def _resampled(
     data: NDArray[np.float32],
     mask: NDArray[np.bool_],
+    labels: NDArray[np.uint8] | None,
     affine: NDArray[np.float64],
     spacing: NDArray[np.float64],
     spacing_mm: float,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8] | None, NDArray[np.float64]]:
     """Cubic splines onto cubic voxels with the same axes, smoothed first where the new voxel is larger."""
     step = spacing_mm / spacing  # old voxels per new voxel
     shape = np.maximum(np.floor((np.array(data.shape) - 1) / step).astype(int) + 1, 1)
@@ -174,8 +200,10 @@ def _resampled(
     smooth = gaussian_filter(data, sigma) if sigma.any() else data
     new = affine_transform(smooth, step, start, tuple(shape), order=3, mode="nearest")
     inside = affine_transform(mask.astype(np.float32), step, start, tuple(shape), order=1) > 0.5
+    if labels is not None:
+        labels = affine_transform(labels, step, start, tuple(shape), order=0)
     result = affine.copy()
     result[:3, :3] = affine[:3, :3] * step
     result[:3, 3] = affine[:3, :3] @ start + affine[:3, 3]
     logger.debug("resampled from %s to %.2f mm", np.round(spacing, 3), spacing_mm)
-    return new.astype(np.float32), inside, result
+    return new.astype(np.float32), inside, labels, result

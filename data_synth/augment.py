@@ -9,6 +9,11 @@ import torch
 import torchio as tio
 
 from data_synth.atlas import TruthVolume
+from data_synth.contrast import recoloured
+from data_synth.pathology import REACH_MM, enlarged_ventricles, with_lesions
+
+CONTRAST_SHARE, VENTRICLES_SHARE, LESION_SHARE = 0.3, 0.2, 0.25
+"""How often a head gets other tissue intensities, enlarged ventricles, lesions."""
 
 
 def augmentation() -> tio.Compose:
@@ -47,10 +52,13 @@ def augmentation() -> tio.Compose:
 
 
 def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Generator) -> TruthVolume:
-    """The volume after a random transform; zero outside its (moved) mask, 99.5th percentile 1.
+    """The volume with other tissues, a pathology at times, and bent.
+
+    Zero outside its (moved) mask, the 99.5th percentile is 1.
 
     torchio draws from torch's global generator; it is seeded from `rng` here and put back afterwards.
     """
+    volume = _other_anatomy(volume, rng)
     subject = tio.Subject(
         image=tio.ScalarImage(tensor=torch.from_numpy(volume.data)[None], affine=volume.affine),
         mask=tio.LabelMap(tensor=torch.from_numpy(volume.mask.astype(np.uint8))[None], affine=volume.affine),
@@ -67,3 +75,15 @@ def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Genera
     return TruthVolume(
         volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine)
     )
+
+
+def _other_anatomy(volume: TruthVolume, rng: np.random.Generator) -> TruthVolume:
+    """What torchio has no transform for: ventricles, contrast by tissue, lesions."""
+    draws = rng.random(3)
+    if draws[0] < VENTRICLES_SHARE:
+        volume = enlarged_ventricles(volume, float(rng.uniform(0.3, 1.0) * REACH_MM))
+    if draws[1] < CONTRAST_SHARE:
+        volume = recoloured(volume, rng)
+    if draws[2] < LESION_SHARE:
+        volume = with_lesions(volume, rng)
+    return volume

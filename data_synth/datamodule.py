@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from data_synth.dataset import (
     IMAGE_KEYS,
+    N_STACKS_KEY,
     HeadPatchSampler,
     SyntheticSubjects,
     central_crop,
@@ -30,7 +31,8 @@ QUEUE_SUBJECTS = 4
 class StackSynthesisDataModule(LightningDataModule):
     """Patches of (V_coarse, M_rho, truth, mask) from an atlas folder or the built-in phantom.
 
-    A batch is a dict of float32 tensors [B, 1, I, J, K] with the keys `coarse`, `density`, `truth`, `mask`.
+    A batch is a dict of float32 tensors [B, 1, I, J, K] with the keys `coarse`, `density`, `sharp`, `truth`
+    and `mask`, and `n_stacks`, int64 [B].
     Training patches differ from epoch to epoch, validation volumes never.
 
     Args:
@@ -49,6 +51,8 @@ class StackSynthesisDataModule(LightningDataModule):
         val_subjects: validation volumes.
         val_crop: edge in voxels of the central cube that is validated on.
         num_workers: processes that synthesise beside the training.
+        distinct_epochs: after so many epochs the same subjects come again, in other patches; 0 for never.
+        cache: folder that keeps synthetic subjects once made (about 15 MB each); None keeps none.
         seed: decides every sample together with its epoch and index.
 
     Raises:
@@ -71,6 +75,8 @@ class StackSynthesisDataModule(LightningDataModule):
         val_subjects: int = 4,
         val_crop: int = 96,
         num_workers: int = 0,
+        distinct_epochs: int = 0,
+        cache: str | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -104,11 +110,13 @@ class StackSynthesisDataModule(LightningDataModule):
         train, val = self._sources()
         logger.info("synthesis from %d training and %d validation subjects", len(train), len(val))
         self.train_subjects = SyntheticSubjects(
-            train, h.spacing_mm, h.subjects_per_epoch, h.seed, smallest_shape=h.patch_size
-        )
+            train, h.spacing_mm, h.subjects_per_epoch, h.seed, smallest_shape=h.patch_size,
+            distinct=h.distinct_epochs, cache=h.cache,
+        )  # fmt: skip
         fixed = SyntheticSubjects(
-            val, h.spacing_mm, h.val_subjects, h.seed + 1_000_003, h.val_crop, augment=False, in_order=True
-        )
+            val, h.spacing_mm, h.val_subjects, h.seed + 1_000_003, h.val_crop, augment=False, in_order=True,
+            cache=h.cache,
+        )  # fmt: skip
         self.val_volumes = FixedCrops(fixed, h.val_crop)
 
     def train_dataloader(self) -> DataLoader:
@@ -215,8 +223,9 @@ class FixedCrops(Dataset):
 
 
 def collate_images(subjects: list[Any]) -> dict[str, torch.Tensor]:
-    """A plain dict of float32 tensors [B, 1, I, J, K], without torchio's nesting."""
-    return {key: torch.stack([subject[key].data for subject in subjects]).float() for key in IMAGE_KEYS}
+    """A plain dict of float32 tensors [B, 1, I, J, K] and of numbers [B], without torchio's nesting."""
+    batch = {key: torch.stack([subject[key].data for subject in subjects]).float() for key in IMAGE_KEYS}
+    return {**batch, N_STACKS_KEY: torch.tensor([int(subject[N_STACKS_KEY]) for subject in subjects])}
 
 
 def _first(batch: list[tio.Subject]) -> tio.Subject:

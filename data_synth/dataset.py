@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,35 +19,34 @@ from torch.utils.data import Dataset
 from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
 from data_synth.heads import Subject, load_volume_of
-from data_synth.motion import LEVELS, ResidualKind, draw_residual_kind, residual_errors
-from data_synth.simulator import Orientation, SimulatedStack, StackSettings, simulate_stacks
-from g3r.acquisition.planes import slices_from_stacks
+from data_synth.kept_subjects import KeptSubjects, SyntheticSubject
+from data_synth.motion import ResidualKind, draw_residual_kind, residual_errors
+from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
+from data_synth.stack_draws import (
+    RIM_SHARE,
+    SMALL_MASK_SHARE,
+    draw_settings,
+    in_line,
+    remasked,
+    with_rim,
+)
+from g3r.acquisition.least_squares import sharpened_volume
+from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.acquisition.scatter import coarse_and_density, normalisation_scale
 from g3r.geometry import RigidPose, VolumeGrid
 
 logger = logging.getLogger(__name__)
 
-IMAGE_KEYS = ("coarse", "density", "truth", "mask")
-SAMPLE_SEED_KEY = "sample_seed"
+IMAGE_KEYS = ("coarse", "density", "sharp", "truth", "mask")
+SAMPLE_SEED_KEY, N_STACKS_KEY = "sample_seed", "n_stacks"
+VALIDATION_STACKS = 3
 MARGIN_VOXELS = 6
 """Background kept around a head: the network must learn that nothing is there."""
 
-N_STACKS_SHARE = {1: 0.12, 2: 0.16, 3: 0.36, 4: 0.16, 5: 0.1, 6: 0.1}
-VOID_SHARE_IF_GROSS = 0.03
-
-
-@dataclass(frozen=True)
-class SyntheticSubject:
-    """What the network sees and should answer, [I, J, K] on the truth's grid, in normalised intensities."""
-
-    coarse: NDArray[np.float32]
-    density: NDArray[np.float32]
-    truth: NDArray[np.float32]
-    mask: NDArray[np.bool_]
-    affine: NDArray[np.float64]
-    name: str
-    n_stacks: int
-    residual: ResidualKind
+IN_LINE_SHARE = 0.6
+"""How often nothing is known of how the slices of a single stack moved against each other."""
+NOTICED_SHARE = 0.7
+"""How often a slice without signal has been given a low weight."""
 
 
 class SyntheticSubjects(Dataset):
@@ -60,7 +59,9 @@ class SyntheticSubjects(Dataset):
         seed: of the whole dataset.
         smallest_shape: grids are padded to at least this many voxels per axis.
         augment: whether truth volumes are varied by torchio.
-        in_order: take the sources in turn instead of drawing them (validation).
+        in_order: take the sources in turn instead of drawing them, and 1, 2, 3 stacks in turn (validation).
+        distinct: after so many epochs the same subjects come again, cut into other patches; 0 for never.
+        cache: folder that keeps subjects once made; None keeps none.
     """
 
     def __init__(
@@ -72,6 +73,8 @@ class SyntheticSubjects(Dataset):
         smallest_shape: int = 64,
         augment: bool = True,
         in_order: bool = False,
+        distinct: int = 0,
+        cache: str | Path | None = None,
     ) -> None:
         if not sources:
             raise ValueError("a dataset needs at least one source")
@@ -82,7 +85,16 @@ class SyntheticSubjects(Dataset):
         self.smallest_shape = smallest_shape
         self.augment = augmentation() if augment else None
         self.in_order = in_order
-        self._cache: dict[int, TruthVolume] = {}
+        self.distinct = distinct
+        self.kept = KeptSubjects(cache, self._recipe()) if cache is not None else None
+        self._volumes: dict[int, TruthVolume] = {}
+
+    def _recipe(self) -> str:
+        """All that decides the subjects, besides the code."""
+        names = [source.name for source in self.sources]
+        return repr(
+            (names, self.spacing_mm, self.seed, self.smallest_shape, self.augment is not None, self.in_order)
+        )
 
     def __len__(self) -> int:
         return self.length
@@ -96,44 +108,68 @@ class SyntheticSubjects(Dataset):
             return tio.ScalarImage(tensor=torch.from_numpy(array.astype(np.float32))[None], affine=one.affine)
 
         images = {key: image(getattr(one, key)) for key in IMAGE_KEYS}
-        return tio.Subject(**images, name=one.name, **{SAMPLE_SEED_KEY: (self.seed, epoch, index)})
+        extra = {SAMPLE_SEED_KEY: (self.seed, epoch, index), N_STACKS_KEY: one.n_stacks}
+        return tio.Subject(**images, name=one.name, **extra)
 
     def sample(self, epoch: int, index: int) -> SyntheticSubject:
         """Subject (epoch, index)."""
+        if self.distinct:
+            epoch %= self.distinct
+        if self.kept is None:
+            return self._made(epoch, index)
+        found = self.kept.load(epoch, index)
+        if found is None:
+            found = self._made(epoch, index)
+            self.kept.save(epoch, index, found)
+        return found
+
+    def _made(self, epoch: int, index: int) -> SyntheticSubject:
         rng = np.random.default_rng([self.seed, epoch, index])
         which = index % len(self.sources) if self.in_order else int(rng.integers(len(self.sources)))
         truth = self._volume(which)
         if self.augment is not None:
             truth = augmented(truth, self.augment, rng)
         truth = _padded(cropped(truth, MARGIN_VOXELS), self.smallest_shape)
-        return synthesise(truth, rng)
+        return synthesise(truth, rng, 1 + index % VALIDATION_STACKS if self.in_order else None)
 
     def _volume(self, which: int) -> TruthVolume:
-        if which not in self._cache:
+        if which not in self._volumes:
             volume = load_volume_of(self.sources[which], self.spacing_mm)
-            self._cache[which] = cropped(volume, MARGIN_VOXELS + 4)
-        return self._cache[which]
+            self._volumes[which] = cropped(volume, MARGIN_VOXELS + 4)
+        return self._volumes[which]
 
 
-def synthesise(truth: TruthVolume, rng: np.random.Generator) -> SyntheticSubject:
+def synthesise(truth: TruthVolume, rng: np.random.Generator, n_stacks: int | None = None) -> SyntheticSubject:
     """One training subject from a truth volume: stacks with random settings, pose errors, Eq. 6.
+
+    Args:
+        truth: the head.
+        rng: source of randomness.
+        n_stacks: drawn when None.
 
     Raises:
         InputError: no head moved into view in any draw (volumes with an all but empty mask).
     """
     residual = draw_residual_kind(rng)
-    stacks = simulate_stacks(truth.data, truth.mask, truth.affine, draw_settings(residual, rng), rng)
+    settings = draw_settings(residual, rng, n_stacks)
+    kind = rng.random()
+    seen = with_rim(truth, rng) if kind < RIM_SHARE else truth
+    stacks = simulate_stacks(seen.data, seen.mask, seen.affine, settings, rng)
+    if kind < RIM_SHARE + SMALL_MASK_SHARE:
+        stacks = remasked(stacks, rng, grow=kind < RIM_SHARE)
     slices = slices_from_stacks([one.stack for one in stacks])
-    true_pose = _per_slice(stacks, slices.stack_id, slices.slice_index)
-    exact = true_pose @ slices.planes.pose
-    error = residual_errors(residual, slices.stack_id, exact.translation_mm, rng)
     grid = VolumeGrid(truth.data.shape, truth.affine)
-    coarse, density = coarse_and_density(slices.with_pose(error @ exact), grid)
+    found = _poses_left_by_registration(stacks, settings, slices, grid.center_mm, residual, rng)
+    weight = _trust(stacks, slices, rng)
+    slices = slices.with_pose(found)
+    coarse, density = coarse_and_density(slices, grid, weight=weight)
+    sharp = sharpened_volume(slices, grid, coarse, weight=weight)
     scale = np.float32(normalisation_scale(coarse, density))
     inside = np.where(truth.mask, truth.data, 0) / scale
     return SyntheticSubject(
         coarse / scale,
         density,
+        sharp / scale,
         inside.astype(np.float32),
         truth.mask,
         truth.affine,
@@ -143,31 +179,29 @@ def synthesise(truth: TruthVolume, rng: np.random.Generator) -> SyntheticSubject
     )
 
 
-def draw_settings(residual: ResidualKind, rng: np.random.Generator) -> list[StackSettings]:
-    """Settings of one to six stacks as a protocol may have them: one resolution, mostly orthogonal."""
-    n_stacks = int(rng.choice(list(N_STACKS_SHARE), p=list(N_STACKS_SHARE.values())))
-    level = LEVELS[str(rng.choice(["none", "mild", "moderate"]))]
-    if residual == "gross":
-        level = replace(level, dropout_share=VOID_SHARE_IF_GROSS)
-    thickness = float(rng.uniform(2.0, 5.0) if rng.random() < 0.4 else rng.uniform(2.0, 3.5))
-    orthogonal: list[Orientation] = ["axial", "coronal", "sagittal"]
-    first = int(rng.integers(3))
-    common = StackSettings(
-        resolution_mm=float(rng.uniform(0.6, 1.3)),
-        thickness_mm=thickness,
-        gap_mm=0.0 if rng.random() < 0.6 else float(rng.uniform(0.0, 1.5)),
-        motion=level,
-        interleave=int(rng.integers(1, 4)),
-        oblique_deg=float(rng.choice([0.0, 5.0, 15.0])),
-        profile="box" if rng.random() < 0.7 else "gaussian",
-        snr=float(np.exp(rng.uniform(np.log(12), np.log(60)))),
-        bias=float(rng.uniform(0, 0.1)),
-        gain_deviation=float(rng.uniform(0, 0.06)),
-    )
-    return [
-        replace(common, orientation="random" if rng.random() < 0.1 else orthogonal[(first + n) % 3])
-        for n in range(n_stacks)
-    ]
+def _poses_left_by_registration(
+    stacks: Sequence[SimulatedStack],
+    settings: Sequence[StackSettings],
+    slices: Slices,
+    center_mm: NDArray[np.float64],
+    residual: ResidualKind,
+    rng: np.random.Generator,
+) -> RigidPose:
+    """Poses that the prior is given: true ones with errors, or for single stacks often one motion for all."""
+    true_pose = _per_slice(stacks, slices.stack_id, slices.slice_index)
+    motion = true_pose
+    no_jerks = settings[0].motion.n_jerks == 0  # registration finds those
+    if len(stacks) == 1 and no_jerks and residual != "gross" and rng.random() < IN_LINE_SHARE:
+        motion = in_line(true_pose, center_mm)
+    exact = motion @ slices.planes.pose
+    return residual_errors(residual, slices.stack_id, exact.translation_mm, rng) @ exact
+
+
+def _trust(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Weight of each masked pixel: registration mostly notices slices without signal."""
+    void = np.array([stacks[s].is_void[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
+    noticed = void & (rng.random(len(void)) < NOTICED_SHARE)
+    return np.where(noticed, rng.uniform(0, 0.3, len(void)), 1.0)[slices.pixel_plane]
 
 
 class HeadPatchSampler(tio.data.PatchSampler):

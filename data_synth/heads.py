@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import center_of_mass
 
 from data_synth.atlas import AtlasSubject, TruthVolume, cropped, find_subjects, load_subject
-from data_synth.phantom import fetal_brain_phantom
+from data_synth.phantom import LABELS, fetal_brain_phantom
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
@@ -103,7 +103,10 @@ def load_volume_of(subject: Subject, spacing_mm: float) -> TruthVolume:
         return load_subject(subject, spacing_mm)
     made = fetal_brain_phantom(subject.weeks, spacing_mm, subject.seed)
     bright = float(np.percentile(made.t2[made.mask], 99.5))
-    return TruthVolume(subject.name, made.t2 / np.float32(bright), made.mask, made.affine)
+    return TruthVolume(
+        subject.name, made.t2 / np.float32(bright), made.mask, made.affine, made.labels,
+        made.labels == LABELS["ventricles"],
+    )  # fmt: skip
 
 
 def load_head(subject: Subject, spacing_mm: float, margin_voxels: int = 3) -> TruthVolume:

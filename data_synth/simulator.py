@@ -51,7 +51,7 @@ class StackSettings:
         orientation: of the slices in the head's frame.
         resolution_mm: in-plane pixel spacing.
         thickness_mm: slice thickness.
-        gap_mm: distance between neighbouring slices.
+        gap_mm: distance between neighbouring slices; negative where they overlap.
         motion: how much the head moves.
         interleave: 1 sequential, 2 every other slice first, 3 every third.
         oblique_deg: standard deviation per axis of a tilt of the slices, known to the header.
@@ -59,6 +59,7 @@ class StackSettings:
         snr: the 99.5th percentile in the mask is 2 snr noise deviations; infinity for none.
         bias: strength of the smooth in-plane inhomogeneity; 0 for none.
         gain_deviation: standard deviation of the slices' log gains.
+        spike_share: share of slices with a spike in k-space: stripes over the whole image.
     """
 
     orientation: Orientation = "axial"
@@ -72,15 +73,17 @@ class StackSettings:
     snr: float = 25.0
     bias: float = 0.05
     gain_deviation: float = 0.05
+    spike_share: float = 0.0
 
     def __post_init__(self) -> None:
         checks = {
             "resolution": (self.resolution_mm, 0.1, 5.0),
             "thickness": (self.thickness_mm, 0.1, 20.0),
-            "gap": (self.gap_mm, 0.0, 20.0),
+            "gap": (self.gap_mm, -0.9 * self.thickness_mm, 20.0),
             "snr": (self.snr, 0.1, np.inf),
             "bias": (self.bias, 0.0, 1.0),
             "gain deviation": (self.gain_deviation, 0.0, 1.0),
+            "share of spikes": (self.spike_share, 0.0, 1.0),
         }
         for name, (value, low, high) in checks.items():
             if not low <= value <= high:
@@ -225,6 +228,8 @@ def _simulate_stack(
     is_void = rng.random(n_slices) < settings.motion.dropout_share
     gain = np.where(is_void, gain * rng.uniform(0.1, 0.5, n_slices), gain)
     image = signal * gain[:, None, None] * _bias(shape[:2], settings, rng)
+    for k in np.flatnonzero(rng.random(n_slices) < settings.spike_share) if settings.spike_share else ():
+        image[k] += _stripes(shape[:2], head.bright, rng)
     if np.isfinite(settings.snr):
         deviation = head.bright / (2 * settings.snr)
         noise = rng.standard_normal((2, *image.shape), dtype=np.float32) * np.float32(deviation)
@@ -252,6 +257,13 @@ def _bias(shape: NDArray[np.int64], settings: StackSettings, rng: np.random.Gene
     c = rng.normal(size=5) * settings.bias
     x, y = x[:, None], y[None, :]
     return np.exp(c[0] * x + c[1] * y + c[2] * x * y + 0.5 * (c[3] * x**2 + c[4] * y**2))
+
+
+def _stripes(shape: NDArray[np.int64], bright: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """What one wrong sample in k-space adds to an image."""
+    x, y = np.meshgrid(*[np.arange(n) for n in shape], indexing="ij")
+    across = rng.uniform(-0.3, 0.3, 2)  # cycles per pixel
+    return bright * rng.uniform(0.1, 0.4) * np.cos(2 * np.pi * (across[0] * x + across[1] * y + rng.random()))
 
 
 class _ProfileOperator(VoxelOperator):

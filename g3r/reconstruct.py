@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import (
     Slices,
     slices_from_stacks,
@@ -58,11 +59,12 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class _Start:
-    """Slices and V_coarse in normalised intensities (given ones over `scale`), M_rho and mask [I, J, K]."""
+    """Slices, V_coarse and V_sharp in normalised intensities (given ones over `scale`), M_rho, mask."""
 
     slices: Slices
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
+    sharp: NDArray[np.float32]
     mask: NDArray[np.bool_]
     grid: VolumeGrid
     scale: float
@@ -243,16 +245,20 @@ class GaussianReconstructor:
         assert isinstance(self.settings, ReconstructionSettings)
         voxel = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
         grid = grid_around(slices, voxel, margin_mm=5.0)
-        coarse, density = coarse_and_density(slices, grid, gain, weight[slices.pixel_plane])
+        trust = weight[slices.pixel_plane]
+        coarse, density = coarse_and_density(slices, grid, gain, trust)
+        sharp = sharpened_volume(slices, grid, coarse, gain, trust)
         scale = normalisation_scale(coarse, density)
         slices = slices.scaled(1 / scale)
         mask = foreground_mask(slices, grid, weight)
-        return _Start(slices, coarse / np.float32(scale), density, mask, grid, scale)
+        return _Start(
+            slices, coarse / np.float32(scale), density, sharp / np.float32(scale), mask, grid, scale
+        )
 
     def _prior(self, start: _Start) -> NDArray[np.float32]:
         if self.network is None:
-            return start.coarse
-        return estimate_prior(self.network, start.coarse, start.density)
+            return start.sharp
+        return estimate_prior(self.network, start.coarse, start.density, start.sharp)
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)

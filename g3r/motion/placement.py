@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.motion.candidates import SearchPixels, distinct, mean_square_residual, perturbed
 from g3r.motion.normal_equations import correlation
 from g3r.motion.runs import Runs, best_runs, changes_in_time, price_of_changes
-from g3r.motion.volume import grid_around, solve_volume
+from g3r.motion.volume import grid_around
 
 CORRELATION_AREA_MM2 = 80.0
 """Area over which residuals at a search's resolution are alike: one independent sample per so much slice."""

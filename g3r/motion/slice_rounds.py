@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.motion.normal_equations import SliceModel
 from g3r.motion.slice_registration import register_slices, try_neighbours
-from g3r.motion.volume import grid_around, solve_volume
+from g3r.motion.volume import grid_around
 
 logger = logging.getLogger(__name__)
 

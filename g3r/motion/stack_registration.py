@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix
 from g3r.motion.normal_equations import SliceModel, correlation
-from g3r.motion.volume import grid_around, solve_volume
+from g3r.motion.volume import grid_around
 
 logger = logging.getLogger(__name__)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from g3r._version import __version__
+from g3r.acquisition.least_squares import SHARP_CONVENTION
 from g3r.acquisition.scatter import DENSITY_CONVENTION, INTENSITY_CONVENTION
 from g3r.errors import InputError
 from g3r.prior.checkpoint_file import (
@@ -44,6 +45,7 @@ class PriorCheckpoint:
         validation: named scores, for example {"val/psnr_prior": 31.2} (dB).
         density_convention: see `DENSITY_CONVENTION`.
         intensity_convention: see `INTENSITY_CONVENTION`.
+        sharp_convention: see `SHARP_CONVENTION`.
         g3r_version: version of g3r that wrote the file.
     """
 
@@ -53,6 +55,7 @@ class PriorCheckpoint:
     validation: Mapping[str, float] = field(default_factory=dict)
     density_convention: str = DENSITY_CONVENTION
     intensity_convention: str = INTENSITY_CONVENTION
+    sharp_convention: str = SHARP_CONVENTION
     g3r_version: str = __version__
 
     def __post_init__(self) -> None:
@@ -100,6 +103,7 @@ def save_prior_checkpoint(
         "beta": meta.beta,
         "density_convention": meta.density_convention,
         "intensity_convention": meta.intensity_convention,
+        "sharp_convention": meta.sharp_convention,
         "voxel_mm": float(meta.voxel_mm),
         "training_data": str(meta.training_data),
         "validation": {str(name): float(value) for name, value in meta.validation.items()},
@@ -130,6 +134,7 @@ def load_prior(path: str | Path) -> "tuple[DensityGatedPriorNetwork, PriorCheckp
         "format_version": FORMAT_VERSION,
         "density_convention": DENSITY_CONVENTION,
         "intensity_convention": INTENSITY_CONVENTION,
+        "sharp_convention": SHARP_CONVENTION,
     }
     check_identity(path, content, KIND, conventions, _ANOTHER_FILE)
     meta = _describe(path, content)
@@ -151,6 +156,7 @@ def _describe(path: Path, content: Mapping[str, Any]) -> PriorCheckpoint:
             validation={str(name): float(value) for name, value in content["validation"].items()},
             density_convention=content["density_convention"],
             intensity_convention=content["intensity_convention"],
+            sharp_convention=content["sharp_convention"],
             g3r_version=str(content["g3r_version"]),
         )
         agrees = (meta.alpha, meta.beta) == (content["alpha"], content["beta"])

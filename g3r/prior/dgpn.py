@@ -10,7 +10,11 @@ from g3r.prior.network import ResidualRefiner
 
 
 class DensityGatedPriorNetwork(nn.Module):
-    """The structural prior: V_prior = V_coarse + G(c) F(V_coarse, M_rho), Eq. 7.
+    """The structural prior: V_prior = V_sharp + G(c) F(V_coarse, V_sharp, M_rho), after Eq. 7.
+
+    With `use_sharp=False` it is Eq. 7 as printed, V_coarse + G(c) F(V_coarse, M_rho). The difference is what
+    the gate lets through where the data are dense: there the base is nearly all of the result, and V_sharp is
+    the better base (docs/prior.md).
 
     With the paper's alpha = 0.05 and beta = 1 the residual counts fully where nothing was measured and
     by 5 % where the density is high; three gapless stacks (M = 3) let 10 % through.
@@ -23,6 +27,7 @@ class DensityGatedPriorNetwork(nn.Module):
         beta: gate at zero density.
         use_gate: False sets G = 1 everywhere (an ablation).
         use_density: False hides the density from F (an ablation); the gate still uses it.
+        use_sharp: whether V_sharp is the base and an input, or V_coarse alone.
 
     Raises:
         ValueError: from `DensityGate` or `ResidualRefiner`.
@@ -37,10 +42,11 @@ class DensityGatedPriorNetwork(nn.Module):
         beta: float = 1.0,
         use_gate: bool = True,
         use_density: bool = True,
+        use_sharp: bool = False,
     ) -> None:
         super().__init__()
         self.gate = DensityGate(alpha, beta)
-        self.refiner = ResidualRefiner(channels, units, tail_channels, use_density)
+        self.refiner = ResidualRefiner(channels, units, tail_channels, use_density, use_sharp)
         self.use_gate = bool(use_gate)
 
     def arguments(self) -> dict[str, Any]:
@@ -52,15 +58,21 @@ class DensityGatedPriorNetwork(nn.Module):
             "use_gate": self.use_gate,
         }
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
+    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
         """Return V_prior.
 
         Args:
             v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
             m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
+            v_sharp: [B, 1, I, J, K], on V_coarse's scale; see `sharpened_volume`. Only with `use_sharp`.
+
+        Raises:
+            ValueError: `use_sharp` without V_sharp.
 
         Returns:
             V_prior, [B, 1, I, J, K], in the units of `v_coarse`.
         """
-        residual = self.refiner(v_coarse, m_rho)
-        return v_coarse + (self.gate(m_rho) * residual if self.use_gate else residual)
+        residual = self.refiner(v_coarse, m_rho, v_sharp)
+        base = v_sharp if self.refiner.use_sharp else v_coarse
+        assert base is not None  # the refiner has refused it
+        return base + (self.gate(m_rho) * residual if self.use_gate else residual)

@@ -19,6 +19,7 @@ def estimate_prior(
     network: DensityGatedPriorNetwork,
     v_coarse: NDArray[np.float32],
     m_rho: NDArray[np.float32],
+    v_sharp: NDArray[np.float32] | None = None,
     *,
     max_whole_voxels: int = MAX_WHOLE_VOXELS,
     tile_voxels: int = TILE_VOXELS,
@@ -30,6 +31,7 @@ def estimate_prior(
         network: from `load_prior`, on any device; its mode is left as it is.
         v_coarse: [I, J, K], already divided by `g3r.acquisition.scatter.normalisation_scale`.
         m_rho: [I, J, K], dimensionless density M >= 0.
+        v_sharp: [I, J, K], on V_coarse's scale; needed by networks with `use_sharp`.
         max_whole_voxels: larger volumes are cut into tiles.
         tile_voxels: edge length of a tile without its halo; rounded up to the network's stride.
         halo_voxels: how far a tile looks beyond its edge; rounded up likewise.
@@ -38,7 +40,7 @@ def estimate_prior(
         V_prior, float32 [I, J, K], in the units of `v_coarse`.
 
     Raises:
-        ValueError: the two volumes are not 3D of one shape, or a tile has no voxels.
+        ValueError: the volumes are not 3D of one shape, a needed one is missing, or a tile has no voxels.
         NumericalError: the result is not finite.
 
     Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
@@ -48,6 +50,11 @@ def estimate_prior(
     """
     if v_coarse.ndim != 3 or v_coarse.shape != m_rho.shape or min(v_coarse.shape) < 1:
         raise ValueError(f"expected two 3D volumes of one shape; got {v_coarse.shape} and {m_rho.shape}")
+    volumes = [v_coarse, m_rho]
+    if network.refiner.use_sharp:
+        if v_sharp is None or v_sharp.shape != v_coarse.shape:
+            raise ValueError(f"this prior needs V_sharp of shape {v_coarse.shape}")
+        volumes.append(v_sharp)
     if tile_voxels < 1 or halo_voxels < 0:
         raise ValueError(f"a tile needs voxels and a halo of at least 0; got {tile_voxels=}, {halo_voxels=}")
     stride = network.refiner.stride
@@ -61,7 +68,7 @@ def estimate_prior(
         for core, seen in _tiles(v_coarse.shape, edge, halo):
             inputs = [
                 torch.from_numpy(np.ascontiguousarray(volume[seen], np.float32)).to(device)[None, None]
-                for volume in (v_coarse, m_rho)
+                for volume in volumes
             ]
             inside = tuple(
                 slice(wanted.start - given.start, wanted.stop - given.start)

@@ -1,6 +1,7 @@
 """Training of the prior network."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,12 +13,15 @@ from torchmetrics.functional.image import (
 )
 
 from g3r.errors import InputError
+from g3r.prior.checkpoint import load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
 from g3r.prior.training import AnnealedModule, describe_data
 
 Batch = Mapping[str, Tensor]
-"""{"coarse", "density", "truth", "mask"}, each float32 [B, 1, I, J, K]; intensities by "p99-coarse-v1"."""
+"""{"coarse", "density", "sharp", "truth", "mask"}, each float32 [B, 1, I, J, K], intensities "p99-coarse-v1".
+
+Other entries, such as the number of stacks, [B], are left as they are."""
 
 EXPORT_KEY = "g3r_prior"
 """Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
@@ -39,6 +43,7 @@ class PriorModule(AnnealedModule):
         beta: gate at zero density.
         use_gate: False sets G = 1 (an ablation).
         use_density: False hides the density from F (an ablation).
+        use_sharp: False leaves V_sharp out: Eq. 7 as printed (an ablation).
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
@@ -46,9 +51,12 @@ class PriorModule(AnnealedModule):
         augment_orientation: turn and mirror each training batch by a random symmetry of the cube, so that
             the prior does not depend on the orientation in which a subject is reconstructed.
         voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
+        start_from: prior file whose weights to begin with; channels that it lacks begin at zero, and so does
+            the last layer if its prior has another base.
 
     Raises:
         ValueError: from the network, or a rate or weight out of range.
+        InputError: `start_from` cannot be read, or is of a network of another size.
     """
 
     def __init__(
@@ -60,29 +68,33 @@ class PriorModule(AnnealedModule):
         beta: float = 1.0,
         use_gate: bool = True,
         use_density: bool = True,
+        use_sharp: bool = True,
         learning_rate: float = 1e-3,
         weight_decay: float = 1e-4,
         warmup_steps: int = 100,
         background_weight: float = 0.01,
         augment_orientation: bool = True,
         voxel_mm: float | None = None,
+        start_from: str | None = None,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
         if not 0 <= background_weight <= 1:
             raise ValueError(f"got {background_weight=}")
         self.save_hyperparameters()
         self.network = DensityGatedPriorNetwork(
-            channels, units, tail_channels, alpha, beta, use_gate, use_density
+            channels, units, tail_channels, alpha, beta, use_gate, use_density, use_sharp
         ).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        if start_from is not None:
+            take_weights(self.network, start_from)
         self.background_weight = background_weight
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
         self._training_data = "not recorded"
         self._panel: Tensor | None = None
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
+    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
         """Return V_prior; see `DensityGatedPriorNetwork.forward`."""
-        return self.network(v_coarse, m_rho)
+        return self.network(v_coarse, m_rho, v_sharp)
 
     # ---- training -------------------------------------------------------------------------------------
 
@@ -91,7 +103,7 @@ class PriorModule(AnnealedModule):
         if self.augment_orientation:
             batch = random_cube_symmetry(batch)
         weight = loss_weight(batch["mask"], self.background_weight)
-        loss = weighted_l1(self(batch["coarse"], batch["density"]), batch["truth"], weight)
+        loss = weighted_l1(self(batch["coarse"], batch["density"], batch["sharp"]), batch["truth"], weight)
         n_samples = batch["truth"].shape[0]
         self.log("train/l1_prior", loss, prog_bar=True, batch_size=n_samples)
         coarse_loss = weighted_l1(batch["coarse"], batch["truth"], weight)
@@ -107,7 +119,7 @@ class PriorModule(AnnealedModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Log L1, PSNR (dB) and SSIM in the mask, for the prior and for V_coarse as the baseline."""
         coarse, truth, mask = batch["coarse"], batch["truth"], batch["mask"] > 0.5
-        prior = self(coarse, batch["density"]).to(truth.dtype)
+        prior = self(coarse, batch["density"], batch["sharp"]).to(truth.dtype)
         weight = loss_weight(batch["mask"], self.background_weight)
         for name, volume in (("prior", prior), ("coarse", coarse)):
             scores = {"l1": [float(weighted_l1(volume, truth, weight))]}
@@ -166,6 +178,32 @@ class PriorModule(AnnealedModule):
         }
 
 
+def take_weights(network: DensityGatedPriorNetwork, path: str) -> None:
+    """Begin with the weights of a prior file, of a network that may have had fewer inputs.
+
+    Raises:
+        InputError: the file cannot be read, or its network has other channels or units.
+    """
+    other, meta = load_prior(Path(path))
+    own = network.state_dict()
+    for name, given in other.state_dict().items():
+        into = own.get(name)
+        fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]
+        if into is None or not fits or into.shape[2:] != given.shape[2:] or into.numel() < given.numel():
+            raise InputError(
+                f"model.start_from: {path} has {dict(meta.network_arguments)}, which do not fit this network; "
+                "train one of the same channels and units"
+            )
+        if into.shape != given.shape:
+            into.zero_()
+            into[:, : given.shape[1]] = given
+        else:
+            into.copy_(given)
+    if other.refiner.use_sharp != network.refiner.use_sharp:
+        torch.nn.init.zeros_(network.refiner.head.weight)
+        torch.nn.init.zeros_(network.refiner.head.bias)  # type: ignore[arg-type]
+
+
 def loss_weight(mask: Tensor, background_weight: float) -> Tensor:
     """Return 1 in the mask and `background_weight` elsewhere, [B, 1, I, J, K]."""
     return background_weight + (1.0 - background_weight) * (mask > 0.5).to(mask.dtype)
@@ -188,7 +226,10 @@ def random_cube_symmetry(batch: Batch) -> dict[str, Tensor]:
         order = [0, 1, 2]
     mirrored = [2 + axis for axis in range(3) if torch.rand(()) < 0.5]
     dims = [0, 1, *[2 + axis for axis in order]]
-    return {name: value.permute(dims).flip(mirrored).contiguous() for name, value in batch.items()}
+    return {
+        name: value.permute(dims).flip(mirrored).contiguous() if value.ndim == 5 else value
+        for name, value in batch.items()
+    }
 
 
 def scores_in_mask(volume: Tensor, truth: Tensor, mask: Tensor) -> dict[str, list[float]]:
@@ -216,7 +257,7 @@ def panel(batch: Batch, prior: Tensor, gate: DensityGate) -> Tensor:
     The section is the one with the most brain of the batch's first sample. Density is shown as
     c = 1 - exp(-M), the error as 4 |prior - truth|.
     """
-    volumes = {name: value[0, 0].detach().float().cpu() for name, value in batch.items()}
+    volumes = {name: value[0, 0].detach().float().cpu() for name, value in batch.items() if value.ndim == 5}
     section = int((volumes["mask"] > 0.5).sum((0, 1)).argmax())
     truth, density, shown = volumes["truth"], volumes["density"], prior[0, 0].detach().float().cpu()
     row = [

@@ -40,6 +40,7 @@ class ResidualRefiner(nn.Module):
         units: residual units (two 3x3x3 convolutions each) per level and direction; one number per level.
         tail_channels: feature channels at full resolution.
         use_density: False leaves c out (an ablation); the signature of `forward` stays the same.
+        use_sharp: True shows V_sharp to the network, beside V_coarse.
 
     Raises:
         ValueError: no level, different numbers of levels, or a count below 1.
@@ -51,6 +52,7 @@ class ResidualRefiner(nn.Module):
         units: Sequence[int] = (1, 2, 3),
         tail_channels: int = 8,
         use_density: bool = True,
+        use_sharp: bool = False,
     ) -> None:
         super().__init__()
         if not channels or len(channels) != len(units) or min(*channels, *units, tail_channels) < 1:
@@ -62,8 +64,9 @@ class ResidualRefiner(nn.Module):
         self.units = tuple(int(value) for value in units)
         self.tail_channels = int(tail_channels)
         self.use_density = bool(use_density)
+        self.use_sharp = bool(use_sharp)
         self.stride = 2 ** len(self.channels)
-        in_channels = 2 if use_density else 1
+        in_channels = 1 + self.use_density + self.use_sharp
 
         self.stem = Convolution(3, 8 * in_channels, self.channels[0], **_BLOCK)
         self.encoder = nn.ModuleList()
@@ -119,19 +122,31 @@ class ResidualRefiner(nn.Module):
             "units": list(self.units),
             "tail_channels": self.tail_channels,
             "use_density": self.use_density,
+            "use_sharp": self.use_sharp,
         }
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor) -> Tensor:
+    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
         """Return the ungated residual F.
 
         Args:
             v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
             m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
+            v_sharp: [B, 1, I, J, K], on V_coarse's scale; needed with `use_sharp`, not looked at without.
 
         Returns:
             [B, 1, I, J, K]; any size works, it is padded with zeros at the far end inside.
+
+        Raises:
+            ValueError: `use_sharp` without V_sharp.
         """
-        inputs = torch.cat([v_coarse, confidence_from_density(m_rho)], 1) if self.use_density else v_coarse
+        given = [v_coarse]
+        if self.use_density:
+            given.append(confidence_from_density(m_rho))
+        if self.use_sharp:
+            if v_sharp is None:
+                raise ValueError("this network needs V_sharp")
+            given.append(v_sharp)
+        inputs = torch.cat(given, 1)
         size = inputs.shape[2:]
         far_end = [padding for extent in reversed(size) for padding in (0, -extent % self.stride)]
         inputs = functional.pad(inputs, far_end)

@@ -10,6 +10,7 @@ from moving_heads import Moving, as_slices, pixel_errors_mm, simulated, slices_d
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack
+from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.template import AtlasTemplate
 from g3r.acquisition.voxel_operator import VoxelOperator
@@ -20,7 +21,7 @@ from g3r.motion.orientation import centred_on_headers
 from g3r.motion.slice_registration import register_slices, try_neighbours
 from g3r.motion.slice_rounds import slice_weights
 from g3r.motion.stack_registration import register_stacks, self_consistency
-from g3r.motion.volume import grid_around, solve_volume
+from g3r.motion.volume import grid_around
 
 OFF = MotionSettings(template=False, network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=1.8)
 

@@ -1,0 +1,121 @@
+"""The expected absolute error as a product of powers of the evidence, fitted by maximum likelihood."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+DEPTH_MM = 3.0
+"""How far the rim of the mask is felt."""
+
+FLOORS = {"residual": 0.005, "edge": 0.01, "texture": 0.005, "from_prior": 0.003, "unmeasured": 0.02}
+"""Added before the logarithm: below them, differences in normalised intensities (or of 1 - c) say nothing."""
+
+SMALLEST, LARGEST = 1e-4, 1.0
+"""Bounds of the answer, in normalised intensities: nothing is known better than a ten-thousandth of the
+brightest tissue, or worse than by all of it."""
+
+RIDGE = 1e-4
+"""Keeps coefficients finite that a small sample does not determine."""
+
+
+def terms(evidence: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """What the logarithm of the answer is linear in, by name: each [n], larger where more is in doubt."""
+    found = {f"log {name}": np.log(evidence[name] + floor) for name, floor in FLOORS.items()}
+    found["rim"] = np.exp(-evidence["depth_mm"] / DEPTH_MM)
+    if "prior_share" in evidence:
+        found["prior_share"] = evidence["prior_share"]
+    return found
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """ln u = intercept + sum of coefficient times term.
+
+    Args:
+        intercept: in the logarithm of normalised intensities.
+        coefficients: of the terms by name; not negative, so that more evidence of doubt never means less.
+    """
+
+    intercept: float
+    coefficients: dict[str, float]
+
+    def expected(self, evidence: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Expected absolute error u [n], in normalised intensities.
+
+        Raises:
+            ValueError: evidence that the model was fitted with is missing.
+        """
+        found = terms(evidence)
+        missing = sorted(set(self.coefficients) - set(found))
+        if missing:
+            raise ValueError(f"no evidence for {', '.join(missing)}")
+        log_u = self.intercept + sum(b * found[name] for name, b in self.coefficients.items())
+        return np.clip(np.exp(np.asarray(log_u, dtype=np.float64)), SMALLEST, LARGEST)
+
+
+def fit_model(
+    samples: Mapping[str, NDArray[np.float64]],
+    error: NDArray[np.float64],
+    weight: NDArray[np.float64] | None = None,
+) -> ErrorModel:
+    """The model under which the errors are most likely, with an exponential distribution of mean u.
+
+    Minimises the mean of ln u + |error| / u, which is convex in the coefficients and lowest where u is the mean
+    absolute error, whatever the true distribution (a proper score of the mean). Coefficients are held at zero or above.
+
+    Args:
+        samples: `terms` of n voxels.
+        error: [n] volume minus truth.
+        weight: [n] how much each voxel counts; all the same when None.
+
+    Raises:
+        ValueError: fewer voxels than coefficients.
+    """
+    names = list(samples)
+    size = np.abs(error)
+    if len(size) <= len(names):
+        raise ValueError(f"{len(size)} voxels for {len(names) + 1} coefficients; expected more")
+    columns = np.stack([samples[name] for name in names], axis=1)
+    middle, spread = columns.mean(0), np.maximum(columns.std(0), 1e-6)
+    design = np.c_[np.ones(len(size)), (columns - middle) / spread]
+    share = np.full(len(size), 1 / len(size)) if weight is None else weight / weight.sum()
+
+    def loss(b: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        log_u = np.clip(design @ b, -30, 30)
+        ratio = size * np.exp(-log_u)
+        value = share @ (log_u + ratio) + RIDGE * (b[1:] ** 2).sum()
+        return float(value), design.T @ (share * (1 - ratio)) + 2 * RIDGE * np.r_[0, b[1:]]
+
+    start = np.r_[np.log(max(float(share @ size), 1e-30)), np.zeros(len(names))]
+    bounds = [(None, None), *[(0.0, None)] * len(names)]
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    slopes = found[1:] / spread
+    return ErrorModel(
+        float(found[0] - slopes @ middle), {n: float(b) for n, b in zip(names, slopes, strict=True)}
+    )
+
+
+def save_calibration(path: Path, models: Mapping[str, ErrorModel], fitted_on: Mapping[str, Any]) -> None:
+    """Write models by name, with what each was fitted on."""
+    record = {
+        name: {"intercept": m.intercept, "coefficients": m.coefficients, "fitted_on": fitted_on.get(name)}
+        for name, m in models.items()
+    }
+    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def load_calibration(path: Path) -> dict[str, ErrorModel]:
+    """Models by name."""
+    record = json.loads(path.read_text(encoding="utf-8"))
+    return {
+        name: ErrorModel(float(one["intercept"]), {k: float(v) for k, v in one["coefficients"].items()})
+        for name, one in record.items()
+    }

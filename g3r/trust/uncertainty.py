@@ -1,0 +1,128 @@
+"""uncertainty.nii.gz: the expected absolute error of each voxel of the volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.fitting.slice_stage import SliceFit
+from g3r.geometry import VolumeGrid
+from g3r.trust.evidence import gather_evidence, mean_residual, on_grid
+from g3r.trust.model import ErrorModel, load_calibration
+
+CALIBRATION = Path(__file__).parent / "calibration.json"
+
+WITH_PRIOR, WITHOUT_PRIOR = "with prior", "without prior"
+"""Names of the two calibrations: for reconstructions that used a prior, and for those that did not."""
+
+MEANING = "expected absolute error of volume.nii.gz, in its intensity units"
+
+DOUBTED_NOTE = (
+    "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
+)
+UNCHECKED_NOTE = "a single stack: nothing but the prior checks where its slices lie"
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The map and what run.json says about it.
+
+    Attributes:
+        expected_error: [I, J, K] in the volume's intensities; zero outside the mask.
+        record: median and 90th percentile in the mask, units, calibration, doubts.
+    """
+
+    expected_error: NDArray[np.float32]
+    record: dict[str, Any]
+
+
+def estimate_uncertainty(
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    grid: VolumeGrid,
+    fit: SliceFit,
+    *,
+    prior: NDArray[np.float32],
+    density: NDArray[np.float32],
+    prior_grid: VolumeGrid,
+    prior_share: NDArray[np.float32] | None,
+    intensity: float = 1.0,
+    trusted: bool | None = True,
+) -> Uncertainty:
+    """The expected absolute error of every voxel of the mask.
+
+    A product of powers of what is known without the truth, with coefficients fitted to simulated subjects
+    (`python -m benchmarks.uncertainty fit`). It is a mean over voxels that look alike to the pipeline, not a
+    bound: errors of single voxels scatter around it about as an exponential distribution does.
+
+    Args:
+        volume: [I, J, K] normalised intensities.
+        mask: [I, J, K].
+        grid: of both.
+        fit: Gaussians and slices as the fit left them, in the volume's intensities.
+        prior, density: on `prior_grid`, normalised intensities; where no network was used the prior is what
+            the fit started from.
+        prior_grid: see there.
+        prior_share: [I, J, K] on `grid`; None where no network was used.
+        intensity: what 1 stands for; the map is multiplied by it.
+        trusted: whether the registration is; None where nothing checks it.
+    """
+    evidence = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
+    name = WITHOUT_PRIOR if prior_share is None else WITH_PRIOR
+    return uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
+
+
+def collect(
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    grid: VolumeGrid,
+    fit: SliceFit,
+    prior: NDArray[np.float32],
+    density: NDArray[np.float32],
+    prior_grid: VolumeGrid,
+    prior_share: NDArray[np.float32] | None,
+) -> dict[str, NDArray[np.float64]]:
+    """The evidence on the voxels of the mask; see `estimate_uncertainty` for the arguments."""
+    return gather_evidence(
+        volume, mask, grid,
+        residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.shading, grid),
+        density=on_grid(density, prior_grid, grid),
+        prior=on_grid(prior, prior_grid, grid),
+        prior_share=prior_share,
+    )  # fmt: skip
+
+
+def uncertainty_of(
+    evidence: dict[str, NDArray[np.float64]],
+    model: ErrorModel,
+    name: str,
+    mask: NDArray[np.bool_],
+    intensity: float,
+    trusted: bool | None,
+) -> Uncertainty:
+    """The map of one model, and its record."""
+    error = model.expected(evidence)
+    expected = np.zeros(mask.shape, np.float32)
+    expected[mask] = error * intensity
+    record: dict[str, Any] = {
+        "meaning": MEANING,
+        "median_in_mask": float(np.median(error)) * intensity,
+        "p90_in_mask": float(np.percentile(error, 90)) * intensity,
+        "median_over_brightest": float(np.median(error)),
+        "calibration": name,
+        "registration_trusted": trusted,
+    }
+    if trusted is not True:
+        record["note"] = UNCHECKED_NOTE if trusted is None else DOUBTED_NOTE
+    return Uncertainty(expected, record)
+
+
+@cache
+def calibration() -> dict[str, ErrorModel]:
+    """The models that ship with the package."""
+    return load_calibration(CALIBRATION)
