@@ -19,7 +19,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias clean
+.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation ablate-networks clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -75,6 +75,17 @@ bench-layers: install ## what each layer of registration brings, on the cases (G
 
 bench-bias: install ## poses and volume under shading (G3R_TEST_DATA)
 	$(BIN)/python -m benchmarks.motion_bias --docs docs/motion.md $(BENCH_ARGS)
+
+bench-prior: install ## the prior volume alone at true poses, and its seconds (G3R_TEST_DATA): docs/prior.md
+	$(BIN)/python -m benchmarks.prior_alone --docs docs/prior.md $(BENCH_ARGS)
+
+bench-ablation: install ## with and without the prior, 1 to 3 stacks, 8 subjects (G3R_TEST_DATA): docs/prior.md
+	$(BIN)/python -m benchmarks.prior_ablation --jobs 2 --docs docs/prior.md \
+		--figure docs/images/prior-ablation.png $(BENCH_ARGS)
+
+ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
+	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \
+		--figure docs/images/prior-networks.png $(BENCH_ARGS)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,323 @@
+"""`python -m benchmarks.prior_networks`: variants of the prior network, trained alike and compared."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.command import parser_of, run_command
+from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+CONFIG = Path(__file__).resolve().parents[1] / "lightning_configs" / "prior.yaml"
+
+LEFT_OUT = ("sta24", "sta30", "sta34")
+VALIDATED_ON = ("*-operated",)
+"""Subjects of the atlas: the first are for judging, the second choose, the rest train."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A network to be trained.
+
+    Args:
+        name: of its folder, and in tables.
+        what: how it differs, in words.
+        options: of `PriorModule`, beside those of the configuration.
+        is_size: whether it belongs to the curve of error against seconds.
+    """
+
+    name: str
+    what: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    is_size: bool = False
+
+
+VARIANTS = (
+    Variant("full", "the configuration as it is", is_size=True),
+    Variant("no-gate", "G = 1 everywhere", {"use_gate": False}),
+    Variant("no-density", "F does not see M_rho; gated", {"use_density": False}),
+    Variant("no-density-no-gate", "neither", {"use_density": False, "use_gate": False}),
+    Variant("alpha-0.05", "the paper's gate", {"alpha": 0.05}),
+    Variant("coarse-base", "Eq. 7 as printed: V_coarse instead of V_sharp", {"use_sharp": False}),
+    Variant("as-printed", "V_coarse, alpha 0.05", {"use_sharp": False, "alpha": 0.05}),
+    Variant("size-16-32-64", "channels 16, 32, 64", {"channels": [16, 32, 64]}, is_size=True),
+    Variant("size-32-64-96", "channels 32, 64, 96", {"channels": [32, 64, 96]}, is_size=True),
+    Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
+)
+
+SPEED_SHAPE = (129, 152, 130)
+"""Voxels of a 36-week brain at 0.8 mm with its margin (`benchmarks.prior_alone`)."""
+
+REPEATS = 3
+
+DEFAULT_FOLDER = Path("runs") / "bench" / "prior-networks"
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = parser_of(
+        "prior_networks",
+        "Train variants of the prior network for the same number of steps on the same subjects and seed, and "
+        "compare them on the validation volumes. Finished ones are kept, interrupted ones go on. Needs "
+        "the atlas in the folder that G3R_TEST_DATA names, or --source.",
+        DEFAULT_FOLDER,
+    )
+    parser.add_argument(
+        "--steps", type=int, default=300, metavar="N", help="of the optimiser, to whole epochs"
+    )
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help=", ".join(names(VARIANTS)))
+    parser.add_argument("--source", type=Path, help="atlas folder (None: the one of the test data)")
+    parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="synthetic subjects")
+    parser.add_argument("--val-subjects", type=int, default=9, metavar="N", help="volumes to compare on")
+    parser.add_argument("--no-train", action="store_true", help="only the table and the figure")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw errors and seconds")
+    parser.add_argument(
+        "train_args",
+        nargs="*",
+        metavar="-- ARG",
+        help="more arguments of g3r-pretrain, such as --data.seed 2",
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = build_parser()
+    options = parser.parse_args(argv)
+    unknown = set(options.only) - set(names(VARIANTS))
+    if unknown:
+        parser.error(f"--only {' '.join(sorted(unknown))}; expected {', '.join(names(VARIANTS))}")
+    if options.steps < 1:
+        parser.error(f"--steps {options.steps}; expected at least 1")
+    return run_command("prior_networks", _run, options)
+
+
+def names(variants: Iterable[Variant]) -> list[str]:
+    """Their names."""
+    return [variant.name for variant in variants]
+
+
+def _run(options: argparse.Namespace) -> int:
+    import yaml
+
+    from benchmarks.runs import available_cores, machine, use_threads
+    from benchmarks.subjects import test_data_folder
+
+    config = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
+    threads = options.threads or available_cores()
+    path = options.output / "networks.json"
+    record: dict[str, Any] = {"threads": threads, "machine": machine(), "baselines": {}, "variants": {}}
+    if path.is_file():
+        record |= json.loads(path.read_text(encoding="utf-8"))
+    if not options.no_train:
+        use_threads(threads)
+        source = options.source or test_data_folder() / "atlas"
+        data = data_arguments(source, options.cache, options.val_subjects)
+        n_epochs = epochs_of(options.steps, config)
+        volumes: list[dict[str, Tensor]] = []
+        for variant in distinct_variants(config):
+            if options.only and variant.name not in options.only:
+                continue
+            kept = record["variants"].get(variant.name, {})
+            if kept.get("epochs") == n_epochs and kept.get("options") == dict(variant.options):
+                print(f"{variant.name}: kept")
+                continue
+            run = options.output / variant.name
+            checkpoint, seconds = train(variant, run, n_epochs, [*data, *options.train_args])
+            if checkpoint is None:
+                print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
+                continue
+            volumes = volumes or validation_volumes(source, options.cache, options.val_subjects, config)
+            record["baselines"] = record["baselines"] or baseline_scores(volumes)
+            record["variants"][variant.name] = {
+                "what": variant.what, "options": dict(variant.options), "is_size": variant.is_size,
+                "epochs": n_epochs, "train_seconds": round(seconds), **evaluate(checkpoint, run, volumes),
+            }  # fmt: skip
+            write_json(path, record)
+    if not record["variants"]:
+        raise InputError(f"{path}: holds no trained variant; leave out --no-train")
+    text = network_tables(record)
+    write_text(options.output / "networks.md", text)
+    print(text)
+    if options.docs:
+        put_into(options.docs, "networks", text)
+    if options.figure:
+        from benchmarks.prior_figures import draw_networks
+
+        draw_networks(record, options.figure)
+    return 0
+
+
+def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
+    """The variants, without a size that is the configuration's own."""
+    model = {"use_gate": True, "use_density": True, "use_sharp": True, **config["model"]}
+    return [
+        variant
+        for variant in VARIANTS
+        if not variant.options or any(model.get(name) != value for name, value in variant.options.items())
+    ]
+
+
+def epochs_of(steps: int, config: Mapping[str, Any]) -> int:
+    """Whole epochs nearest to a number of optimiser steps, at least one."""
+    data = config["data"]["init_args"]
+    per_epoch = data["subjects_per_epoch"] * data["patches_per_subject"] // data["batch_size"]
+    return max(1, round(steps / per_epoch))
+
+
+def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
+    """What all variants are told about their data."""
+    listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
+    return [
+        f"--data.source={source}", f"--data.cache={cache}", f"--data.val_subjects={val_subjects}",
+        *(f"--data.{name}={json.dumps(patterns)}" for name, patterns in listed.items()),
+    ]  # fmt: skip
+
+
+def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
+    """Train a variant in a process of its own, going on where an earlier one stopped.
+
+    Returns:
+        Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    last = newest_checkpoint(run)
+    command = [
+        sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(CONFIG), *arguments,
+        *(f"--model.{name}={json.dumps(value)}" for name, value in variant.options.items()),
+        f"--trainer.max_epochs={n_epochs}", "--trainer.max_time=null", "--trainer.enable_progress_bar=false",
+        f"--trainer.logger.init_args.save_dir={run}", "--trainer.logger.init_args.name=logs",
+        *([f"--ckpt_path={last}"] if last else []),
+    ]  # fmt: skip
+    print(f"{variant.name}: {'going on' if last else 'training'}, {n_epochs} epochs", flush=True)
+    start = time.perf_counter()
+    with (run / "train.log").open("ab") as log:
+        done = subprocess.run(command, cwd=CONFIG.parents[1], stdout=log, stderr=log, check=False)
+    seconds = time.perf_counter() - start
+    return (newest_checkpoint(run) if done.returncode == 0 else None), seconds
+
+
+def newest_checkpoint(run: Path) -> Path | None:
+    """The last checkpoint of the last process that trained in a folder."""
+    found = sorted(run.glob("logs/version_*/checkpoints/last*.ckpt"), key=lambda path: path.stat().st_mtime)
+    return found[-1] if found else None
+
+
+def validation_volumes(
+    source: Path, cache: Path, val_subjects: int, config: Mapping[str, Any]
+) -> list[dict[str, Tensor]]:
+    """The volumes that every variant is compared on: those that its training validated on."""
+    from data_synth.datamodule import StackSynthesisDataModule
+
+    settings = {
+        **config["data"]["init_args"], "source": str(source), "cache": str(cache),
+        "val_subjects": val_subjects, "exclude": list(LEFT_OUT), "val_include": list(VALIDATED_ON),
+    }  # fmt: skip
+    return list(StackSynthesisDataModule(**settings).val_dataloader())
+
+
+def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
+    """Export a variant and score it: errors by number of stacks, seconds for a whole brain, its size."""
+    import numpy as np
+    import torch
+
+    from g3r.cli import export
+    from g3r.prior import estimate_prior, load_prior
+
+    exported = run / "prior.pt"
+    if export.main([str(checkpoint), str(exported), "--force"]) != 0:
+        raise InputError(f"{checkpoint}: cannot be exported; remove {run} and train again")
+    network, _ = load_prior(exported)
+    with torch.inference_mode():
+        priors = [network(one["coarse"], one["density"], one["sharp"]) for one in volumes]
+    rng = np.random.default_rng(0)
+    inputs = [rng.random(SPEED_SHAPE, dtype=np.float32) for _ in range(3)]
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        estimate_prior(network, *inputs)
+        seconds.append(time.perf_counter() - start)
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    return {
+        "steps": int(content["global_step"]),
+        "parameters": sum(value.numel() for value in network.parameters()),
+        "seconds": round(min(seconds), 2),
+        "scores": scores_by_stacks(priors, volumes),
+    }
+
+
+def baseline_scores(volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
+    """What the network starts from, scored alike."""
+    return {
+        name: scores_by_stacks([one[key] for one in volumes], volumes)
+        for name, key in (("V_coarse", "coarse"), ("V_sharp", "sharp"))
+    }
+
+
+def scores_by_stacks(
+    made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]
+) -> dict[str, dict[str, float]]:
+    """Mean L1, PSNR (dB) and SSIM in the mask, for each number of stacks and over all ("all")."""
+    from g3r.prior.lightning_module import scores_in_mask
+
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for volume, one in zip(made, volumes, strict=True):
+        inside = one["mask"] > 0.5
+        scores = scores_in_mask(volume, one["truth"], inside)
+        l1 = float((volume - one["truth"])[inside].abs().mean())
+        row = (l1, mean(scores["psnr"]), mean(scores["ssim"]))
+        for key in (str(int(one["n_stacks"][0])), "all"):
+            rows.setdefault(key, []).append(row)
+    return {
+        key: {name: mean(row[n] for row in found) for n, name in enumerate(("l1", "psnr_db", "ssim"))}
+        for key, found in sorted(rows.items())
+    }
+
+
+def network_tables(record: Mapping[str, Any]) -> str:
+    """A row per variant in Markdown, those it starts from first."""
+    variants: Mapping[str, Any] = record["variants"]
+    ordered = [name for name in names(VARIANTS) if name in variants]
+    numbers = sorted(n for n in variants[ordered[0]]["scores"] if n != "all")
+    head = ["", "differs by", "L1", *(f"{n} stack{'s' * (n != '1')}, dB" for n in numbers), "all, dB", "SSIM"]
+    head += ["weights", "s per brain", "steps", "trained, min"]
+    rows = [
+        [name, "", *_score_cells(scores, numbers), "", "", "", ""]
+        for name, scores in record["baselines"].items()
+    ]
+    for name in ordered:
+        one = variants[name]
+        rows.append(
+            [name, one["what"], *_score_cells(one["scores"], numbers), f"{one['parameters'] / 1e6:.2f} M",
+             f"{one['seconds']:.1f}", one["steps"], f"{one['train_seconds'] / 60:.0f}"]
+        )  # fmt: skip
+    size = " x ".join(map(str, SPEED_SHAPE))
+    return "\n".join(
+        [
+            "Mean over the validation volumes, in the mask, in normalised intensities (PSNR: range 1); "
+            f"seconds for {size} voxels on {record['threads']} threads.",
+            "", markdown_table(head, rows),
+        ]
+    )  # fmt: skip
+
+
+def _score_cells(scores: Mapping[str, Any], numbers: Sequence[str]) -> list[str]:
+    every = scores["all"]
+    of_number = [f"{scores[n]['psnr_db']:.2f}" if n in scores else "" for n in numbers]
+    return [f"{every['l1']:.4f}", *of_number, f"{every['psnr_db']:.2f}", f"{every['ssim']:.3f}"]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
