@@ -30,6 +30,7 @@ from g3r.geometry import VolumeGrid
 from g3r.motion import MotionEstimate, estimate_motion
 from g3r.motion.confidence import (
     pose_warnings,
+    registration_trusted,
     stack_confidences,
 )
 from g3r.motion.prior_registration import register_to_prior
@@ -42,6 +43,7 @@ from g3r.prior.pose_checkpoint import PoseCheckpoint
 from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
 from g3r.run_record import Clock, left_out_notes, run_record
+from g3r.trust import estimate_uncertainty
 
 logger = logging.getLogger(__name__)
 
@@ -202,17 +204,23 @@ class GaussianReconstructor:
             if not np.isfinite(volume).all():
                 raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         intensity = first_scale * scale
+        with clock("uncertainty"):
+            uncertainty = estimate_uncertainty(
+                volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,
+                with_prior=settings.use_prior, intensity=intensity, trusted=registration_trusted(confidences),
+            )  # fmt: skip
         record = run_record(
             settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
             warnings,
         )  # fmt: skip
+        record["uncertainty"] = uncertainty.record
         record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
         for warning in warnings:
             logger.warning(warning)
         return ReconstructionResult(
             volume * np.float32(intensity), mask, grid, prior * np.float32(intensity),
             coarse * np.float32(intensity), density, prior_grid, fit.cloud, intensity, fit.slices, fit.gain,
-            fit.weight, motion.ncc, record,
+            fit.weight, motion.ncc, uncertainty.expected_error, record,
         )  # fmt: skip
 
     def register_stacks(self, stacks: Sequence[Stack]) -> MotionEstimate:

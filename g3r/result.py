@@ -33,8 +33,8 @@ LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
 stack's median of pixels is small; one that correlates less than the third with the volume does not fit."""
 
 OUTPUT_NAMES = (
-    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz", "gaussians.npz",
-    "slices.tsv", "run.json", "sections.png",
+    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
+    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
 )  # fmt: skip
 
 
@@ -48,6 +48,7 @@ class ReconstructionResult:
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
         gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
+        uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask.
         record: settings, versions, seconds, memory, warnings: run.json.
     """
 
@@ -64,6 +65,7 @@ class ReconstructionResult:
     gain: NDArray[np.float64]
     weight: NDArray[np.float64]
     ncc: NDArray[np.float64]
+    uncertainty: NDArray[np.float32]
     record: dict[str, Any] = field(default_factory=dict)
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
@@ -98,6 +100,7 @@ class ReconstructionResult:
 
         save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
         save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
+        save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
         for name in ("prior", "coarse", "density"):
             save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
         self.cloud.save(folder / "gaussians.npz")

@@ -24,6 +24,7 @@ ALLOWED = {
     "motion": {"geometry", "acquisition", "gaussians"},
     "prior": {"geometry", "acquisition", "gaussians"},
     "fitting": BELOW_FITTING,
+    "trust": {"geometry", "acquisition", "gaussians", "fitting"},
     "evaluation": {"geometry", "acquisition"},
     "report": BELOW_FITTING | {"fitting"},
     "presets": BELOW_FITTING | {"fitting"},

@@ -1,4 +1,4 @@
-"""How far a result can be trusted, voxel by voxel: the expected size of the error, calibrated on simulations."""
+"""How far a result can be trusted: the expected size of each voxel's error, calibrated on simulations."""
 
 from g3r.trust.uncertainty import Uncertainty, estimate_uncertainty
 

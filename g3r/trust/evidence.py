@@ -25,7 +25,7 @@ from g3r.geometry import VolumeGrid
 
 RESIDUAL_VOXEL_MM = 1.6
 RESIDUAL_SMOOTHING_MM = 1.6
-"""A mean of few noisy residuals says little: they are gathered on coarse voxels and smoothed by this sigma."""
+"""A mean of few noisy residuals says little: they are gathered on coarse voxels and smoothed."""
 
 RESIDUAL_SUPPORT = 0.1
 """Density (1 is one gapless stack) at which the local residual and that of the whole head count the same."""
@@ -51,7 +51,8 @@ def mean_residual(
     Args:
         cloud: the Gaussians.
         slices: K slices in their last poses, intensities as the cloud's.
-        gain, weight: [K] intensity factor and trust of each slice.
+        gain: [K] intensity factor of each slice.
+        weight: [K] trust in each slice.
         shading: coefficients of the stacks' fields; empty where there are none.
         grid: of the result.
     """
@@ -86,9 +87,12 @@ def gather_evidence(
     """The evidence [n] on each of the n voxels of the mask, by name.
 
     Args:
-        volume, residual, density, prior: [I, J, K] on the grid, normalised intensities; M_rho has no unit.
+        volume: [I, J, K] normalised intensities, as all intensities here.
         mask: [I, J, K] where an answer is wanted.
-        grid: of all of them.
+        grid: of all arrays.
+        residual: [I, J, K] of `mean_residual`.
+        density: [I, J, K] M_rho.
+        prior: [I, J, K] the prior volume, or what the fit started from.
         prior_share: [I, J, K] in [0, 1]; None where no prior was used.
 
     Returns:

@@ -68,8 +68,9 @@ def fit_model(
 ) -> ErrorModel:
     """The model under which the errors are most likely, with an exponential distribution of mean u.
 
-    Minimises the mean of ln u + |error| / u, which is convex in the coefficients and lowest where u is the mean
-    absolute error, whatever the true distribution (a proper score of the mean). Coefficients are held at zero or above.
+    Minimises the mean of ln u + |error| / u, which is convex in the coefficients and lowest where u is the
+    mean absolute error, whatever the true distribution (a proper score of the mean). Coefficients are held
+    at zero or above.
 
     Args:
         samples: `terms` of n voxels.

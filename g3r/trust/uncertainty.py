@@ -50,7 +50,8 @@ def estimate_uncertainty(
     prior: NDArray[np.float32],
     density: NDArray[np.float32],
     prior_grid: VolumeGrid,
-    prior_share: NDArray[np.float32] | None,
+    prior_share: NDArray[np.float32] | None = None,
+    with_prior: bool = True,
     intensity: float = 1.0,
     trusted: bool | None = True,
 ) -> Uncertainty:
@@ -65,15 +66,16 @@ def estimate_uncertainty(
         mask: [I, J, K].
         grid: of both.
         fit: Gaussians and slices as the fit left them, in the volume's intensities.
-        prior, density: on `prior_grid`, normalised intensities; where no network was used the prior is what
-            the fit started from.
-        prior_grid: see there.
+        prior: on `prior_grid`, normalised intensities; what the fit started from where no network was used.
+        density: M_rho on `prior_grid`.
+        prior_grid: of these two.
         prior_share: [I, J, K] on `grid`; None where no network was used.
+        with_prior: whether one was used: there is a calibration for each.
         intensity: what 1 stands for; the map is multiplied by it.
         trusted: whether the registration is; None where nothing checks it.
     """
     evidence = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
-    name = WITHOUT_PRIOR if prior_share is None else WITH_PRIOR
+    name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
     return uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
 
 

@@ -22,8 +22,8 @@ from g3r.reconstruct import DEFAULT_CHECKPOINT
 from g3r.result import OUTPUT_NAMES, SLICE_COLUMNS
 
 OUTPUTS = {
-    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz", "gaussians.npz",
-    "slices.tsv", "run.json", "sections.png",
+    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
+    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
 }  # fmt: skip
 QUICK = (
     "--preset",
