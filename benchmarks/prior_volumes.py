@@ -104,7 +104,7 @@ def aligned_scores(
         case: with the truth.
         truth_from_volume: where to begin: the common motion of the slices' pose error.
     """
-    moved = _refined(data, grid, case.truth, case.truth_mask, truth_from_volume)
+    moved = refined_pose(data, grid, case.truth, case.truth_mask, truth_from_volume)
     return compare(Volume(data, _moved(moved, grid.affine), case.name), case.truth, case.truth_mask).scores
 
 
@@ -125,7 +125,7 @@ def _moved(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix @ affine
 
 
-def _refined(
+def refined_pose(
     data: NDArray[np.float32],
     grid: VolumeGrid,
     truth: Volume,
