@@ -195,6 +195,8 @@ class PatchQueue(tio.Queue):
             self._subjects_loader = DataLoader(
                 self.subjects_dataset,
                 num_workers=self.num_workers,
+                # the queue takes several subjects at once; the next ones should be ready by then
+                prefetch_factor=QUEUE_SUBJECTS if self.num_workers else None,
                 batch_size=1,
                 collate_fn=_first,
                 sampler=self.subject_sampler,

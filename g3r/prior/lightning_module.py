@@ -21,7 +21,15 @@ from g3r.prior.training import AnnealedModule, describe_data
 Batch = Mapping[str, Tensor]
 """{"coarse", "density", "sharp", "truth", "mask"}, each float32 [B, 1, I, J, K], intensities "p99-coarse-v1".
 
-Other entries, such as the number of stacks, [B], are left as they are."""
+`n_stacks`, int64 [B], is optional: scores are also logged by the number of stacks where it is there. Other
+entries are left as they are."""
+
+VALIDATED = ("prior", "sharp", "coarse")
+"""Volumes that are scored: the network's, and what it starts from."""
+METRICS = ("l1", "psnr", "ssim")
+MOST_STACKS = 12
+"""More count as so many."""
+PANEL_TAG = "coarse, sharp, confidence, gate, prior, truth, 4 x error"
 
 EXPORT_KEY = "g3r_prior"
 """Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
@@ -90,7 +98,8 @@ class PriorModule(AnnealedModule):
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
         self._training_data = "not recorded"
-        self._panel: Tensor | None = None
+        self._sums = torch.zeros(0)
+        self._panels: dict[int, Tensor] = {}
 
     def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
         """Return V_prior; see `DensityGatedPriorNetwork.forward`."""
@@ -116,32 +125,50 @@ class PriorModule(AnnealedModule):
 
     # ---- validation -----------------------------------------------------------------------------------
 
+    def on_validation_epoch_start(self) -> None:
+        """Forget the last epoch's scores and images."""
+        # sum and number of each score, for each number of stacks; row 0 is everything
+        shape = (MOST_STACKS + 1, len(VALIDATED), len(METRICS), 2)
+        self._sums = torch.zeros(shape, dtype=torch.float64)
+        self._panels = {}
+
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Log L1, PSNR (dB) and SSIM in the mask, for the prior and for V_coarse as the baseline."""
-        coarse, truth, mask = batch["coarse"], batch["truth"], batch["mask"] > 0.5
-        prior = self(coarse, batch["density"], batch["sharp"]).to(truth.dtype)
+        """Score every volume of a batch in its mask: the prior, and V_sharp and V_coarse beside it."""
+        truth, mask = batch["truth"], batch["mask"] > 0.5
+        prior = self(batch["coarse"], batch["density"], batch["sharp"]).to(truth.dtype)
         weight = loss_weight(batch["mask"], self.background_weight)
-        for name, volume in (("prior", prior), ("coarse", coarse)):
-            scores = {"l1": [float(weighted_l1(volume, truth, weight))]}
-            for metric, values in scores_in_mask(volume, truth, mask).items():
-                scores[metric] = values
-            for metric, values in scores.items():
-                if values:
-                    mean = sum(values) / len(values)
-                    self.log(f"val/{metric}_{name}", mean, batch_size=len(values), prog_bar=metric == "psnr")
-        if batch_idx == 0:
-            self._panel = panel(batch, prior, self.network.gate)
+        n_stacks = stack_numbers(batch)
+        volumes = {"prior": prior, "sharp": batch["sharp"], "coarse": batch["coarse"]}
+        for v, name in enumerate(VALIDATED):
+            for b, n in enumerate(n_stacks):
+                one = slice(b, b + 1)
+                scores = scores_in_mask(volumes[name][one], truth[one], mask[one])
+                scores["l1"] = [float(weighted_l1(volumes[name][one], truth[one], weight[one]))]
+                for m, metric in enumerate(METRICS):
+                    for value in scores[metric]:
+                        for row in {0, n}:
+                            self._sums[row, v, m] += torch.tensor([value, 1.0], dtype=torch.float64)
+        for b, n in enumerate(n_stacks):
+            if n not in self._panels:
+                gate = self.network.gate if self.network.use_gate else None
+                self._panels[n] = panel({k: x[b : b + 1] for k, x in batch.items()}, prior[b : b + 1], gate)
 
     def on_validation_epoch_end(self) -> None:
-        """Send the row of images to TensorBoard, if that is the logger."""
+        """Log mean L1, PSNR (dB), SSIM and gain, over all and by number of stacks; send the images."""
+        # summed over the processes, so that all of them log, and keep, the same
+        sums = self.all_gather(self._sums.to(self.device, torch.float32))
+        assert isinstance(sums, Tensor)
+        if sums.ndim > self._sums.ndim:
+            sums = sums.sum(0)
+        for name, value in validation_scores(sums).items():
+            self.log(f"val/{name}", value, prog_bar=name == "psnr_gain")
         for logger in self.loggers:
-            if isinstance(logger, TensorBoardLogger) and self._panel is not None:
-                logger.experiment.add_image(
-                    "val/coarse density gate prior truth error",
-                    self._panel,
-                    global_step=self.global_step,
-                    dataformats="HW",
-                )
+            if isinstance(logger, TensorBoardLogger):
+                for n, image in sorted(self._panels.items()):
+                    logger.experiment.add_image(
+                        f"val/{stacks_suffix(n).removeprefix('_') or 'volume'}: {PANEL_TAG}", image,
+                        global_step=self.global_step, dataformats="HW",
+                    )  # fmt: skip
 
     # ---- what an export needs -------------------------------------------------------------------------
 
@@ -191,8 +218,8 @@ def take_weights(network: DensityGatedPriorNetwork, path: str) -> None:
         fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]
         if into is None or not fits or into.shape[2:] != given.shape[2:] or into.numel() < given.numel():
             raise InputError(
-                f"model.start_from: {path} has {dict(meta.network_arguments)}, which do not fit this network; "
-                "train one of the same channels and units"
+                f"model.start_from: {path} has {dict(meta.network_arguments)}, this network differs; "
+                "give it the same channels and units"
             )
         if into.shape != given.shape:
             into.zero_()
@@ -251,19 +278,50 @@ def scores_in_mask(volume: Tensor, truth: Tensor, mask: Tensor) -> dict[str, lis
     return scores
 
 
-def panel(batch: Batch, prior: Tensor, gate: DensityGate) -> Tensor:
-    """Return coarse, density, gate, prior, truth and error side by side, [H, W] in [0, 1].
+def stack_numbers(batch: Batch) -> list[int]:
+    """How many stacks each sample was made of, at most `MOST_STACKS`; 0 where the batch does not say."""
+    if "n_stacks" not in batch:
+        return [0] * len(batch["truth"])
+    return [min(int(n), MOST_STACKS) for n in batch["n_stacks"]]
 
-    The section is the one with the most brain of the batch's first sample. Density is shown as
-    c = 1 - exp(-M), the error as 4 |prior - truth|.
+
+def stacks_suffix(n_stacks: int) -> str:
+    """Ending of a tag: `_1stack`, `_3stacks`, or nothing for 0."""
+    return f"_{n_stacks}stack{'s' * (n_stacks > 1)}" if n_stacks else ""
+
+
+def validation_scores(sums: Tensor) -> dict[str, float]:
+    """Means by name: `psnr_prior`, `psnr_prior_1stack`, `psnr_gain` (prior less V_coarse) and so on.
+
+    Args:
+        sums: [`MOST_STACKS` + 1, volumes, metrics, 2], sums of the scores and their numbers.
+    """
+    result: dict[str, float] = {}
+    for n, of_volume in enumerate(sums.double().cpu()):
+        for name, of_metric in zip(VALIDATED, of_volume, strict=True):
+            for metric, (total, count) in zip(METRICS, of_metric.tolist(), strict=True):
+                if count:
+                    result[f"{metric}_{name}{stacks_suffix(n)}"] = total / count
+        prior, coarse = (result.get(f"psnr_{name}{stacks_suffix(n)}") for name in ("prior", "coarse"))
+        if prior is not None and coarse is not None:
+            result[f"psnr_gain{stacks_suffix(n)}"] = prior - coarse
+    return result
+
+
+def panel(batch: Batch, prior: Tensor, gate: DensityGate | None) -> Tensor:
+    """Return the volumes named in `PANEL_TAG` side by side, [H, W] in [0, 1].
+
+    The section is the one with the most brain of the batch's first sample. Confidence is c = 1 - exp(-M), the
+    gate is 1 everywhere without one, the error is 4 |prior - truth|.
     """
     volumes = {name: value[0, 0].detach().float().cpu() for name, value in batch.items() if value.ndim == 5}
     section = int((volumes["mask"] > 0.5).sum((0, 1)).argmax())
     truth, density, shown = volumes["truth"], volumes["density"], prior[0, 0].detach().float().cpu()
     row = [
         volumes["coarse"],
+        volumes["sharp"],
         confidence_from_density(density),
-        gate(density),
+        torch.ones_like(density) if gate is None else gate(density),
         shown,
         truth,
         4.0 * (shown - truth).abs(),

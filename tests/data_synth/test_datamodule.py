@@ -14,7 +14,7 @@ pytest.importorskip("torchio")
 from data_synth.atlas import cropped, find_subjects, load_subject
 from data_synth.augment import augmentation, augmented
 from data_synth.datamodule import EpochSampler, StackSynthesisDataModule
-from data_synth.dataset import SyntheticSubjects, synthesise
+from data_synth.dataset import IMAGE_KEYS, SyntheticSubjects, synthesise
 from data_synth.heads import PhantomSubject
 from data_synth.phantom import fetal_brain_phantom
 from g3r.errors import InputError
@@ -64,8 +64,10 @@ def test_batches_of_training_and_validation() -> None:
     assert len(batches) == 4
     for batch in batches:
         assert type(batch) is dict
-        assert list(batch) == ["coarse", "density", "truth", "mask"]
-        for value in batch.values():
+        assert list(batch) == [*IMAGE_KEYS, "n_stacks"]
+        assert batch["n_stacks"].shape == (2,)
+        assert 1 <= int(batch["n_stacks"].min()) <= int(batch["n_stacks"].max()) <= 6
+        for value in (batch[key] for key in IMAGE_KEYS):
             assert value.shape == (2, 1, 24, 24, 24)
             assert value.dtype == torch.float32
             assert bool(value.isfinite().all())
@@ -97,7 +99,7 @@ def test_a_sample_is_a_function_of_seed_epoch_and_index() -> None:
     torch.rand(5)  # the global generator plays no part
     other_way.sample(0, 3)
     b = other_way.sample(2, 1)
-    for key in ("coarse", "density", "truth", "mask"):
+    for key in IMAGE_KEYS:
         np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
     item = straight[2 * 4 + 1]
     np.testing.assert_array_equal(item["coarse"].data[0].numpy(), a.coarse)
@@ -177,7 +179,7 @@ def test_training_on_a_folder(atlas: Path) -> None:
     data.setup()
     assert [s.name for s in data.train_subjects.sources] == ["a/week24", "a/week30"]
     assert [s.name for s in data.val_volumes.subjects.sources] == ["b/sub-27"]
-    assert len(next(iter(data.val_dataloader()))) == 4
+    assert len(next(iter(data.val_dataloader()))) == len(IMAGE_KEYS) + 1
     mixed = StackSynthesisDataModule(str(atlas), val_include=["week24"], phantom_share=0.5, **TINY)
     mixed.setup()
     assert len(mixed.train_subjects.sources) == 4
@@ -189,6 +191,42 @@ def test_training_on_a_folder(atlas: Path) -> None:
 def test_bad_settings_say_so(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"expected|raise"):
         StackSynthesisDataModule(**{**TINY, **wrong}).setup()
+
+
+def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
+    sources = [PhantomSubject("young", 23.0, 1)]
+
+    def dataset(cache: Path | None, seed: int = 7) -> SyntheticSubjects:
+        return SyntheticSubjects(
+            sources, 2.5, length=2, seed=seed, smallest_shape=24, augment=False, distinct=1, cache=cache
+        )
+
+    fresh = dataset(None).sample(0, 1)
+    first = dataset(tmp_path)
+    made = first.sample(0, 1)
+    np.testing.assert_array_equal(made.coarse, fresh.coarse)
+    files = list(tmp_path.iterdir())
+    assert len(files) == 1
+    again = dataset(tmp_path)
+    again._made = None  # type: ignore[method-assign,assignment]  # would fail if anything had to be made
+    for epoch in (0, 3):  # every epoch is the first one again
+        kept = again.sample(epoch, 1)
+        for key in ("coarse", "density", "sharp", "truth"):
+            np.testing.assert_allclose(getattr(kept, key), getattr(fresh, key), rtol=1e-3, atol=1e-6)
+        np.testing.assert_array_equal(kept.mask, fresh.mask)
+        assert (kept.name, kept.n_stacks, kept.residual) == (fresh.name, fresh.n_stacks, fresh.residual)
+    # another recipe does not take this one's files, and a damaged file is made again
+    assert dataset(tmp_path, seed=8).kept.load(0, 1) is None
+    files[0].write_bytes(files[0].read_bytes()[:1000])
+    np.testing.assert_array_equal(dataset(tmp_path).sample(0, 1).coarse, fresh.coarse)
+    # patches of one subject differ from epoch to epoch
+    seeds = {dataset(tmp_path)[2 * epoch + 1]["sample_seed"] for epoch in (0, 1)}
+    assert seeds == {(7, 0, 1), (7, 1, 1)}
+
+
+def test_validation_takes_one_two_and_three_stacks_in_turn() -> None:
+    data = StackSynthesisDataModule("phantom", **{**TINY, "val_subjects": 3})
+    assert [int(batch["n_stacks"]) for batch in data.val_dataloader()] == [1, 2, 3]
 
 
 @pytest.mark.slow

@@ -169,7 +169,7 @@ def test_bright_rim_outside_the_mask_is_not_needed() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"thickness_mm": 0.0}, {"resolution_mm": -1.0}, {"gap_mm": -0.1}, {"snr": 0.0}, {"bias": float("nan")}],
+    [{"thickness_mm": 0.0}, {"resolution_mm": -1.0}, {"gap_mm": -2.1}, {"snr": 0.0}, {"bias": float("nan")}],
 )
 def test_impossible_settings(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
@@ -212,10 +212,11 @@ class TestMotion:
             moved = np.linalg.norm(error.apply(center) - center, axis=1)
             lengths.append(np.sqrt((moved**2).mean()))
             angles.append(np.degrees(np.sqrt((error.rotvec_rad() ** 2).sum(1).mean())))
-        assert min(lengths) > 0.2
-        assert max(lengths) < 1.2
-        assert 0.55 < np.mean(lengths) < 0.75
-        assert 0.9 < np.mean(angles) < 1.1
+        # 0.1 to 0.8 mm and 0.2 to 1.2 degrees, a third more for the tail
+        assert min(lengths) > 0.08
+        assert max(lengths) < 1.6
+        assert 0.35 < np.mean(lengths) < 0.55
+        assert 0.7 < np.mean(angles) < 1.2
         assert (
             np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max()
             == 0
@@ -226,4 +227,4 @@ class TestMotion:
     def test_shares_of_residual_kinds(self) -> None:
         rng = np.random.default_rng(4)
         kinds = [draw_residual_kind(rng) for _ in range(2000)]
-        assert abs(kinds.count("small") / 2000 - 0.6) < 0.04
+        assert abs(kinds.count("small") / 2000 - 0.65) < 0.04

@@ -17,6 +17,7 @@ lightning = pytest.importorskip("lightning.pytorch", reason="the training extra 
 
 from torch.utils.data import DataLoader  # noqa: E402
 
+from g3r.prior import PriorCheckpoint, save_prior_checkpoint  # noqa: E402
 from g3r.prior import lightning_module as training  # noqa: E402
 from g3r.prior.training import cosine_factor  # noqa: E402
 
@@ -30,14 +31,15 @@ def smooth_noise(generator, size):
 
 
 def sample(seed, size=16):
-    """One training sample: a smooth truth, and a coarse volume that is wrong where the density is low."""
+    """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
     generator = torch.Generator().manual_seed(seed)
     truth = smooth_noise(generator, size)
     density = 3 * smooth_noise(generator, size)
     error = -0.5 * torch.exp(-density) * truth + 0.02 * torch.randn(truth.shape, generator=generator)
     mask = torch.ones_like(truth)
     mask[:, :3] = 0
-    return {"coarse": mask * (truth + error), "density": density, "truth": mask * truth, "mask": mask}
+    coarse, sharp = mask * (truth + error), mask * (truth + 0.8 * error)
+    return {"coarse": coarse, "density": density, "sharp": sharp, "truth": mask * truth, "mask": mask}
 
 
 class TinyData(lightning.LightningDataModule):
@@ -86,7 +88,7 @@ def test_tensorboard_has_scalars_and_the_panel(trained):
     assert scores | speed | {"train/l1_prior", "train/l1_coarse"} <= set(log.Tags()["scalars"])
     (tag,) = log.Tags()["images"]
     image = log.Images(tag)[0]
-    assert (image.height, image.width) == (16, 6 * 16)
+    assert (image.height, image.width) == (16, 7 * 16)
 
 
 def test_training_moves_the_weights(trained):
@@ -105,7 +107,7 @@ def test_export_gives_the_same_network(trained, tmp_path, capsys):
     path = tmp_path / "prior.pt"
     assert export.main([str(checkpoint), str(path)]) == 0
     network, meta = load_prior(path)
-    inputs = torch.rand(2, 1, 1, 12, 16, 9)
+    inputs = torch.rand(3, 1, 1, 12, 16, 9)
     with torch.no_grad():
         torch.testing.assert_close(network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
     assert (meta.alpha, meta.voxel_mm) == (0.1, 0.8)
@@ -178,12 +180,34 @@ def test_a_patch_can_be_learnt():
     weight = training.loss_weight(batch["mask"], 0.1)
     optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
     for _ in range(60):
-        loss = training.weighted_l1(module(batch["coarse"], batch["density"]), batch["truth"], weight)
+        prior = module(batch["coarse"], batch["density"], batch["sharp"])
+        loss = training.weighted_l1(prior, batch["truth"], weight)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     coarse_loss = training.weighted_l1(batch["coarse"], batch["truth"], weight)
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
+
+
+@pytest.mark.parametrize("use_sharp", [False, True])
+def test_beginning_with_the_weights_of_another_prior(tmp_path, use_sharp):
+    """Channels that the file lacks have no effect at first, and another base begins as it is."""
+    torch.manual_seed(0)
+    old = training.DensityGatedPriorNetwork([8, 8], [1, 1], 4, use_sharp=use_sharp)
+    torch.nn.init.normal_(old.refiner.head.weight)
+    path = tmp_path / "old.pt"
+    save_prior_checkpoint(path, old, PriorCheckpoint(old.arguments(), 0.8, "noise"))
+    new = training.PriorModule(**SMALL, alpha=0.05, start_from=str(path)).network
+    volumes = [torch.rand(1, 1, 8, 8, 8) for _ in range(3)]
+    if use_sharp:
+        torch.testing.assert_close(new(*volumes), old(*volumes))
+    else:
+        torch.testing.assert_close(new(*volumes), volumes[2])
+        given = old.refiner.stem.conv.weight
+        torch.testing.assert_close(new.refiner.stem.conv.weight[:, : given.shape[1]], given)
+        assert float(new.refiner.stem.conv.weight[:, given.shape[1] :].abs().max()) == 0
+    with pytest.raises(InputError, match="give it the same channels and units"):
+        training.PriorModule(**{**SMALL, "channels": [8, 16]}, start_from=str(path))
 
 
 def test_loss_weight_is_one_in_the_mask_and_small_outside():

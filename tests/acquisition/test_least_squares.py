@@ -1,0 +1,55 @@
+"""V_sharp: nearer to the head than V_coarse, and what its convention promises."""
+
+import numpy as np
+import pytest
+
+from data_synth.heads import PhantomSubject, load_volume_of
+from data_synth.simulator import orthogonal_settings, simulate_stacks
+from g3r.acquisition.least_squares import SHARP_CONVENTION, sharpened_volume
+from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.scatter import coarse_and_density
+from g3r.geometry import VolumeGrid
+
+
+@pytest.fixture(scope="module")
+def head():
+    return load_volume_of(PhantomSubject("26w", 26.0, 3), 1.2)
+
+
+@pytest.fixture(scope="module", params=[1, 3])
+def slices(request, head) -> Slices:
+    settings = orthogonal_settings(
+        request.param, resolution_mm=1.2, thickness_mm=3.0, snr=40.0, bias=0.0, gain_deviation=0.0
+    )
+    stacks = simulate_stacks(head.data, head.mask, head.affine, settings, np.random.default_rng(0))
+    return slices_from_stacks([one.stack for one in stacks])
+
+
+def test_v_sharp_is_nearer_to_the_head(head, slices) -> None:
+    grid = VolumeGrid(head.data.shape, head.affine)
+    coarse, _ = coarse_and_density(slices, grid)
+    sharp = sharpened_volume(slices, grid, coarse)
+    error = {
+        name: float(np.sqrt(((volume - head.data)[head.mask] ** 2).mean()))
+        for name, volume in (("coarse", coarse), ("sharp", sharp))
+    }
+    assert error["sharp"] < 0.9 * error["coarse"]
+
+
+def test_gain_and_trust_count(head, slices) -> None:
+    grid = VolumeGrid(head.data.shape, head.affine)
+    coarse, _ = coarse_and_density(slices, grid)
+    plain = sharpened_volume(slices, grid, coarse)
+    np.testing.assert_allclose(sharpened_volume(slices, grid, 7 * coarse, np.full(len(slices), 1 / 7)), 7 * plain,
+                               atol=7e-4)  # fmt: skip
+    dark = slices.scaled(1.0)
+    dark.value[dark.pixel_index[dark.pixel_plane == 10]] = 0
+    trust = np.where(dark.pixel_plane == 10, 0.0, 1.0)
+    coarse_without, _ = coarse_and_density(dark, grid, weight=trust)
+    without = sharpened_volume(dark, grid, coarse_without, weight=trust)
+    believed = sharpened_volume(dark, grid, coarse_and_density(dark, grid)[0])
+    assert np.abs(without - plain).mean() < 0.5 * np.abs(believed - plain).mean()
+
+
+def test_the_convention_names_what_it_depends_on() -> None:
+    assert SHARP_CONVENTION == "cg6-smoothness0.1-v1"
