@@ -113,10 +113,11 @@ def save_calibration(path: Path, models: Mapping[str, ErrorModel], fitted_on: Ma
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
-def load_calibration(path: Path) -> dict[str, ErrorModel]:
-    """Models by name."""
+def load_calibration(path: Path) -> tuple[dict[str, ErrorModel], dict[str, Any]]:
+    """Models by name, and what each was fitted on."""
     record = json.loads(path.read_text(encoding="utf-8"))
-    return {
+    models = {
         name: ErrorModel(float(one["intercept"]), {k: float(v) for k, v in one["coefficients"].items()})
         for name, one in record.items()
     }
+    return models, {name: one["fitted_on"] for name, one in record.items()}

@@ -127,4 +127,4 @@ def uncertainty_of(
 @cache
 def calibration() -> dict[str, ErrorModel]:
     """The models that ship with the package."""
-    return load_calibration(CALIBRATION)
+    return load_calibration(CALIBRATION)[0]

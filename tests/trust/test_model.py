@@ -114,8 +114,8 @@ def test_missing_evidence_is_named() -> None:
 def test_file_keeps_the_model(tmp_path: Path) -> None:
     model = ErrorModel(-2.5, dict.fromkeys(terms(evidence(5, np.random.default_rng(8))), 0.25))
     save_calibration(tmp_path / "c.json", {"a": model}, {"a": {"subjects": ["x"]}})
-    assert load_calibration(tmp_path / "c.json") == {"a": model}
+    assert load_calibration(tmp_path / "c.json") == ({"a": model}, {"a": {"subjects": ["x"]}})
 
 
 def test_shipped_file_has_both() -> None:
-    assert set(load_calibration(CALIBRATION)) == {WITH_PRIOR, WITHOUT_PRIOR}
+    assert set(load_calibration(CALIBRATION)[0]) == {WITH_PRIOR, WITHOUT_PRIOR}

@@ -1,0 +1,156 @@
+"""Simulated subjects that calibrate and check uncertainty.nii.gz: evidence and error of each voxel."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.prior_volumes import refined_pose
+from benchmarks.subjects import SubjectRecipe, simulated_subject
+from g3r.acquisition.images import Volume
+from g3r.evaluation.align import resample
+from g3r.evaluation.case import SimulatedCase, load_case
+from g3r.evaluation.metrics import score
+from g3r.fitting.slice_stage import SliceFit
+from g3r.motion import MotionEstimate
+from g3r.reconstruct import GaussianReconstructor
+from g3r.result import ReconstructionResult
+from g3r.trust.uncertainty import collect
+
+FIT_VOLUMES = (
+    ("spina-bifida/sb26-operated", 3, "mild"), ("spina-bifida/sb28-operated", 3, "moderate"),
+    ("spina-bifida/sb30-operated", 3, "mild"), ("spina-bifida/sb32-operated", 3, "moderate"),
+    ("spina-bifida/sb34-operated", 3, "mild"),
+    ("spina-bifida/sb25-operated", 1, "mild"), ("spina-bifida/sb27-operated", 1, "none"),
+    ("spina-bifida/sb29-operated", 1, "mild"), ("spina-bifida/sb31-operated", 1, "mild"),
+    ("spina-bifida/sb33-operated", 1, "mild"),
+)  # fmt: skip
+"""Volume, stacks and motion of the subjects that the coefficients are fitted to. No prior was trained on
+these volumes (checkpoints are chosen by them)."""
+
+CHECK_VOLUMES = (
+    ("crl-sta/sta24", 3, "mild"), ("crl-sta/sta30", 3, "moderate"), ("crl-sta/sta34", 3, "mild"),
+    ("crl-sta/sta24", 3, "moderate"), ("crl-sta/sta30", 3, "mild"),
+    ("crl-sta/sta24", 1, "mild"), ("crl-sta/sta30", 1, "mild"), ("crl-sta/sta34", 1, "mild"),
+    ("crl-sta/sta30", 1, "none"), ("crl-sta/sta34", 1, "mild"),
+)  # fmt: skip
+"""The same of the subjects that they are checked on: weeks left out of every training and choice."""
+
+FIT_SEED, CHECK_SEED = 51_200, 52_200
+
+VOXELS_PER_SUBJECT = 40_000
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One reconstruction, voxel by voxel.
+
+    Attributes:
+        recipe: the subject.
+        n_stacks: how many of its stacks were used.
+        evidence: [n] by name, a random choice of the voxels inside both masks.
+        error: [n] volume minus truth, in normalised intensities.
+        psnr_db: of the volume.
+        median_mm: error of the poses.
+        trusted: whether the record trusts the registration.
+        seconds: of reconstruction and judgement; registration comes from the cache.
+        map_seconds: of the map alone, processor time.
+    """
+
+    recipe: SubjectRecipe
+    n_stacks: int
+    evidence: dict[str, NDArray[np.float64]]
+    error: NDArray[np.float64]
+    psnr_db: float
+    median_mm: float
+    trusted: bool | None
+    seconds: float
+    map_seconds: float
+
+    @property
+    def label(self) -> str:
+        """Subject and number of stacks."""
+        return f"{self.recipe.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+
+
+def fit_recipes() -> list[tuple[SubjectRecipe, int]]:
+    """Subjects of the fit with their number of stacks; always the same."""
+    return [_recipe(FIT_SEED + n, *one) for n, one in enumerate(FIT_VOLUMES)]
+
+
+def check_recipes() -> list[tuple[SubjectRecipe, int]]:
+    """Subjects of the check with their number of stacks; always the same."""
+    return [_recipe(CHECK_SEED + n, *one) for n, one in enumerate(CHECK_VOLUMES)]
+
+
+def _recipe(seed: int, volume: str, n_stacks: int, motion: str) -> tuple[SubjectRecipe, int]:
+    name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
+    return SubjectRecipe(name, volume, motion, seed), n_stacks
+
+
+def judged(
+    recipe: SubjectRecipe, n_stacks: int, reconstructor: GaussianReconstructor, atlas: Path, cache: Path
+) -> Judged:
+    """Simulate, register (or take that from the cache), reconstruct and compare with the truth."""
+    case = load_case(simulated_subject(recipe, atlas, cache))
+    motion = cached_registration(case, n_stacks, reconstructor, cache)
+    start = time.perf_counter()
+    result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
+    pose_error = case.pose_error(result.slices)
+    truth_from_result = refined_pose(
+        result.volume, result.grid, case.truth, case.truth_mask, pose_error.common
+    )
+    truth = resample(case.truth, result.grid, truth_from_result)
+    mask = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
+    both = result.mask & (resample(mask, result.grid, truth_from_result) > 0.5)
+    error = relative_error(result.volume, truth, both) / result.intensity_scale
+    rng = np.random.default_rng(recipe.seed)
+    inside = np.flatnonzero(both[result.mask])
+    chosen = np.sort(rng.choice(inside, min(VOXELS_PER_SUBJECT, len(inside)), replace=False))
+    return Judged(
+        recipe, n_stacks, {name: one[chosen] for name, one in evidence_of(result).items()},
+        error[result.mask][chosen], score(result.volume, truth, both).psnr_db, pose_error.median_mm,
+        result.record["registration"]["trusted"], time.perf_counter() - start,
+        result.record["cpu_seconds"]["uncertainty"],
+    )  # fmt: skip
+
+
+def relative_error(
+    volume: NDArray[np.float32], truth: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Volume minus truth, the truth brought to the volume's mean in the mask.
+
+    One factor, since the scale of a reconstruction is arbitrary. The gain and offset that `g3r-evaluate` fits
+    would hide errors: of a volume that has nothing to do with the truth they leave its mean.
+    """
+    factor = float(volume[mask].mean()) / float(truth[mask].mean())
+    return volume.astype(np.float64) - factor * truth
+
+
+def evidence_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
+    """What the map of a result was made of."""
+    scale = np.float32(result.intensity_scale)
+    fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record["shading"])
+    return collect(
+        result.volume / scale, result.mask, result.grid, fit, result.prior / scale, result.density,
+        result.prior_grid, getattr(result, "prior_share", None),
+    )  # fmt: skip
+
+
+def cached_registration(
+    case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
+) -> MotionEstimate:
+    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
+    path = cache / f"{case.name}-{n_stacks}.motion.pkl"
+    if path.is_file():
+        with path.open("rb") as stream:
+            return pickle.load(stream)
+    motion = reconstructor.register_stacks(case.stacks[:n_stacks])
+    with path.open("wb") as stream:
+        pickle.dump(motion, stream)
+    return motion
