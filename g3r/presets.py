@@ -21,6 +21,7 @@ class ReconstructionSettings:
         motion: registration.
         prior_stage: stage 1.
         slice_stage: stage 2.
+        prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         use_prior: False seeds from V_coarse and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
@@ -32,6 +33,7 @@ class ReconstructionSettings:
     motion: MotionSettings = field(default_factory=MotionSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
+    prior_views: int = 4
     use_prior: bool = True
     distillation: bool = True
     seed: int = 0
@@ -43,6 +45,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
+        prior_views=1,
         motion=replace(_BALANCED.motion, n_rounds=6, finest_voxel_mm=1.6, pixels_at_most=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=15),
@@ -50,6 +53,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "fast": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.5,
+        prior_views=1,
         motion=replace(_BALANCED.motion, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=30),
@@ -58,6 +62,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         gaussian_spacing_pixels=1.96,
+        prior_views=8,
         motion=replace(_BALANCED.motion, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=160),

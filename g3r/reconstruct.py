@@ -266,7 +266,9 @@ class GaussianReconstructor:
     def _prior(self, start: _Start) -> NDArray[np.float32]:
         if self.network is None:
             return start.sharp
-        return estimate_prior(self.network, start.coarse, start.density, start.sharp)
+        assert isinstance(self.settings, ReconstructionSettings)
+        views = self.settings.prior_views
+        return estimate_prior(self.network, start.coarse, start.density, start.sharp, n_views=views)
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)

@@ -1,6 +1,6 @@
 """Whole-volume estimation of the structural prior, in one go or in tiles."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -15,23 +15,32 @@ TILE_VOXELS = 160
 HALO_VOXELS = 64
 
 
+VIEWS = ((), (0, 1), (1, 2), (0, 2), (0,), (1,), (2,), (0, 1, 2))
+"""Axes that are mirrored: half turns first, which show the network a head and not a mirror image."""
+
+
 def estimate_prior(
     network: DensityGatedPriorNetwork,
     v_coarse: NDArray[np.float32],
     m_rho: NDArray[np.float32],
     v_sharp: NDArray[np.float32] | None = None,
     *,
+    n_views: int = 1,
     max_whole_voxels: int = MAX_WHOLE_VOXELS,
     tile_voxels: int = TILE_VOXELS,
     halo_voxels: int = HALO_VOXELS,
 ) -> NDArray[np.float32]:
     """Return V_prior for a whole volume (Eq. 7).
 
+    The network was trained on heads lying in any of the 48 symmetric ways, and its errors differ between
+    them: the mean over some is better than any one ("geometric self-ensemble", Lim et al., CVPRW 2017).
+
     Args:
         network: from `load_prior`, on any device; its mode is left as it is.
         v_coarse: [I, J, K], already divided by `g3r.acquisition.scatter.normalisation_scale`.
         m_rho: [I, J, K], dimensionless density M >= 0.
         v_sharp: [I, J, K], on V_coarse's scale; needed by networks with `use_sharp`.
+        n_views: number of mirror images and half turns to average over, 1 to 8.
         max_whole_voxels: larger volumes are cut into tiles.
         tile_voxels: edge length of a tile without its halo; rounded up to the network's stride.
         halo_voxels: how far a tile looks beyond its edge; rounded up likewise.
@@ -40,7 +49,8 @@ def estimate_prior(
         V_prior, float32 [I, J, K], in the units of `v_coarse`.
 
     Raises:
-        ValueError: the volumes are not 3D of one shape, a needed one is missing, or a tile has no voxels.
+        ValueError: the volumes are not 3D of one shape, a needed one is missing, a tile has no voxels, or the
+            number of views is not 1 to 8.
         NumericalError: the result is not finite.
 
     Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
@@ -55,29 +65,45 @@ def estimate_prior(
         if v_sharp is None or v_sharp.shape != v_coarse.shape:
             raise ValueError(f"this prior needs V_sharp of shape {v_coarse.shape}")
         volumes.append(v_sharp)
+    if not 1 <= n_views <= len(VIEWS):
+        raise ValueError(f"{n_views} views; expected 1 to {len(VIEWS)}")
     if tile_voxels < 1 or halo_voxels < 0:
         raise ValueError(f"a tile needs voxels and a halo of at least 0; got {tile_voxels=}, {halo_voxels=}")
     stride = network.refiner.stride
     whole = v_coarse.size <= max_whole_voxels
-    edge = max(v_coarse.shape) if whole else _round_up(tile_voxels, stride)
+    # only with whole strides does a mirrored tile fall on the same sub-sampled grid as the mirrored volume
+    far_end = [(0, -extent % stride) for extent in v_coarse.shape]
+    volumes = [np.pad(np.asarray(volume, np.float32), far_end) for volume in volumes]
+    shape = volumes[0].shape
+    edge = max(shape) if whole else _round_up(tile_voxels, stride)
     halo = 0 if whole else _round_up(halo_voxels, stride)
     device = next(network.parameters()).device
 
-    prior = np.empty(v_coarse.shape, np.float32)
+    prior = np.empty(shape, np.float32)
     with torch.inference_mode():
-        for core, seen in _tiles(v_coarse.shape, edge, halo):
+        for core, seen in _tiles(shape, edge, halo):
             inputs = [
                 torch.from_numpy(np.ascontiguousarray(volume[seen], np.float32)).to(device)[None, None]
                 for volume in volumes
             ]
+            seen_prior = sum(_view(network, inputs, axes) for axes in VIEWS[:n_views]) / n_views
             inside = tuple(
                 slice(wanted.start - given.start, wanted.stop - given.start)
                 for wanted, given in zip(core, seen, strict=True)
             )
-            prior[core] = network(*inputs)[0, 0].float().cpu().numpy()[inside]
+            prior[core] = seen_prior[0, 0].float().cpu().numpy()[inside]  # type: ignore[index]
+    prior = prior[tuple(slice(extent) for extent in v_coarse.shape)]
     if not np.isfinite(prior).all():
         raise NumericalError("the prior network returned NaN or infinity; check the stacks' intensities")
-    return prior
+    return np.ascontiguousarray(prior)
+
+
+def _view(
+    network: DensityGatedPriorNetwork, inputs: Sequence[torch.Tensor], axes: tuple[int, ...]
+) -> torch.Tensor:
+    """The prior as the network sees it with some axes mirrored, mirrored back."""
+    dims = [2 + axis for axis in axes]
+    return network(*[volume.flip(dims) for volume in inputs]).flip(dims)
 
 
 def _round_up(value: int, multiple: int) -> int:

@@ -50,6 +50,32 @@ def test_tiles_are_exact_beyond_the_receptive_field(network, volumes, whole):
     assert np.abs(tiled - whole).max() < 1e-5
 
 
+def test_views_do_not_prefer_a_side(volumes):
+    """The mean over all mirror images is mirrored when the head is; whether in tiles or not."""
+    torch.manual_seed(0)
+    network = DensityGatedPriorNetwork((8, 8), (1, 1), 4).eval()
+    nn.init.normal_(network.refiner.head.weight, std=0.05)
+    part = [volume[:50] for volume in volumes]
+    prior = estimate_prior(network, *part, n_views=8)
+    assert np.abs(prior - estimate_prior(network, *part)).max() > 1e-3
+    tiled = estimate_prior(network, *part, n_views=8, max_whole_voxels=0, tile_voxels=20, halo_voxels=32)
+    assert np.abs(tiled - prior).max() < 1e-5
+    even = [volume[:48, :16, :16] for volume in volumes]  # an odd size is padded at one end only
+    turned = [volume[::-1, :, ::-1] for volume in even]
+    straight, back = (estimate_prior(network, *given, n_views=8) for given in (even, turned))
+    np.testing.assert_allclose(back[::-1, :, ::-1], straight, atol=1e-5)
+    with pytest.raises(ValueError, match="expected 1 to 8"):
+        estimate_prior(network, *part, n_views=9)
+
+
+def test_v_sharp_is_asked_for_and_is_the_base(volumes):
+    network = DensityGatedPriorNetwork((8,), (1,), 4, use_sharp=True).eval()
+    v_sharp = volumes[0][::-1].copy()
+    np.testing.assert_array_equal(estimate_prior(network, *volumes, v_sharp), v_sharp)
+    with pytest.raises(ValueError, match="needs V_sharp"):
+        estimate_prior(network, *volumes)
+
+
 def test_without_a_halo_they_do_not_agree(network, volumes, whole):
     """The two tests above would notice a tile that is cut off."""
     tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=48, halo_voxels=0)
