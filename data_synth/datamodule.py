@@ -124,13 +124,19 @@ class StackSynthesisDataModule(LightningDataModule):
         self.setup()
         h: Any = self.hparams
         assert self.train_subjects is not None
-        epoch = self.trainer.current_epoch if self.trainer is not None else 0
+        epoch, rank, n_ranks = 0, 0, 1
+        if self.trainer is not None:
+            epoch, rank, n_ranks = (
+                self.trainer.current_epoch,
+                self.trainer.global_rank,
+                self.trainer.world_size,
+            )
         queue = PatchQueue(
             self.train_subjects,  # type: ignore[arg-type]  # any dataset of subjects will do
             max_length=h.patches_per_subject * min(QUEUE_SUBJECTS, h.subjects_per_epoch),
             samples_per_volume=h.patches_per_subject,
             sampler=HeadPatchSampler(h.patch_size),
-            subject_sampler=EpochSampler(h.subjects_per_epoch, epoch),
+            subject_sampler=EpochSampler(h.subjects_per_epoch, epoch, rank, n_ranks),
             shuffle_subjects=False,
             num_workers=h.num_workers,
             start_background=h.num_workers > 0,
@@ -162,11 +168,20 @@ class StackSynthesisDataModule(LightningDataModule):
 
 
 class EpochSampler(Sampler[int]):
-    """Numbers epoch * length + index, one epoch further each time it is iterated."""
+    """Numbers epoch * length + index, one epoch further each time it is iterated.
 
-    def __init__(self, length: int, epoch: int = 0) -> None:
+    Args:
+        length: of an epoch, over all processes; this is what `len` says, too.
+        epoch: to begin with.
+        rank: of this process. Each of `n_ranks` processes has numbers of its own.
+        n_ranks: processes that train together.
+    """
+
+    def __init__(self, length: int, epoch: int = 0, rank: int = 0, n_ranks: int = 1) -> None:
         self.length = length
         self.epoch = epoch
+        self.rank = rank
+        self.n_ranks = n_ranks
 
     def __len__(self) -> int:
         return self.length
@@ -174,7 +189,7 @@ class EpochSampler(Sampler[int]):
     def __iter__(self) -> Iterator[int]:
         first = self.epoch * self.length
         self.epoch += 1
-        return iter(range(first, first + self.length))
+        return iter(range(first + self.rank % self.length, first + self.length, self.n_ranks))
 
 
 class PatchQueue(tio.Queue):

@@ -134,6 +134,12 @@ def test_epoch_sampler_goes_on() -> None:
     assert len(sampler) == 3
 
 
+def test_processes_that_train_together_have_subjects_of_their_own() -> None:
+    of_rank = [EpochSampler(5, epoch=1, rank=rank, n_ranks=2) for rank in range(2)]
+    assert [list(sampler) for sampler in of_rank] == [[5, 7, 9], [6, 8]]
+    assert list(EpochSampler(2, rank=3, n_ranks=4)) == [1]  # more processes than subjects: none is idle
+
+
 def test_augmentation_keeps_a_head() -> None:
     volume = make_dataset()._volume(0)
     transform = augmentation()
