@@ -34,10 +34,10 @@ FIT_VOLUMES = (
 these volumes (checkpoints are chosen by them)."""
 
 CHECK_VOLUMES = (
-    ("crl-sta/sta24", 3, "mild"), ("crl-sta/sta30", 3, "moderate"), ("crl-sta/sta34", 3, "mild"),
-    ("crl-sta/sta24", 3, "moderate"), ("crl-sta/sta30", 3, "mild"),
-    ("crl-sta/sta24", 1, "mild"), ("crl-sta/sta30", 1, "mild"), ("crl-sta/sta34", 1, "mild"),
-    ("crl-sta/sta30", 1, "none"), ("crl-sta/sta34", 1, "mild"),
+    ("crl-sta/sta24", 3, "mild"), ("crl-sta/sta30", 1, "mild"), ("crl-sta/sta34", 3, "moderate"),
+    ("crl-sta/sta24", 1, "mild"), ("crl-sta/sta30", 3, "mild"), ("crl-sta/sta34", 1, "mild"),
+    ("crl-sta/sta24", 3, "moderate"), ("crl-sta/sta30", 1, "none"), ("crl-sta/sta34", 3, "mild"),
+    ("crl-sta/sta24", 1, "mild"),
 )  # fmt: skip
 """The same of the subjects that they are checked on: weeks left out of every training and choice."""
 

@@ -37,6 +37,15 @@ OUTPUT_NAMES = (
     "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
 )  # fmt: skip
 
+CAPTIONS = {
+    "density": "1: covered by one gapless stack",
+    "prior share": "0: measured, 1: by the prior alone",
+    "uncertainty": "expected error, in the volume's units",
+}
+"""Rows of sections.png that are maps, and how to read them."""
+
+RANGES = {"prior share": (0.0, 1.0)}
+
 
 @dataclass(frozen=True)
 class ReconstructionResult:
@@ -106,13 +115,18 @@ class ReconstructionResult:
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
-        rows = {"volume": self.volume}
+        rows = {"volume": self.volume, "uncertainty": self.uncertainty}
         if self.grid is self.prior_grid:
             on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
-            rows = {**on_mask, "volume": self.volume}
+            rows = {**on_mask, **rows}
         doubted = self.record.get("registration", {}).get("trusted") is False
         title = "REGISTRATION DOUBTFUL: do not trust this volume (see run.json)" if doubted else ""
-        save_sections(folder / "sections.png", rows, self.grid.affine, self.mask, title=title)
+        # the rim is far more uncertain than the rest; it may saturate, so that the rest is seen
+        bright = float(np.percentile(self.uncertainty[self.mask], 97)) if self.mask.any() else 1.0
+        save_sections(
+            folder / "sections.png", rows, self.grid.affine, self.mask, maps=CAPTIONS, captions=CAPTIONS,
+            ranges={**RANGES, "uncertainty": (0.0, bright or 1.0)}, title=title,
+        )  # fmt: skip
 
     def slice_table(self) -> str:
         """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, mm)."""

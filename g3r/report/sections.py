@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,6 +52,17 @@ VIEWS = (
 )
 
 
+@dataclass(frozen=True)
+class Row:
+    """One volume [I, J, K] to be shown: its name, whether it is a map, a caption, and the ends of its bar."""
+
+    name: str
+    data: NDArray[np.float32]
+    is_map: bool
+    caption: str
+    range: tuple[float, float] | None
+
+
 def save_sections(
     path: str | os.PathLike[str],
     volumes: Mapping[str, ArrayLike],
@@ -59,6 +70,8 @@ def save_sections(
     mask: ArrayLike | None = None,
     *,
     maps: Collection[str] = ("density",),
+    captions: Mapping[str, str] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
     title: str = "",
 ) -> None:
     """Write a PNG of the three central sections of each volume, in the order given.
@@ -74,6 +87,8 @@ def save_sections(
             by the nearest anatomical direction.
         mask: [I, J, K]; the sections go through the middle of it and are cropped around it.
         maps: names of the volumes that are maps.
+        captions: what a row shows, in a few words beside its name.
+        ranges: values of the two ends of the bar, for maps that have natural ones.
         title: a line above.
 
     Raises:
@@ -95,7 +110,11 @@ def save_sections(
     spacing_mm = np.linalg.norm(affine[:3, :3], axis=0)[np.argsort(orientation[:, 0])]
     box, center = _crop(inside, spacing_mm, has_mask=mask is not None)
     canonical = {n: nib.orientations.apply_orientation(data, orientation)[box] for n, data in arrays.items()}
-    figure = _draw(canonical, inside[box], center, spacing_mm, maps, title)
+    rows = [
+        Row(name, data, name in maps, (captions or {}).get(name, ""), (ranges or {}).get(name))
+        for name, data in canonical.items()
+    ]
+    figure = _draw(rows, inside[box], center, spacing_mm, title)
     _write(figure, Path(path))
 
 
@@ -113,11 +132,10 @@ def _crop(
 
 
 def _draw(
-    volumes: Mapping[str, NDArray[np.float32]],
+    volumes: Sequence[Row],
     inside: NDArray[np.bool_],
     center: NDArray[np.intp],
     spacing_mm: NDArray[np.float64],
-    maps: Collection[str],
     title: str,
 ) -> Figure:
     """Lay the panels out at one scale in mm, so that lengths compare across views and rows."""
@@ -127,7 +145,8 @@ def _draw(
     widths_mm = [size_mm[view.across] for view in VIEWS]
     height_mm = max(size_mm[view.up] for view in VIEWS)
     inches_per_mm = ROW_HEIGHT_INCHES / height_mm
-    left, right, top, bottom = 0.38, 0.55, 0.34 + (0.26 if title else 0.0), 0.30
+    captioned = any(one.caption for one in volumes)
+    left, right, top, bottom = 0.58 if captioned else 0.38, 0.55, 0.34 + (0.26 if title else 0.0), 0.30
     width = sum(widths_mm) * inches_per_mm + left + right + 0.08
     height = len(volumes) * ROW_HEIGHT_INCHES + 0.04 * (len(volumes) - 1) + top + bottom
     figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor=BACKGROUND)
@@ -145,13 +164,12 @@ def _draw(
             "hspace": 0.04 / ROW_HEIGHT_INCHES,
         },
     )
-    for row, (name, data) in enumerate(volumes.items()):
-        is_map = name in maps
-        low, high = _window(data, inside, is_map=is_map)
+    for row, one in enumerate(volumes):
+        low, high = one.range or _window(one.data, inside, is_map=one.is_map)
         for panel, view in zip(panels[row], VIEWS, strict=True):
-            shown = _section(data, view, center)
+            shown = _section(one.data, view, center)
             extent = (0.0, size_mm[view.across], 0.0, size_mm[view.up])
-            colors = "inferno" if is_map else "gray"
+            colors = "inferno" if one.is_map else "gray"
             image = panel.imshow(
                 shown,
                 cmap=colors,
@@ -169,8 +187,9 @@ def _draw(
                 _letter(panel, view.letters)
         box = panels[row][0].get_position()
         middle = (box.y0 + box.y1) / 2
-        figure.text(0.16 / width, middle, name, rotation=90, color=INK, fontsize=11, ha="center", va="center")
-        if is_map:
+        _beside(figure, 0.16 / width, middle, one.name, color=INK, fontsize=11)
+        _beside(figure, 0.38 / width, middle, one.caption, color=FAINT_INK, fontsize=7.5)
+        if one.is_map:
             last = panels[row][-1].get_position()
             bar = figure.add_axes(
                 (last.x1 + 0.06 / width, last.y0 + 0.15 * last.height, 0.08 / width, 0.7 * last.height)
@@ -185,6 +204,11 @@ def _draw(
     note = f"voxels {voxel} mm; radiological: the patient's right is on the left"
     figure.text(1 - 0.1 / width, 0.13 / height, note, color=FAINT_INK, fontsize=7.5, ha="right", va="center")
     return figure
+
+
+def _beside(figure: Figure, x: float, y: float, text: str, *, color: str, fontsize: float) -> None:
+    """Write a line upwards, left of a row."""
+    figure.text(x, y, text, rotation=90, color=color, fontsize=fontsize, ha="center", va="center")
 
 
 def _section(data: NDArray[np.float32], view: View, center: NDArray[np.intp]) -> NDArray[np.float32]:
