@@ -83,6 +83,18 @@ bench-ablation: install ## with and without the prior, 1 to 3 stacks, 8 subjects
 	$(BIN)/python -m benchmarks.prior_ablation --jobs 2 --docs docs/prior.md \
 		--figure docs/images/prior-ablation.png $(BENCH_ARGS)
 
+fit-uncertainty: install ## coefficients of uncertainty.nii.gz, with and without prior (G3R_TEST_DATA), about 10 min
+	$(BIN)/python -m benchmarks.uncertainty fit $(BENCH_ARGS)
+	$(BIN)/python -m benchmarks.uncertainty fit --no-prior $(BENCH_ARGS)
+
+bench-uncertainty: install ## stated uncertainty against error, on subjects left out (G3R_TEST_DATA): docs/prior.md
+	$(BIN)/python -m benchmarks.uncertainty check --no-prior $(BENCH_ARGS)
+	$(BIN)/python -m benchmarks.uncertainty check --docs docs/prior.md \
+		--figure docs/images/uncertainty-calibration.png $(BENCH_ARGS)
+
+bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
+	$(BIN)/python -m benchmarks.lesions --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
+
 ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
 	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \
 		--figure docs/images/prior-networks.png $(BENCH_ARGS)
