@@ -19,7 +19,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation ablate-networks clean
+.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation ablate-networks fit-uncertainty bench-uncertainty bench-lesions clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
