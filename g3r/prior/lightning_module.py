@@ -13,7 +13,7 @@ from torchmetrics.functional.image import (
 )
 
 from g3r.errors import InputError
-from g3r.prior.checkpoint import load_prior
+from g3r.prior.checkpoint import VOXEL_MM_TOLERANCE, load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
 from g3r.prior.training import AnnealedModule, describe_data
@@ -52,6 +52,7 @@ class PriorModule(AnnealedModule):
         use_gate: False sets G = 1 (an ablation).
         use_density: False hides the density from F (an ablation).
         use_sharp: False leaves V_sharp out: Eq. 7 as printed (an ablation).
+        sharp_base: True adds the residual to V_sharp (an ablation).
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
@@ -77,6 +78,7 @@ class PriorModule(AnnealedModule):
         use_gate: bool = True,
         use_density: bool = True,
         use_sharp: bool = True,
+        sharp_base: bool = False,
         learning_rate: float = 1e-3,
         weight_decay: float = 1e-4,
         warmup_steps: int = 100,
@@ -90,10 +92,11 @@ class PriorModule(AnnealedModule):
             raise ValueError(f"got {background_weight=}")
         self.save_hyperparameters()
         self.network = DensityGatedPriorNetwork(
-            channels, units, tail_channels, alpha, beta, use_gate, use_density, use_sharp
+            channels, units, tail_channels, alpha, beta, use_gate, use_density, use_sharp, sharp_base
         ).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self._learnt_at_mm: dict[str, float] = {}
         if start_from is not None:
-            take_weights(self.network, start_from)
+            self._learnt_at_mm["model.start_from"] = take_weights(self.network, start_from)
         self.background_weight = background_weight
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
@@ -176,7 +179,8 @@ class PriorModule(AnnealedModule):
         """Take the voxel size and a description from the data module.
 
         Raises:
-            InputError: the voxel size is not known, or differs from the data's.
+            InputError: the voxel size is not known, or differs from the data's, or the weights to go on with
+                were trained on another.
         """
         data = getattr(self.trainer, "datamodule", None)
         settings = dict(getattr(data, "hparams", None) or {})
@@ -187,11 +191,23 @@ class PriorModule(AnnealedModule):
                     "model.voxel_mm: not given, and the data module has no spacing_mm; pass either"
                 )
             self.voxel_mm = float(spacing_mm)
-        elif spacing_mm is not None and abs(self.voxel_mm - float(spacing_mm)) > 1e-3:
+        elif spacing_mm is not None and abs(self.voxel_mm - float(spacing_mm)) > VOXEL_MM_TOLERANCE:
             raise InputError(
                 f"model.voxel_mm: {self.voxel_mm} mm, but the data are made at {spacing_mm} mm; leave it out"
             )
+        for name, voxel_mm in self._learnt_at_mm.items():
+            if abs(voxel_mm - self.voxel_mm) > VOXEL_MM_TOLERANCE:
+                raise InputError(
+                    f"{name}: was trained on voxels of {voxel_mm:g} mm, the data have {self.voxel_mm:g} mm; "
+                    f"leave it out, or pass --data.spacing_mm {voxel_mm:g}"
+                )
         self._training_data = describe_data(data, settings)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Note the voxel size of a run that is gone on with; `on_fit_start` compares it with the data's."""
+        voxel_mm = checkpoint.get(EXPORT_KEY, {}).get("voxel_mm")
+        if voxel_mm is not None:
+            self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the description from which `g3r-export` makes a prior checkpoint, in plain values only."""
@@ -205,8 +221,11 @@ class PriorModule(AnnealedModule):
         }
 
 
-def take_weights(network: DensityGatedPriorNetwork, path: str) -> None:
+def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
     """Begin with the weights of a prior file, of a network that may have had fewer inputs.
+
+    Returns:
+        The voxel size (mm) that they were trained on.
 
     Raises:
         InputError: the file cannot be read, or its network has other channels or units.
@@ -226,9 +245,10 @@ def take_weights(network: DensityGatedPriorNetwork, path: str) -> None:
             into[:, : given.shape[1]] = given
         else:
             into.copy_(given)
-    if other.refiner.use_sharp != network.refiner.use_sharp:
+    if other.sharp_base != network.sharp_base:
         torch.nn.init.zeros_(network.refiner.head.weight)
         torch.nn.init.zeros_(network.refiner.head.bias)  # type: ignore[arg-type]
+    return meta.voxel_mm
 
 
 def loss_weight(mask: Tensor, background_weight: float) -> Tensor:

@@ -69,7 +69,7 @@ def test_views_do_not_prefer_a_side(volumes):
 
 
 def test_v_sharp_is_asked_for_and_is_the_base(volumes):
-    network = DensityGatedPriorNetwork((8,), (1,), 4, use_sharp=True).eval()
+    network = DensityGatedPriorNetwork((8,), (1,), 4, use_sharp=True, sharp_base=True).eval()
     v_sharp = volumes[0][::-1].copy()
     np.testing.assert_array_equal(estimate_prior(network, *volumes, v_sharp), v_sharp)
     with pytest.raises(ValueError, match="needs V_sharp"):
