@@ -50,8 +50,9 @@ VARIANTS = (
     Variant("no-density", "F does not see M_rho; gated", {"use_density": False}),
     Variant("no-density-no-gate", "neither", {"use_density": False, "use_gate": False}),
     Variant("alpha-0.05", "the paper's gate", {"alpha": 0.05}),
-    Variant("coarse-base", "Eq. 7 as printed: V_coarse instead of V_sharp", {"use_sharp": False}),
-    Variant("as-printed", "V_coarse, alpha 0.05", {"use_sharp": False, "alpha": 0.05}),
+    Variant("no-sharp", "F does not see V_sharp: Eq. 7 as printed", {"use_sharp": False}),
+    Variant("sharp-base", "the residual is added to V_sharp", {"sharp_base": True}),
+    Variant("as-printed", "Eq. 7 as printed, alpha 0.05", {"use_sharp": False, "alpha": 0.05}),
     Variant("size-16-32-64", "channels 16, 32, 64", {"channels": [16, 32, 64]}, is_size=True),
     Variant("size-32-64-96", "channels 32, 64, 96", {"channels": [32, 64, 96]}, is_size=True),
     Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
@@ -87,7 +88,7 @@ def build_parser() -> argparse.ArgumentParser:
         "train_args",
         nargs="*",
         metavar="-- ARG",
-        help="more arguments of g3r-pretrain, such as --data.seed 2",
+        help="more arguments of g3r-pretrain, such as --data.batch_size=2",
     )
     return parser
 
@@ -125,7 +126,7 @@ def _run(options: argparse.Namespace) -> int:
         use_threads(threads)
         source = options.source or test_data_folder() / "atlas"
         data = data_arguments(source, options.cache, options.val_subjects)
-        n_epochs = epochs_of(options.steps, config)
+        n_epochs = epochs_of(options.steps, config, options.train_args)
         volumes: list[dict[str, Tensor]] = []
         for variant in distinct_variants(config):
             if options.only and variant.name not in options.only:
@@ -162,7 +163,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
     """The variants, without a size that is the configuration's own."""
-    model = {"use_gate": True, "use_density": True, "use_sharp": True, **config["model"]}
+    model = {"use_gate": True, "use_density": True, "use_sharp": True, "sharp_base": False, **config["model"]}
     return [
         variant
         for variant in VARIANTS
@@ -170,9 +171,19 @@ def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
     ]
 
 
-def epochs_of(steps: int, config: Mapping[str, Any]) -> int:
-    """Whole epochs nearest to a number of optimiser steps, at least one."""
-    data = config["data"]["init_args"]
+def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = ()) -> int:
+    """Whole epochs nearest to a number of optimiser steps, at least one.
+
+    Args:
+        steps: of the optimiser.
+        config: of the training.
+        arguments: that may change the size of an epoch, such as `--data.batch_size=2`.
+    """
+    data = dict(config["data"]["init_args"])
+    for argument in arguments:
+        name, _, value = argument.removeprefix("--data.").partition("=")
+        if name in data and value.isdecimal():
+            data[name] = int(value)
     per_epoch = data["subjects_per_epoch"] * data["patches_per_subject"] // data["batch_size"]
     return max(1, round(steps / per_epoch))
 

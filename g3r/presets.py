@@ -22,6 +22,7 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_stage: stage 2.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
+        prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
         use_prior: False seeds from V_coarse and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
@@ -34,6 +35,7 @@ class ReconstructionSettings:
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     prior_views: int = 4
+    prior_voxel_mm: float = 0.8
     use_prior: bool = True
     distillation: bool = True
     seed: int = 0

@@ -48,6 +48,10 @@ def build_parser() -> argparse.ArgumentParser:
         "--space", choices=("standard", "scanner"), default="standard",
         help="volume in standard orientation (RAS, mid-sagittal plane in the middle) or in scanner space",
     )  # fmt: skip
+    parser.add_argument(
+        "--prior-voxel", type=float, default=0.8, metavar="MM",
+        help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
+    )  # fmt: skip
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
     parser.add_argument(
         "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
@@ -170,6 +174,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         preset,
         motion=replace(preset.motion, standard_orientation=options.space == "standard", seed=options.seed),
         resolution_mm=options.resolution,
+        prior_voxel_mm=options.prior_voxel,
         seed=options.seed,
         use_prior=not options.no_prior,
     )

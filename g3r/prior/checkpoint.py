@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 KIND = "prior"
 FORMAT_VERSION = 1
 VOXEL_MM_RANGE = (0.1, 10.0)
+VOXEL_MM_TOLERANCE = 1e-3
 
 _ANOTHER_FILE = "pass a file made by g3r-export, or leave --ckpt out to use the weights that ship with g3r"
 
@@ -113,20 +114,23 @@ def save_prior_checkpoint(
     write_file(path, content)
 
 
-def load_prior(path: str | Path) -> "tuple[DensityGatedPriorNetwork, PriorCheckpoint]":
+def load_prior(
+    path: str | Path, voxel_mm: float | None = None
+) -> "tuple[DensityGatedPriorNetwork, PriorCheckpoint]":
     """Read a prior file.
 
     Nothing in the file is executed (`weights_only=True`), and everything it claims is checked.
 
     Args:
         path: file written by `save_prior_checkpoint`.
+        voxel_mm: voxel size that it will be used at; None takes any.
 
     Returns:
         The network on the CPU in evaluation mode, float32, and its description.
 
     Raises:
-        InputError: missing, not a prior, damaged, of another format version or convention, with weights
-            that do not fit the network, or with values that make no sense.
+        InputError: missing, not a prior, damaged, of another format version, convention or voxel size, with
+            weights that do not fit the network, or with values that make no sense.
     """
     path = Path(path)
     content = read_file(path, KIND, _ANOTHER_FILE)
@@ -138,6 +142,11 @@ def load_prior(path: str | Path) -> "tuple[DensityGatedPriorNetwork, PriorCheckp
     }
     check_identity(path, content, KIND, conventions, _ANOTHER_FILE)
     meta = _describe(path, content)
+    if voxel_mm is not None and not abs(meta.voxel_mm - voxel_mm) <= VOXEL_MM_TOLERANCE:
+        raise InputError(
+            f"{path}: was trained on voxels of {meta.voxel_mm:g} mm, expected {voxel_mm:g} mm; pass another "
+            f"file, or --prior-voxel {meta.voxel_mm:g} if that is what you want"
+        )
     network = _build(path, meta)
     fill(path, network, content["weights"], KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))

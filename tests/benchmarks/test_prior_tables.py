@@ -121,10 +121,17 @@ def test_networks_differ_from_the_configuration():
     own_size = "size-" + "-".join(map(str, config["model"]["channels"]))
     assert "full" in found
     assert own_size not in found
-    assert {"no-gate", "no-density", "no-density-no-gate", "coarse-base"} < set(found)
+    assert {"no-gate", "no-density", "no-density-no-gate", "no-sharp"} < set(found)
     per_epoch = prior_networks.epochs_of(10**6, config) / 10**6
     assert prior_networks.epochs_of(1, config) == 1
     assert prior_networks.epochs_of(300, config) == max(1, round(300 * per_epoch))
+    own = [
+        "--data.subjects_per_epoch=6",
+        "--data.patches_per_subject=4",
+        "--data.batch_size=2",
+        "--data.source=9",
+    ]
+    assert prior_networks.epochs_of(36, config, own) == 3
 
 
 def test_network_options_are_those_of_the_module():

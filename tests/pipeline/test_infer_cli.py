@@ -87,7 +87,11 @@ def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_every_output_is_there_and_nothing_else(reconstructed: Path):
-    assert {path.name for path in reconstructed.iterdir()} == OUTPUTS == set(OUTPUT_NAMES)
+    assert (
+        {path.name for path in reconstructed.iterdir()}
+        == OUTPUTS
+        == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
+    )
     assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
 
 
@@ -279,6 +283,13 @@ def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path):
     prior, coarse = (load_volume(tmp_path / "out" / f"{name}.nii.gz").data for name in ("prior", "coarse"))
     assert np.isfinite(prior).all()
     assert not np.array_equal(prior, coarse)
+    share, mask = (load_volume(tmp_path / "out" / f"{name}.nii.gz").data for name in ("prior_share", "mask"))
+    assert 0 <= share.min() < share[mask > 0].mean() < 0.6  # three stacks leave it little
+    assert share.max() == 1
+    # a later result without the prior leaves no map of another behind
+    done = run("infer", *inputs(subject), *QUICK, "--force", "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
 
 
 # -- refusals --------------------------------------------------------------------------------------
@@ -323,6 +334,9 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
     elif kind == "output is a file":
         (folder / "out").write_text("mine")
         return [*inputs(subject), *options], "out"
+    elif kind == "prior of another voxel size":
+        expected = "prior.pt: was trained on voxels of 0.8 mm, expected 1.2 mm"
+        return [*inputs(subject), *options, "--prior-voxel", "1.2"], expected
     elif kind == "resolution":
         return [*inputs(subject), *options, "--resolution", "0"], "resolution 0 mm"
     whole = kind in ("one slice", "NaN volume")
@@ -341,7 +355,7 @@ def _like(path: Path, image_path: Path) -> Path:
     [
         "missing file", "text file", "cut off", "cut off after the header", "one slice", "NaN volume",
         "mask of another grid", "empty mask", "thickness zero", "checkpoint is text",
-        "output is a file", "resolution",
+        "output is a file", "resolution", "prior of another voxel size",
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path):

@@ -115,6 +115,14 @@ def test_refusal_of_an_altered_file(saved, tmp_path, case):
     assert_refused(path, expected)
 
 
+def test_refusal_of_another_voxel_size_than_wanted(saved):
+    assert load_prior(saved, 0.8)[1].voxel_mm == 0.8
+    with pytest.raises(
+        InputError, match=r"voxels of 0\.8 mm, expected 1 mm; pass another .* --prior-voxel 0\.8"
+    ):
+        load_prior(saved, 1.0)
+
+
 def test_refusal_of_a_file_that_is_not_there(tmp_path):
     assert_refused(tmp_path / "none.pt", "no such file")
 

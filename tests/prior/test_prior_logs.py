@@ -13,6 +13,8 @@ from torch.utils.data import DataLoader
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
 
+from g3r.errors import InputError  # noqa: E402
+from g3r.prior import PriorCheckpoint, save_prior_checkpoint  # noqa: E402
 from g3r.prior import lightning_module as training  # noqa: E402
 
 NETWORK = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4}
@@ -99,6 +101,30 @@ def test_panel_of_a_network_without_a_gate():
     assert bool((gate == 1).all())
     assert 0 < float(confidence.max()) < 1
     assert torch.equal(prior, coarse)  # which stands for the prior here
+
+
+def test_going_on_at_another_voxel_size_is_refused(tmp_path):
+    """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
+    first = training.PriorModule(**NETWORK)
+    options = {
+        "accelerator": "cpu", "max_steps": 1, "logger": False, "enable_progress_bar": False,
+        "enable_model_summary": False, "enable_checkpointing": False,
+    }  # fmt: skip
+    run = lightning.Trainer(**options)
+    run.fit(first, ValidatedByStacks())
+    run.save_checkpoint(tmp_path / "run.ckpt")
+    network = first.network
+    save_prior_checkpoint(
+        tmp_path / "prior.pt", network, PriorCheckpoint(network.arguments(), first.voxel_mm, "noise")
+    )
+    data = ValidatedByStacks()
+    data.spacing_mm = 1.0
+    again = training.PriorModule(**NETWORK, start_from=str(tmp_path / "prior.pt"))
+    with pytest.raises(InputError, match=r"start_from: was trained on voxels of 0\.8 mm, the data have 1 mm"):
+        lightning.Trainer(**options).fit(again, data)
+    run, fresh = lightning.Trainer(**{**options, "max_steps": 2}), training.PriorModule(**NETWORK)
+    with pytest.raises(InputError, match=r"ckpt_path: was trained on voxels of 0\.8 mm, the data have 1 mm"):
+        run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
 
 
 def run_training(folder, *arguments):
