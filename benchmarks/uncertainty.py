@@ -46,9 +46,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import available_cores, preset_settings, use_threads
+    from benchmarks.runs import available_cores, changed, preset_settings, use_threads
     from benchmarks.subjects import test_data_folder
-    from benchmarks.uncertainty_data import check_recipes, fit_recipes, judged
+    from benchmarks.uncertainty_data import (
+        NO_REGISTRATION,
+        check_recipes,
+        fit_recipes,
+        judged,
+        unregistered_recipe,
+    )
     from g3r.reconstruct import GaussianReconstructor
 
     atlas = test_data_folder() / "atlas"
@@ -56,11 +62,15 @@ def _run(options: argparse.Namespace) -> int:
     settings = replace(preset_settings(options.preset), use_prior=not options.no_prior)
     reconstructor = GaussianReconstructor(options.ckpt, settings)
     fitting = options.task == "fit"
-    chosen = fit_recipes() if fitting else check_recipes()
+    chosen = (fit_recipes() if fitting else check_recipes())[: options.subjects]
+    todo = [(*one, reconstructor) for one in chosen]
+    if not fitting and not options.subjects:
+        unregistered = GaussianReconstructor(options.ckpt, changed(settings, NO_REGISTRATION))
+        todo.append((*unregistered_recipe(), unregistered))
     start, found = time.perf_counter(), []
-    for recipe, n_stacks in chosen[: options.subjects]:
-        found.append(judged(recipe, n_stacks, reconstructor, atlas, options.cache))
-        one = found[-1]
+    for recipe, n_stacks, by in todo:
+        one = judged(recipe, n_stacks, by, atlas, options.cache, registered=by is reconstructor)
+        found.append(one)
         print(
             f"{one.label}: {one.psnr_db:.2f} dB, poses {one.median_mm:.2f} mm, mean error "
             f"{100 * abs(one.error).mean():.2f} % of the brightest, {one.seconds:.0f} s "

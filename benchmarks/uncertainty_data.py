@@ -41,7 +41,15 @@ CHECK_VOLUMES = (
 )  # fmt: skip
 """The same of the subjects that they are checked on: weeks left out of every training and choice."""
 
-FIT_SEED, CHECK_SEED = 51_200, 52_200
+UNREGISTERED = ("crl-sta/sta24", 3, "moderate")
+"""One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
+
+NO_REGISTRATION = {
+    "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
+    "motion.n_rounds": 0, "motion.standard_orientation": False,
+}  # fmt: skip
+
+FIT_SEED, CHECK_SEED, UNREGISTERED_SEED = 51_200, 52_200, 52_250
 
 VOXELS_PER_SUBJECT = 40_000
 
@@ -58,6 +66,7 @@ class Judged:
         psnr_db: of the volume.
         median_mm: error of the poses.
         trusted: whether the record trusts the registration.
+        registered: whether there was one.
         seconds: of reconstruction and judgement; registration comes from the cache.
         map_seconds: of the map alone, processor time.
     """
@@ -71,11 +80,13 @@ class Judged:
     trusted: bool | None
     seconds: float
     map_seconds: float
+    registered: bool = True
 
     @property
     def label(self) -> str:
         """Subject and number of stacks."""
-        return f"{self.recipe.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+        name = f"{self.recipe.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+        return name if self.registered else f"{name}, not registered"
 
 
 def fit_recipes() -> list[tuple[SubjectRecipe, int]]:
@@ -88,17 +99,28 @@ def check_recipes() -> list[tuple[SubjectRecipe, int]]:
     return [_recipe(CHECK_SEED + n, *one) for n, one in enumerate(CHECK_VOLUMES)]
 
 
+def unregistered_recipe() -> tuple[SubjectRecipe, int]:
+    """The subject that the check leaves unregistered."""
+    return _recipe(UNREGISTERED_SEED, *UNREGISTERED)
+
+
 def _recipe(seed: int, volume: str, n_stacks: int, motion: str) -> tuple[SubjectRecipe, int]:
     name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
     return SubjectRecipe(name, volume, motion, seed), n_stacks
 
 
 def judged(
-    recipe: SubjectRecipe, n_stacks: int, reconstructor: GaussianReconstructor, atlas: Path, cache: Path
+    recipe: SubjectRecipe,
+    n_stacks: int,
+    reconstructor: GaussianReconstructor,
+    atlas: Path,
+    cache: Path,
+    *,
+    registered: bool = True,
 ) -> Judged:
     """Simulate, register (or take that from the cache), reconstruct and compare with the truth."""
     case = load_case(simulated_subject(recipe, atlas, cache))
-    motion = cached_registration(case, n_stacks, reconstructor, cache)
+    motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
     start = time.perf_counter()
     result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
     pose_error = case.pose_error(result.slices)
@@ -116,7 +138,7 @@ def judged(
         recipe, n_stacks, {name: one[chosen] for name, one in evidence_of(result).items()},
         error[result.mask][chosen], score(result.volume, truth, both).psnr_db, pose_error.median_mm,
         result.record["registration"]["trusted"], time.perf_counter() - start,
-        result.record["cpu_seconds"]["uncertainty"],
+        result.record["cpu_seconds"]["uncertainty"], registered,
     )  # fmt: skip
 
 

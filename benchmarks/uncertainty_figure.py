@@ -44,7 +44,7 @@ def draw_calibration(record: Mapping[str, Any], path: Path) -> None:
 def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
     """Mean and root-mean-square error of ten groups of voxels against what was stated for them."""
     colour = COLOURS.get(n, "#4a4a4a")
-    of_n = [one for one in record["subjects"].values() if one["n_stacks"] == n]
+    of_n = [one for one in record["subjects"].values() if one["n_stacks"] == n and one["registered"]]
     for k, one in enumerate(of_n):
         panel.plot(
             *_points(one, "mean_error"), color=colour, lw=0.8, alpha=0.45,

@@ -29,14 +29,15 @@ def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
     subjects = {
         one.label: {
             "n_stacks": one.n_stacks, "psnr_db": one.psnr_db, "poses_mm": one.median_mm,
-            "trusted": one.trusted, "seconds": one.seconds, "map_seconds": one.map_seconds,
+            "trusted": one.trusted, "registered": one.registered, "seconds": one.seconds,
+            "map_seconds": one.map_seconds,
             **judge(u, np.abs(one.error)),
         }
         for one, u in zip(found, stated, strict=True)
     }  # fmt: skip
     together = {}
     for n in sorted({one.n_stacks for one in found}):
-        of_n = [k for k, one in enumerate(found) if one.n_stacks == n]
+        of_n = [k for k, one in enumerate(found) if one.n_stacks == n and one.registered]
         size = np.concatenate([np.abs(found[k].error) for k in of_n])
         together[str(n)] = judge(np.concatenate([stated[k] for k in of_n]), size)
     return {
@@ -95,7 +96,7 @@ def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
     rows, each = [], []
     for name, one in record.items():
         for n, figures in one["by_stacks"].items():
-            of_n = [s for s in one["subjects"].values() if s["n_stacks"] == int(n)]
+            of_n = [s for s in one["subjects"].values() if s["n_stacks"] == int(n) and s["registered"]]
             ratios = [s["mean_error"] / s["mean_stated"] for s in of_n]
             rows.append(
                 [

@@ -81,15 +81,20 @@ def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
     return SimpleNamespace(
         label=name, n_stacks=n_stacks, evidence=evidence, error=rng.exponential(evidence["residual"]),
         psnr_db=28.0, median_mm=0.1, trusted=None, seconds=1.0, map_seconds=0.5,
+        registered=True,
     )  # fmt: skip
 
 
 def test_record_table_and_figure(tmp_path: Path) -> None:
     found = [judged_subject("a", 3, 0), judged_subject("b", 3, 1), judged_subject("c", 1, 2)]
+    found.append(judged_subject("not registered", 3, 3))
+    found[-1].registered = False  # has a row, and no part in the figures of all
+    found[-1].error = 10 * found[-1].error
     record = check_record(found, ErrorModel(-0.1, {"log residual": 1.0}))  # type: ignore[arg-type]
     assert set(record["by_stacks"]) == {"1", "3"}
+    assert record["by_stacks"]["3"]["mean_error"] < 0.1
     text = check_text({"with prior": {"preset": "p", "weights": "w", **record}})
-    assert text.count("| with prior |") == 2 + 3
+    assert text.count("| with prior |") == 2 + 4
     assert "+ 1.00 log residual" in text
     draw_calibration(record, tmp_path / "new" / "figure.png")
     assert Image.open(tmp_path / "new" / "figure.png").width > 1000
