@@ -6,15 +6,19 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
 
+from g3r.acquisition.images import save_volume  # noqa: E402
+from g3r.cli import export  # noqa: E402
 from g3r.errors import InputError  # noqa: E402
-from g3r.prior import PriorCheckpoint, save_prior_checkpoint  # noqa: E402
+from g3r.prior import PriorCheckpoint, load_prior, save_prior_checkpoint  # noqa: E402
 from g3r.prior import lightning_module as training  # noqa: E402
 
 NETWORK = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4}
@@ -180,3 +184,26 @@ def test_trainer_flags(tmp_path, flags):
     assert process.returncode == 0, words[-2000:]
     (last,) = (tmp_path / "prior" / "version_0" / "checkpoints").glob("last*.ckpt")
     assert steps_of(last) > 0
+
+
+@pytest.mark.slow
+def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
+    """A folder of volumes with masks is enough for the prior; names need not hold an age."""
+    generator = np.random.default_rng(0)
+    index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
+    mask = np.linalg.norm(index / [10, 8, 9], axis=-1) < 1
+    for name in ("placenta-a", "placenta-b"):
+        image = np.where(mask, 300 + 200 * gaussian_filter(generator.normal(size=mask.shape), 1.5), 0)
+        (tmp_path / "atlas" / name).mkdir(parents=True)
+        save_volume(
+            tmp_path / "atlas" / name / "t2.nii.gz", image.astype(np.float32), np.diag([3.0, 3, 3, 1])
+        )
+        save_volume(tmp_path / "atlas" / name / "mask.nii.gz", mask, np.diag([3.0, 3, 3, 1]))
+    process = run_training(tmp_path, "--trainer.max_epochs=1", f"--data.source={tmp_path / 'atlas'}")
+    words, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, words[-2000:]
+    (last,) = (tmp_path / "prior" / "version_0" / "checkpoints").glob("last*.ckpt")
+    assert export.main([str(last), str(tmp_path / "prior.pt")]) == 0
+    assert load_prior(tmp_path / "prior.pt", 3.0)[1].voxel_mm == 3.0
+    with pytest.raises(InputError, match=r"expected 0\.8 mm"):
+        load_prior(tmp_path / "prior.pt", 0.8)
