@@ -23,33 +23,31 @@ from g3r.result import ReconstructionResult
 from g3r.trust.uncertainty import collect
 
 FIT_VOLUMES = (
-    ("spina-bifida/sb26-operated", 3, "mild"), ("spina-bifida/sb28-operated", 3, "moderate"),
-    ("spina-bifida/sb30-operated", 3, "mild"), ("spina-bifida/sb32-operated", 3, "moderate"),
-    ("spina-bifida/sb34-operated", 3, "mild"),
-    ("spina-bifida/sb25-operated", 1, "mild"), ("spina-bifida/sb27-operated", 1, "none"),
-    ("spina-bifida/sb29-operated", 1, "mild"), ("spina-bifida/sb31-operated", 1, "mild"),
-    ("spina-bifida/sb33-operated", 1, "mild"),
+    ("spina-bifida/sb26-operated", 3, "mild", 51_200), ("spina-bifida/sb33-operated", 1, "mild", 51_209),
+    ("spina-bifida/sb28-operated", 3, "moderate", 51_201), ("spina-bifida/sb25-operated", 1, "mild", 51_205),
+    ("spina-bifida/sb30-operated", 3, "mild", 51_202), ("spina-bifida/sb27-operated", 1, "none", 51_206),
+    ("spina-bifida/sb32-operated", 3, "moderate", 51_203), ("spina-bifida/sb29-operated", 1, "mild", 51_207),
+    ("spina-bifida/sb34-operated", 3, "mild", 51_204), ("spina-bifida/sb31-operated", 1, "mild", 51_208),
 )  # fmt: skip
-"""Volume, stacks and motion of the subjects that the coefficients are fitted to. No prior was trained on
-these volumes (checkpoints are chosen by them)."""
+"""Volume, stacks, motion and seed of the subjects that the coefficients are fitted to. No prior was
+trained on these volumes (checkpoints are chosen by them)."""
 
 CHECK_VOLUMES = (
-    ("crl-sta/sta24", 3, "mild"), ("crl-sta/sta30", 1, "mild"), ("crl-sta/sta34", 3, "moderate"),
-    ("crl-sta/sta24", 1, "mild"), ("crl-sta/sta30", 3, "mild"), ("crl-sta/sta34", 1, "mild"),
-    ("crl-sta/sta24", 3, "moderate"), ("crl-sta/sta30", 1, "none"), ("crl-sta/sta34", 3, "mild"),
-    ("crl-sta/sta24", 1, "mild"),
+    ("crl-sta/sta24", 3, "mild", 52_200), ("crl-sta/sta30", 1, "mild", 52_201),
+    ("crl-sta/sta34", 3, "moderate", 52_202), ("crl-sta/sta24", 1, "mild", 52_203),
+    ("crl-sta/sta30", 3, "mild", 52_204), ("crl-sta/sta34", 1, "mild", 52_205),
+    ("crl-sta/sta24", 3, "moderate", 52_206), ("crl-sta/sta30", 1, "none", 52_207),
+    ("crl-sta/sta34", 3, "mild", 52_208), ("crl-sta/sta24", 1, "mild", 52_209),
 )  # fmt: skip
 """The same of the subjects that they are checked on: weeks left out of every training and choice."""
 
-UNREGISTERED = ("crl-sta/sta24", 3, "moderate")
+UNREGISTERED = ("crl-sta/sta24", 3, "moderate", 52_250)
 """One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
 
 NO_REGISTRATION = {
     "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
     "motion.n_rounds": 0, "motion.standard_orientation": False,
 }  # fmt: skip
-
-FIT_SEED, CHECK_SEED, UNREGISTERED_SEED = 51_200, 52_200, 52_250
 
 VOXELS_PER_SUBJECT = 40_000
 
@@ -91,20 +89,20 @@ class Judged:
 
 def fit_recipes() -> list[tuple[SubjectRecipe, int]]:
     """Subjects of the fit with their number of stacks; always the same."""
-    return [_recipe(FIT_SEED + n, *one) for n, one in enumerate(FIT_VOLUMES)]
+    return [_recipe(*one) for one in FIT_VOLUMES]
 
 
 def check_recipes() -> list[tuple[SubjectRecipe, int]]:
     """Subjects of the check with their number of stacks; always the same."""
-    return [_recipe(CHECK_SEED + n, *one) for n, one in enumerate(CHECK_VOLUMES)]
+    return [_recipe(*one) for one in CHECK_VOLUMES]
 
 
 def unregistered_recipe() -> tuple[SubjectRecipe, int]:
     """The subject that the check leaves unregistered."""
-    return _recipe(UNREGISTERED_SEED, *UNREGISTERED)
+    return _recipe(*UNREGISTERED)
 
 
-def _recipe(seed: int, volume: str, n_stacks: int, motion: str) -> tuple[SubjectRecipe, int]:
+def _recipe(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectRecipe, int]:
     name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
     return SubjectRecipe(name, volume, motion, seed), n_stacks
 
