@@ -66,8 +66,17 @@ def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
     return slices.with_pose(case.true.pose.take(rows) @ slices.header_pose)
 
 
-def prior_volumes(network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: float) -> PriorVolumes:
-    """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have."""
+def prior_volumes(
+    network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: float, n_views: int = 1
+) -> PriorVolumes:
+    """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have.
+
+    Args:
+        network: from `load_prior`.
+        slices: posed.
+        voxel_mm: that the network was trained on.
+        n_views: see `estimate_prior`.
+    """
     from g3r.prior import estimate_prior
 
     seconds: dict[str, float] = {}
@@ -76,13 +85,13 @@ def prior_volumes(network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: f
     sharp = _timed(seconds, "V_sharp", lambda: sharpened_volume(slices, grid, coarse))
     scale = np.float32(normalisation_scale(coarse, density))
     given = coarse / scale, density, sharp / scale
-    prior = _timed(seconds, "V_prior", lambda: estimate_prior(network, *given))
+    prior = _timed(seconds, "V_prior", lambda: estimate_prior(network, *given, n_views=n_views))
     by_name = {"V_coarse": coarse / scale, "V_sharp": sharp / scale, "V_prior": prior}
     return PriorVolumes(by_name, density, grid, seconds)
 
 
 def tiling_difference(network: DensityGatedPriorNetwork, volumes: PriorVolumes, tile_voxels: int) -> float:
-    """Largest difference, in the normalised scale, between the prior made whole and made in tiles."""
+    """Largest difference, in the normalised scale, between a prior of one view made whole and in tiles."""
     from g3r.prior import estimate_prior
 
     given = volumes.by_name["V_coarse"], volumes.density, volumes.by_name["V_sharp"]

@@ -85,13 +85,17 @@ def test_alone_table_marks_what_falls_short():
     rows = [row(1, 2.9, 0.81), row(3, 2.1, 0.84), row(2, 0.5, 0.5)]
     speed = {
         "shape": [9, 8, 7], "voxel_mm": 0.8, "seconds": dict.fromkeys(prior_alone.VOLUMES, 5.5),
-        "tile_voxels": 72, "tiling_difference": 2e-4,
+        "tile_voxels": 72, "tiling_difference": 2e-4, "all_views_seconds": 4.9,
     }  # fmt: skip
-    text = prior_alone.alone_tables({"weights": "abc", "threads": 2, "rows": rows, "speed": speed})
+    text = prior_alone.alone_tables(
+        {"weights": "abc", "threads": 2, "n_views": 4, "rows": rows, "speed": speed}
+    )
     assert "| +2.90 (!) | 0.810 | 2.5 |" in text
     assert "| +2.10 | 0.840 (!) | 2.5 |" in text
     assert "| +0.50 | 0.500 | 2.5 |" in text  # nothing was asked of two stacks
-    assert "the network 5.5 s (asked: under 5 (!))" in text
+    assert (
+        "the network 5.5 s (asked: under 5 (!)), and the mean over the 4 views of the product 4.9 s." in text
+    )
     assert "2.0e-04 of the intensity scale (asked: 0.001)" in text
 
 
