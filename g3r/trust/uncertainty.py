@@ -22,6 +22,9 @@ WITH_PRIOR, WITHOUT_PRIOR = "with prior", "without prior"
 
 MEANING = "expected absolute error of volume.nii.gz, in its intensity units"
 
+MOSTLY_PRIOR = 0.5
+"""A voxel whose prior share is larger shows more of the prior than of the slices."""
+
 DOUBTED_NOTE = (
     "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
 )
@@ -76,7 +79,10 @@ def estimate_uncertainty(
     """
     evidence = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
     name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
-    return uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
+    found = uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
+    if prior_share is not None:
+        found.record["prior_share"] = prior_share_summary(prior_share[mask])
+    return found
 
 
 def collect(
@@ -122,6 +128,13 @@ def uncertainty_of(
     if trusted is not True:
         record["note"] = UNCHECKED_NOTE if trusted is None else DOUBTED_NOTE
     return Uncertainty(expected, record)
+
+
+def prior_share_summary(share: NDArray[np.float32]) -> dict[str, float]:
+    """What run.json says of prior_share.nii.gz: its mean over the mask's voxels, and how many rest on it."""
+    if not share.size:
+        return {"mean_in_mask": 0.0, "mask_mostly_prior": 0.0}
+    return {"mean_in_mask": float(share.mean()), "mask_mostly_prior": float((share > MOSTLY_PRIOR).mean())}
 
 
 @cache

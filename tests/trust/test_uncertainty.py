@@ -127,6 +127,14 @@ def test_without_a_prior_there_is_a_map_too(grid: VolumeGrid, mask: np.ndarray) 
     assert found.record["calibration"] == "without prior"
 
 
+def test_record_says_how_much_rests_on_the_prior(grid: VolumeGrid, mask: np.ndarray) -> None:
+    share = np.where(np.arange(SHAPE[0])[:, None, None] < SHAPE[0] // 2, 0.8, 0.2) * np.ones(grid.shape)
+    record = uncertainty_of(fit_of(0.02), grid, mask, prior_share=share.astype(np.float32)).record
+    assert record["prior_share"]["mask_mostly_prior"] == pytest.approx(0.5)
+    assert record["prior_share"]["mean_in_mask"] == pytest.approx(0.5)
+    assert "prior_share" not in uncertainty_of(fit_of(0.02), grid, mask).record
+
+
 def test_evidence_in_a_corner_of_the_grid(grid: VolumeGrid) -> None:
     corner = np.zeros(grid.shape, bool)
     corner[:3, :3, :3] = True
