@@ -188,7 +188,7 @@ def _mean_line(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         of_number.setdefault(row["n_stacks"], []).append(gain_db(row))
     listed = [
-        f"{_stacks(n)} {mean(gains):+.2f} dB (from {min(gains):+.2f} to {max(gains):+.2f}, {len(gains)} cases)"
+        f"{_stacks(n)} {mean(gains):+.2f} dB ({min(gains):+.2f} to {max(gains):+.2f}, {len(gains)} cases)"
         for n, gains in sorted(of_number.items())
     ]
     return f"Prior less V_coarse, mean over the cases: {'; '.join(listed)}."
