@@ -22,6 +22,7 @@ from g3r.acquisition.planes import (
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
+from g3r.fitting.prior_share import estimate_prior_share
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import fit_slices
 from g3r.gaussians import render
@@ -106,7 +107,8 @@ class GaussianReconstructor:
                 f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm"
             )
         if self.settings.use_prior:
-            self.network, self.prior_meta = load_prior(Path(self.checkpoint or DEFAULT_CHECKPOINT))
+            path = Path(self.checkpoint or DEFAULT_CHECKPOINT)
+            self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
         if self.settings.motion.template or self.settings.motion.network:
             path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
             self.pose_network, self.pose_meta = load_pose_network(path)
@@ -132,11 +134,12 @@ class GaussianReconstructor:
         slices, first_scale = _normalised_slices(stacks)
         notes += left_out_notes(stacks, slices)
         single = len(np.unique(slices.stack_id)) == 1
+        held = settings.use_prior and settings.distillation and settings.motion.runs
         if single:
-            # registered to a volume made of themselves, slices of a single stack drift
+            # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
+            stage = settings.slice_stage
             settings = replace(
-                settings,
-                slice_stage=replace(settings.slice_stage, optimise_poses=False),
+                settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held)
             )
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
 
@@ -169,7 +172,7 @@ class GaussianReconstructor:
                     prior = self._prior(start)
             notes.append(
                 "slices of the single stack were registered to the prior volume" if believed else
-                "slices of the single stack stay in line: the prior volume gives no reason to move them"
+                "slices of the single stack stay in line up to the fit: the prior gave no reason to move"
             )  # fmt: skip
         elif single:
             notes.append("slices of the single stack stay where the mean head or the header has them")
@@ -204,10 +207,15 @@ class GaussianReconstructor:
             if not np.isfinite(volume).all():
                 raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         intensity = first_scale * scale
+        prior_share = None
+        if settings.use_prior:
+            with clock("prior share"):
+                prior_share = estimate_prior_share(fit, density, prior_grid, mask, grid, rng)
         with clock("uncertainty"):
             uncertainty = estimate_uncertainty(
                 volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,
-                with_prior=settings.use_prior, intensity=intensity, trusted=registration_trusted(confidences),
+                prior_share=prior_share, with_prior=settings.use_prior, intensity=intensity,
+                trusted=registration_trusted(confidences),
             )  # fmt: skip
         record = run_record(
             settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
@@ -220,7 +228,7 @@ class GaussianReconstructor:
         return ReconstructionResult(
             volume * np.float32(intensity), mask, grid, prior * np.float32(intensity),
             coarse * np.float32(intensity), density, prior_grid, fit.cloud, intensity, fit.slices, fit.gain,
-            fit.weight, motion.ncc, uncertainty.expected_error, record,
+            fit.weight, motion.ncc, uncertainty.expected_error, prior_share, record,
         )  # fmt: skip
 
     def register_stacks(self, stacks: Sequence[Stack]) -> MotionEstimate:

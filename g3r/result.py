@@ -34,7 +34,7 @@ stack's median of pixels is small; one that correlates less than the third with 
 
 OUTPUT_NAMES = (
     "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
-    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
+    "uncertainty.nii.gz", "prior_share.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
 )  # fmt: skip
 
 CAPTIONS = {
@@ -58,6 +58,8 @@ class ReconstructionResult:
         slices: in their last poses.
         gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
         uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask.
+        prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
+            prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
     """
 
@@ -75,6 +77,7 @@ class ReconstructionResult:
     weight: NDArray[np.float64]
     ncc: NDArray[np.float64]
     uncertainty: NDArray[np.float32]
+    prior_share: NDArray[np.float32] | None = None
     record: dict[str, Any] = field(default_factory=dict)
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
@@ -93,7 +96,10 @@ class ReconstructionResult:
             self._write(beside)
             if folder.exists():
                 for name in OUTPUT_NAMES:
-                    os.replace(beside / name, folder / name)
+                    if (beside / name).exists():
+                        os.replace(beside / name, folder / name)
+                    else:  # of an earlier result with a prior
+                        (folder / name).unlink(missing_ok=True)
             else:
                 os.replace(beside, folder)
         except OSError as error:
@@ -110,12 +116,16 @@ class ReconstructionResult:
         save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
         save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
         save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
+        if self.prior_share is not None:
+            save_volume(folder / "prior_share.nii.gz", self.prior_share, self.grid.affine)
         for name in ("prior", "coarse", "density"):
             save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
         rows = {"volume": self.volume, "uncertainty": self.uncertainty}
+        if self.prior_share is not None:
+            rows["prior share"] = self.prior_share * self.mask
         if self.grid is self.prior_grid:
             on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
             rows = {**on_mask, **rows}

@@ -19,6 +19,9 @@ from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
 from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes
 from g3r.motion.slice_rounds import slice_weights
 
+MOST_PRIOR_STRENGTH = 1.0
+"""A pixel read off the prior never counts for more than a measured one."""
+
 
 @dataclass(frozen=True)
 class SliceStageSettings:
@@ -29,7 +32,9 @@ class SliceStageSettings:
         peak_iterations: conjugate-gradient steps for the peaks at the start; 0 leaves them as stage 1 did.
         peak_damping: pull of those towards the prior's peaks (relative).
         scale_weight: weight of the scale regulariser.
-        distillation: w(i), weight of the distance to the prior.
+        distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
+        prior_error: mean absolute error expected of the prior where nothing is measured, in normalised
+            intensities; see `prior_strength`.
         distillation_planes: share of the prior's planes in a step (random).
         optimise_poses: whether slices move.
         pose_prior_mm: a slice that moves this far from where registration left it pays as much as a change of
@@ -47,6 +52,7 @@ class SliceStageSettings:
     peak_damping: float = 0.05
     scale_weight: float = 0.02
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.5, 0.05))
+    prior_error: float = 0.05
     distillation_planes: float = 0.1
     optimise_poses: bool = True
     pose_prior_mm: float = 10.0
@@ -164,7 +170,7 @@ def fit_slices(
         entry = {"image": image.item()}
         if shading:
             loss = loss + settings.shading_ridge * coefficients.square().mean()
-        strength = settings.distillation.at(fraction)
+        strength = prior_strength(settings, fraction, entry["image"])
         if prior is not None and strength > 0:
             distance = weighted_l1(render(current, part.planes, pairs=part_pairs), part_value, part_weight)
             loss = loss + strength * prior_share * distance
@@ -190,6 +196,25 @@ def fit_slices(
         history,
         coefficients.detach().double().tolist() if shading else [],
     )
+
+
+def prior_strength(settings: SliceStageSettings, fraction: float, residual: float) -> float:
+    """w(i): annealed as in G3R, but not below what the slices' residual and the prior's error ask for.
+
+    A voxel with confidence c counts as if 1 - c missing pixels had been read off the prior. Under L1 (Laplace
+    distributions) a pixel weighs one over its mean absolute error, so one read off the prior weighs
+    residual / prior_error times one that was measured: little where slices fit much better than the prior is
+    known to, much where noise or motion spoil them.
+
+    Args:
+        settings: the schedule, and the prior's error.
+        fraction: of the fit that is done.
+        residual: mean absolute residual of the slices at present.
+    """
+    annealed = settings.distillation.at(fraction)
+    if settings.prior_error <= 0 or not settings.distillation.start > 0:
+        return annealed
+    return max(annealed, min(residual / settings.prior_error, MOST_PRIOR_STRENGTH))
 
 
 def _trust(

@@ -11,7 +11,7 @@ from g3r.acquisition.planes import Planes, Slices, volume_from_pixels, volume_pl
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.schedules import AnnealedWeight
-from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
+from g3r.fitting.slice_stage import SliceStageSettings, fit_slices, prior_strength
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
@@ -223,3 +223,15 @@ def test_the_same_seed_gives_the_same_fit(volume: np.ndarray):
     one, two = (fit(volume, make_slices(), target, n_steps=12) for _ in range(2))
     torch.testing.assert_close(one.cloud.mean_mm, two.cloud.mean_mm, rtol=0, atol=0)
     assert one.history == two.history
+
+
+def test_the_prior_weighs_by_the_residual_over_its_error_and_never_more_than_a_pixel():
+    settings = SliceStageSettings(distillation=AnnealedWeight(0.5, 0.05), prior_error=0.05)
+    assert prior_strength(settings, 0.0, 0.001) == 0.5
+    assert prior_strength(settings, 1.0, 0.001) == pytest.approx(0.05)
+    assert prior_strength(settings, 1.0, 0.02) == pytest.approx(0.4)
+    assert prior_strength(replace(settings, prior_error=0.025), 1.0, 0.02) == pytest.approx(0.8)
+    assert prior_strength(settings, 1.0, 0.5) == 1.0
+    assert prior_strength(replace(settings, prior_error=0.0), 1.0, 0.5) == pytest.approx(0.05)
+    off = replace(settings, distillation=AnnealedWeight(0.0, 0.0))
+    assert prior_strength(off, 0.5, 0.5) == 0.0
