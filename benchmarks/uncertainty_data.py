@@ -158,7 +158,7 @@ def evidence_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
     fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record["shading"])
     return collect(
         result.volume / scale, result.mask, result.grid, fit, result.prior / scale, result.density,
-        result.prior_grid, getattr(result, "prior_share", None),
+        result.prior_grid, result.prior_share,
     )  # fmt: skip
 
 

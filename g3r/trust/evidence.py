@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import (
-    affine_transform,
     distance_transform_edt,
     gaussian_filter,
     gaussian_gradient_magnitude,
@@ -19,6 +18,7 @@ from scipy.ndimage import (
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.scatter import confidence
 from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.prior_share import on_grid
 from g3r.fitting.shading import StackShading
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
@@ -119,18 +119,6 @@ def gather_evidence(
     if prior_share is not None:
         evidence["prior_share"] = prior_share[box]
     return {name: values[inside].astype(np.float64) for name, values in evidence.items()}
-
-
-def on_grid(
-    data: NDArray[np.float32], source: VolumeGrid, target: VolumeGrid, outside: float = 0.0
-) -> NDArray[np.float32]:
-    """A map [I, J, K] read on another grid by trilinear interpolation; untouched where both are the same."""
-    if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
-        return data
-    index = source.index_from_world @ target.affine
-    return affine_transform(
-        data, index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant", cval=outside
-    )
 
 
 def _box_around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, ...]:

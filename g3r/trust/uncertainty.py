@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.fitting.prior_share import on_grid
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
-from g3r.trust.evidence import gather_evidence, mean_residual, on_grid
+from g3r.trust.evidence import gather_evidence, mean_residual
 from g3r.trust.model import ErrorModel, load_calibration
 
 CALIBRATION = Path(__file__).parent / "calibration.json"
@@ -99,8 +100,8 @@ def collect(
     return gather_evidence(
         volume, mask, grid,
         residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.shading, grid),
-        density=on_grid(density, prior_grid, grid),
-        prior=on_grid(prior, prior_grid, grid),
+        density=on_grid(density, prior_grid, grid, outside=0.0),
+        prior=on_grid(prior, prior_grid, grid, outside=0.0),
         prior_share=prior_share,
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.trust import estimate_uncertainty
-from g3r.trust.evidence import gather_evidence, mean_residual, on_grid
+from g3r.trust.evidence import gather_evidence, mean_residual
 from g3r.trust.uncertainty import DOUBTED_NOTE, MEANING, UNCHECKED_NOTE
 
 SHAPE = (24, 22, 20)
@@ -143,12 +143,3 @@ def test_evidence_in_a_corner_of_the_grid(grid: VolumeGrid) -> None:
     assert {len(values) for values in found.values()} == {27}
     assert found["edge"].max() < 1e-6  # the rim of the mask is no edge of the brain
     assert found["depth_mm"].min() == 1.0
-
-
-def test_on_grid_reads_in_the_world(grid: VolumeGrid) -> None:
-    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
-    ramp = (grid.world(index) @ [1.0, 2.0, 3.0]).astype(np.float32)
-    finer = VolumeGrid.isotropic([-5, -5, -5], [5, 5, 5], 0.7)
-    index = np.stack(np.meshgrid(*[np.arange(n) for n in finer.shape], indexing="ij"), -1)
-    np.testing.assert_allclose(on_grid(ramp, grid, finer), finer.world(index) @ [1.0, 2.0, 3.0], atol=1e-4)
-    assert on_grid(ramp, grid, grid) is ramp
