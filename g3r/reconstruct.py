@@ -189,10 +189,10 @@ class GaussianReconstructor:
         with clock("fit to slices"):
             distil_to = None
             if settings.use_prior and settings.distillation:
-                # the prior counts where slices are sparse; where they are dense they know better
-                unmeasured = np.maximum(
-                    prior_mask * (1 - confidence(density)), LEAST_DISTILLATION * prior_mask
-                )
+                # the prior counts where slices are sparse; where they are dense they know better. It was made
+                # of the same slices: from several stacks only 1 - c of what it says there is its own
+                power = 1 if single else 2
+                unmeasured = np.maximum((1 - confidence(density)) ** power, LEAST_DISTILLATION) * prior_mask
                 distil_to = VolumeTarget.of(prior, unmeasured.astype(np.float32), prior_grid)
             fit = fit_slices(
                 cloud, slices, gain, motion.weight, distil_to, settings.slice_stage, rng,
