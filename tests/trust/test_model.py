@@ -9,6 +9,7 @@ import pytest
 
 from g3r.trust.model import (
     LARGEST,
+    LEAST,
     SMALLEST,
     ErrorModel,
     fit_model,
@@ -68,6 +69,13 @@ def test_coefficients_are_never_negative() -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(size=5000)
     assert fit_model({"x": x}, rng.exponential(np.exp(-x))).coefficients["x"] == 0
+
+
+def test_misfit_of_slices_always_counts() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=5000)
+    found = fit_model({"log residual": x}, rng.exponential(np.exp(-x)))
+    assert found.coefficients["log residual"] == pytest.approx(LEAST["log residual"])
 
 
 def test_too_few_voxels() -> None:
