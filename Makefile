@@ -12,6 +12,9 @@ ATLAS ?=
 PRETRAIN_ARGS ?=
 POSE_ARGS ?=
 BENCH_ARGS ?=
+# of `make ablate-networks`: small patches of subjects that all variants share
+SHORT_TRAINING ?= --data.num_workers=0 --data.patch_size=32 --data.batch_size=2 --data.distinct_epochs=2 \
+	--model.warmup_steps=60 --trainer.check_val_every_n_epoch=2
 PRIOR ?= runs/prior.pt
 POSE ?= runs/pose.pt
 BIN := $(VENV)/bin
@@ -97,7 +100,7 @@ bench-lesions: install ## how much of lesions is kept, with and without prior (G
 
 ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
 	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \
-		--figure docs/images/prior-networks.png $(BENCH_ARGS)
+		--figure docs/images/prior-networks.png $(BENCH_ARGS) -- $(SHORT_TRAINING)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

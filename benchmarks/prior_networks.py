@@ -10,10 +10,19 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import mean
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
+from benchmarks.prior_network_scores import (
+    EXPORTED,
+    LEFT_OUT,
+    SPEED_SHAPE,
+    VALIDATED_ON,
+    baseline_scores,
+    evaluate,
+    inference_seconds,
+    validation_volumes,
+)
 from benchmarks.tables import markdown_table, put_into, write_json, write_text
 from g3r.errors import InputError
 
@@ -21,10 +30,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 CONFIG = Path(__file__).resolve().parents[1] / "lightning_configs" / "prior.yaml"
-
-LEFT_OUT = ("sta24", "sta30", "sta34")
-VALIDATED_ON = ("*-operated",)
-"""Subjects of the atlas: the first are for judging, the second choose, the rest train."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +63,6 @@ VARIANTS = (
     Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
 )
 
-SPEED_SHAPE = (129, 152, 130)
-"""Voxels of a 36-week brain at 0.8 mm with its margin (`benchmarks.prior_alone`)."""
-
-REPEATS = 3
-
 DEFAULT_FOLDER = Path("runs") / "bench" / "prior-networks"
 
 
@@ -76,13 +76,14 @@ def build_parser() -> argparse.ArgumentParser:
         DEFAULT_FOLDER,
     )
     parser.add_argument(
-        "--steps", type=int, default=300, metavar="N", help="of the optimiser, to whole epochs"
+        "--steps", type=int, default=384, metavar="N", help="of the optimiser, to whole epochs"
     )
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help=", ".join(names(VARIANTS)))
     parser.add_argument("--source", type=Path, help="atlas folder (None: the one of the test data)")
     parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="synthetic subjects")
     parser.add_argument("--val-subjects", type=int, default=9, metavar="N", help="volumes to compare on")
     parser.add_argument("--no-train", action="store_true", help="only the table and the figure")
+    parser.add_argument("--retime", action="store_true", help="measure all seconds again, on a quiet machine")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw errors and seconds")
     parser.add_argument(
         "train_args",
@@ -122,10 +123,11 @@ def _run(options: argparse.Namespace) -> int:
     record: dict[str, Any] = {"threads": threads, "machine": machine(), "baselines": {}, "variants": {}}
     if path.is_file():
         record |= json.loads(path.read_text(encoding="utf-8"))
+    use_threads(threads)
     if not options.no_train:
-        use_threads(threads)
         source = options.source or test_data_folder() / "atlas"
         data = data_arguments(source, options.cache, options.val_subjects)
+        record["arguments"] = options.train_args
         n_epochs = epochs_of(options.steps, config, options.train_args)
         volumes: list[dict[str, Tensor]] = []
         for variant in distinct_variants(config):
@@ -149,6 +151,11 @@ def _run(options: argparse.Namespace) -> int:
             write_json(path, record)
     if not record["variants"]:
         raise InputError(f"{path}: holds no trained variant; leave out --no-train")
+    if options.retime:
+        record |= {"threads": threads, "machine": machine()}
+        for name, one in record["variants"].items():
+            one["seconds"] = inference_seconds(options.output / name / EXPORTED)
+        write_json(path, record)
     text = network_tables(record)
     write_text(options.output / "networks.md", text)
     print(text)
@@ -226,77 +233,6 @@ def newest_checkpoint(run: Path) -> Path | None:
     return found[-1] if found else None
 
 
-def validation_volumes(
-    source: Path, cache: Path, val_subjects: int, config: Mapping[str, Any]
-) -> list[dict[str, Tensor]]:
-    """The volumes that every variant is compared on: those that its training validated on."""
-    from data_synth.datamodule import StackSynthesisDataModule
-
-    settings = {
-        **config["data"]["init_args"], "source": str(source), "cache": str(cache),
-        "val_subjects": val_subjects, "exclude": list(LEFT_OUT), "val_include": list(VALIDATED_ON),
-    }  # fmt: skip
-    return list(StackSynthesisDataModule(**settings).val_dataloader())
-
-
-def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
-    """Export a variant and score it: errors by number of stacks, seconds for a whole brain, its size."""
-    import numpy as np
-    import torch
-
-    from g3r.cli import export
-    from g3r.prior import estimate_prior, load_prior
-
-    exported = run / "prior.pt"
-    if export.main([str(checkpoint), str(exported), "--force"]) != 0:
-        raise InputError(f"{checkpoint}: cannot be exported; remove {run} and train again")
-    network, _ = load_prior(exported)
-    with torch.inference_mode():
-        priors = [network(one["coarse"], one["density"], one["sharp"]) for one in volumes]
-    rng = np.random.default_rng(0)
-    inputs = [rng.random(SPEED_SHAPE, dtype=np.float32) for _ in range(3)]
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        estimate_prior(network, *inputs)
-        seconds.append(time.perf_counter() - start)
-    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    return {
-        "steps": int(content["global_step"]),
-        "parameters": sum(value.numel() for value in network.parameters()),
-        "seconds": round(min(seconds), 2),
-        "scores": scores_by_stacks(priors, volumes),
-    }
-
-
-def baseline_scores(volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
-    """What the network starts from, scored alike."""
-    return {
-        name: scores_by_stacks([one[key] for one in volumes], volumes)
-        for name, key in (("V_coarse", "coarse"), ("V_sharp", "sharp"))
-    }
-
-
-def scores_by_stacks(
-    made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]
-) -> dict[str, dict[str, float]]:
-    """Mean L1, PSNR (dB) and SSIM in the mask, for each number of stacks and over all ("all")."""
-    from g3r.prior.lightning_module import scores_in_mask
-
-    rows: dict[str, list[tuple[float, float, float]]] = {}
-    for volume, one in zip(made, volumes, strict=True):
-        inside = one["mask"] > 0.5
-        scores = scores_in_mask(volume, one["truth"], inside)
-        l1 = float((volume - one["truth"])[inside].abs().mean())
-        row = (l1, mean(scores["psnr"]), mean(scores["ssim"]))
-        for key in (str(int(one["n_stacks"][0])), "all"):
-            rows.setdefault(key, []).append(row)
-    return {
-        key: {name: mean(row[n] for row in found) for n, name in enumerate(("l1", "psnr_db", "ssim"))}
-        for key, found in sorted(rows.items())
-    }
-
-
 def network_tables(record: Mapping[str, Any]) -> str:
     """A row per variant in Markdown, those it starts from first."""
     variants: Mapping[str, Any] = record["variants"]
@@ -318,7 +254,8 @@ def network_tables(record: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             "Mean over the validation volumes, in the mask, in normalised intensities (PSNR: range 1); "
-            f"seconds for {size} voxels on {record['threads']} threads.",
+            f"seconds for one view of {size} voxels on {record['threads']} threads. Trained with "
+            f"`{' '.join(record.get('arguments', [])) or 'the configuration as it is'}`.",
             "", markdown_table(head, rows),
         ]
     )  # fmt: skip

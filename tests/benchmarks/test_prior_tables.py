@@ -10,7 +10,7 @@ import torch
 import yaml
 from scipy.ndimage import gaussian_filter
 
-from benchmarks import motion_sweep, prior_ablation, prior_alone, prior_networks
+from benchmarks import motion_sweep, prior_ablation, prior_alone, prior_network_scores, prior_networks
 from benchmarks.prior_figures import draw_ablation, draw_networks
 from benchmarks.prior_volumes import aligned_scores, slices_at_true_poses
 from benchmarks.runs import changed
@@ -151,7 +151,7 @@ def test_scores_by_number_of_stacks():
         {"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)
     ]
     made = [truth + error for error in (0.1, 0.01, 0.03)]
-    scores = prior_networks.scores_by_stacks(made, volumes)
+    scores = prior_network_scores.scores_by_stacks(made, volumes)
     assert scores["1"]["psnr_db"] == pytest.approx(20, abs=1e-3)
     assert scores["3"]["l1"] == pytest.approx(0.02, abs=1e-6)
     assert scores["all"]["l1"] == pytest.approx(0.14 / 3, abs=1e-6)
