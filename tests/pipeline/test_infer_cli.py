@@ -336,7 +336,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
         return [*inputs(subject), *options], "out"
     elif kind == "prior of another voxel size":
         expected = "prior.pt: was trained on voxels of 0.8 mm, expected 1.2 mm"
-        return [*inputs(subject), *options, "--prior-voxel", "1.2"], expected
+        return [*inputs(subject), *options[1:], "--prior-voxel", "1.2"], expected
     elif kind == "resolution":
         return [*inputs(subject), *options, "--resolution", "0"], "resolution 0 mm"
     whole = kind in ("one slice", "NaN volume")
