@@ -30,9 +30,6 @@ def draw_calibration(record: Mapping[str, Any], path: Path) -> None:
     panels = figure.subplots(1, len(numbers) + 1)
     for panel, n in zip(panels, numbers, strict=False):
         _calibration(panel, record, n)
-    for panel in panels[1 : len(numbers)]:
-        panel.sharex(panels[0])
-        panel.sharey(panels[0])
     _sparsification(panels[-1], record)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.name}.{os.getpid()}.png")
