@@ -219,6 +219,7 @@ def one_motion_or_runs(
     interleave: int,
     volume: NDArray[np.float32],
     grid: VolumeGrid,
+    margin: float = MARGIN,
 ) -> tuple[RigidPose, bool]:
     """One motion for all slices of a stack where a volume predicts them as well by it; otherwise its runs.
 
@@ -229,6 +230,7 @@ def one_motion_or_runs(
         interleave: its acquisition order.
         volume: [I, J, K] that the stack did not help to make.
         grid: its grid.
+        margin: by how much runs have to be cheaper.
 
     Returns:
         Motions [K], and whether they are all one.
@@ -236,7 +238,7 @@ def one_motion_or_runs(
     rigid = _one_motion(slices.take(part.rows), motion, volume, grid)
     free = predict(part, motion, volume, grid, interleave)
     still = predict(part, rigid, volume, grid, interleave)
-    is_one = still.cost <= free.cost + MARGIN
+    is_one = still.cost <= free.cost + margin
     logger.debug("stack %d: one motion costs %.0f, runs %.0f", part.stack, still.cost, free.cost)
     return (rigid, True) if is_one else (motion, False)
 

@@ -28,6 +28,11 @@ from g3r.motion.template_registration import TemplatePlacement, place_in_templat
 
 logger = logging.getLogger(__name__)
 
+SINGLE_MARGIN = 250.0
+"""How much cheaper runs must be for a single stack, which only a mean head holds together: 25-101 with mild
+motion, where one motion for all slices is nearer to the truth (0.7-0.9 mm instead of 1.2-1.8), 691 to 1950
+with jerks (12 stacks of seeds 31000+, 31100+ and 31200+, the development subjects)."""
+
 SETTLED = 0.68
 """Held-out correlation that every stack must reach; below it the search is begun again by other random
 numbers. Stacks in place reach 0.66 to 0.9, so that a few of them are searched for again in vain."""
@@ -123,6 +128,6 @@ def search_single(
         return Searched(motion, "headers", {}, placed)
     only, head = placed.placement[0], placed.head
     motion, is_one = one_motion_or_runs(
-        slices, part, only.motion, only.runs.interleave, head.volume, head.grid
+        slices, part, only.motion, only.runs.interleave, head.volume, head.grid, SINGLE_MARGIN
     )
     return Searched(motion, "headers" if is_one else "template", {}, placed)
