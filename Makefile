@@ -22,7 +22,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation ablate-networks fit-uncertainty bench-uncertainty bench-lesions clean
+.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -97,6 +97,9 @@ bench-uncertainty: install ## stated uncertainty against error, on subjects left
 
 bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
 	$(BIN)/python -m benchmarks.lesions --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
+
+bench-cases: install ## with and without the prior on the cases (G3R_TEST_DATA): docs/prior.md
+	$(BIN)/python -m benchmarks.prior_cases --docs docs/prior.md $(BENCH_ARGS)
 
 ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
 	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \

@@ -10,7 +10,14 @@ import torch
 import yaml
 from scipy.ndimage import gaussian_filter
 
-from benchmarks import motion_sweep, prior_ablation, prior_alone, prior_network_scores, prior_networks
+from benchmarks import (
+    motion_sweep,
+    prior_ablation,
+    prior_alone,
+    prior_cases,
+    prior_network_scores,
+    prior_networks,
+)
 from benchmarks.prior_figures import draw_ablation, draw_networks
 from benchmarks.prior_volumes import aligned_scores, slices_at_true_poses
 from benchmarks.runs import changed
@@ -225,3 +232,17 @@ def test_slices_without_a_true_pose_are_left_out(tmp_path, rng):
     motion = slices.world_from_header()
     np.testing.assert_allclose(motion.translation_mm[:, 0], range(5), atol=1e-9)
     np.testing.assert_allclose(motion.rotvec_rad()[:, 2], 0.1, atol=1e-9)
+
+
+def test_cases_table_marks_a_prior_that_costs():
+    def row(gain):
+        scores = {v: {"psnr_db": 25.0, "ssim": 0.9} for v in prior_ablation.VARIANTS}
+        scores[prior_ablation.VARIANTS[-1]] = {"psnr_db": 25.0 + gain, "ssim": 0.9}
+        return {"n_stacks": 3, "scores": scores, "median_mm": {prior_ablation.VARIANTS[-1]: 0.07}}
+
+    record = {"preset": "balanced", "weights": "abc", "cases": {"good": row(0.4), "bad": row(-0.3)}}
+    lines = prior_cases.cases_table(record).splitlines()
+    good, bad = (next(line for line in lines if line.startswith(f"| {name}")) for name in ("good", "bad"))
+    assert "+0.40 |" in good
+    assert "-0.30 (!)" in bad
+    assert "0.07" in good
