@@ -23,7 +23,7 @@ class ReconstructionSettings:
         slice_stage: stage 2.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
-        use_prior: False seeds from V_coarse and leaves distillation out.
+        use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
     """

@@ -53,7 +53,7 @@ class ReconstructionResult:
 
     Args:
         volume, mask: [I, J, K] on `grid`.
-        prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_coarse where no network was used.
+        prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
         gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
