@@ -142,6 +142,9 @@ class GaussianReconstructor:
                 settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held)
             )
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
+        else:
+            # several stacks check each other: the schedule alone decides how hard the prior pulls
+            settings = replace(settings, slice_stage=replace(settings.slice_stage, prior_error=0.0))
 
         with clock("motion"):
             if motion is None:

@@ -34,7 +34,8 @@ class SliceStageSettings:
         scale_weight: weight of the scale regulariser.
         distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
         prior_error: mean absolute error of the prior, in normalised intensities (0.054 from one, 0.043 from
-            three stacks on the validation subjects of the shipped weights); see `prior_strength`.
+            three stacks on the validation subjects of the shipped weights); see `prior_strength`. 0 leaves
+            the strength to the schedule.
         distillation_planes: share of the prior's planes in a step (random).
         optimise_poses: whether slices move.
         pose_prior_mm: a slice that moves this far from where registration left it pays as much as a change of
@@ -51,7 +52,7 @@ class SliceStageSettings:
     peak_iterations: int = 6
     peak_damping: float = 0.05
     scale_weight: float = 0.02
-    distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.5, 0.05))
+    distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.2, 0.02))
     prior_error: float = 0.05
     distillation_planes: float = 0.1
     optimise_poses: bool = True

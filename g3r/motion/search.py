@@ -29,7 +29,7 @@ from g3r.motion.template_registration import TemplatePlacement, place_in_templat
 logger = logging.getLogger(__name__)
 
 SINGLE_MARGIN = 450.0
-"""How much cheaper runs must be for a single stack, which only a mean head holds together: -7 to 277 with mild
+"""How much cheaper runs must be for a single stack, which only a mean head holds together: to 277 with mild
 motion, where one motion for all slices is nearer to the truth (0.7-0.9 mm instead of 0.8-2.6), 691 to 1950
 with jerks (15 stacks of development and validation subjects)."""
 
