@@ -66,7 +66,8 @@ def test_the_share_is_what_refitting_to_another_prior_says(volume: np.ndarray) -
         name: float((answer * change)[part].sum() / (change**2)[part].sum())
         for name, part in (("upper", UPPER & BALL), ("lower", LOWER & BALL))
     }
-    assert share[LOWER & BALL].mean() == pytest.approx(kept["lower"], abs=0.12)
+    # the map errs towards the prior, and not by much
+    assert kept["lower"] - 0.03 < share[LOWER & BALL].mean() < kept["lower"] + 0.15
     # where nothing is measured a second fit does not repeat every detail; nothing but the prior speaks there
     assert kept["upper"] > 0.5
     assert share[UPPER & BALL].mean() > 0.9
