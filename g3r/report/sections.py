@@ -166,8 +166,10 @@ def _draw(
     )
     for row, one in enumerate(volumes):
         low, high = one.range or _window(one.data, inside, is_map=one.is_map)
+        # what a mask has cut away is black, also where a volume goes below zero
+        data = one.data if one.is_map else np.where(inside | (one.data != 0), one.data, low)
         for panel, view in zip(panels[row], VIEWS, strict=True):
-            shown = _section(one.data, view, center)
+            shown = _section(data, view, center)
             extent = (0.0, size_mm[view.across], 0.0, size_mm[view.up])
             colors = "inferno" if one.is_map else "gray"
             image = panel.imshow(
