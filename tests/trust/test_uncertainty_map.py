@@ -61,6 +61,7 @@ def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options:
         "prior": volume + np.float32(0.01),
         "density": np.full(grid.shape, 1.0, np.float32),
         "prior_grid": grid,
+        "prior_share": np.full(grid.shape, 0.2, np.float32),
     }
     return estimate_uncertainty(volume, mask, grid, fit, **{**given, **options})
 
@@ -132,7 +133,8 @@ def test_record_says_how_much_rests_on_the_prior(grid: VolumeGrid, mask: np.ndar
     record = uncertainty_of(fit_of(0.02), grid, mask, prior_share=share.astype(np.float32)).record
     assert record["prior_share"]["mask_mostly_prior"] == pytest.approx(0.5)
     assert record["prior_share"]["mean_in_mask"] == pytest.approx(0.5)
-    assert "prior_share" not in uncertainty_of(fit_of(0.02), grid, mask).record
+    without = uncertainty_of(fit_of(0.02), grid, mask, prior=None, prior_share=None)
+    assert "prior_share" not in without.record
 
 
 def test_evidence_in_a_corner_of_the_grid(grid: VolumeGrid) -> None:
