@@ -133,7 +133,7 @@ def test_record_says_how_much_rests_on_the_prior(grid: VolumeGrid, mask: np.ndar
     record = uncertainty_of(fit_of(0.02), grid, mask, prior_share=share.astype(np.float32)).record
     assert record["prior_share"]["mask_mostly_prior"] == pytest.approx(0.5)
     assert record["prior_share"]["mean_in_mask"] == pytest.approx(0.5)
-    without = uncertainty_of(fit_of(0.02), grid, mask, prior=None, prior_share=None)
+    without = uncertainty_of(fit_of(0.02), grid, mask, with_prior=False, prior_share=None)
     assert "prior_share" not in without.record
 
 
