@@ -80,24 +80,29 @@ class Planes:
         """Plane of every pixel [P]."""
         return np.repeat(np.arange(len(self)), np.diff(self.offset))
 
-    def pixel_uv_mm(self) -> NDArray[np.float64]:
-        """In-plane position (mm from the plane's centre) of every pixel [P, 2]."""
-        blocks = [
-            np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2 for n in shape], indexing="ij"), -1).reshape(
-                -1, 2
-            )
-            * spacing
-            for shape, spacing in zip(self.shape, self.spacing_mm, strict=True)
-        ]
-        return np.concatenate(blocks) if blocks else np.zeros((0, 2))
+    def pixel_uv_mm(self, pixel: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
+        """In-plane position (mm from the plane's centre) of every pixel [P, 2], or of those given."""
+        return self._plane_and_uv(pixel)[1]
 
     def pixel_world_mm(self, pixel: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
         """World position [P, 3] of every pixel, or of those with the given numbers."""
-        plane, uv = self.plane_id(), self.pixel_uv_mm()
-        if pixel is not None:
-            plane, uv = plane[pixel], uv[pixel]
-        in_plane = np.einsum("pij,pj->pi", self.rotation[plane][:, :, :2], uv)
-        return in_plane + self.center_mm[plane]
+        plane, uv = self._plane_and_uv(pixel)
+        position = self.center_mm[plane]
+        for axis in range(2):
+            position += uv[:, axis, None] * self.rotation[plane, :, axis]
+        return position
+
+    def _plane_and_uv(
+        self, pixel: NDArray[np.integer] | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        if pixel is None:
+            pixel, plane = np.arange(self.n_pixels), self.plane_id()
+        else:
+            plane = np.searchsorted(self.offset, pixel, side="right") - 1
+        row_length = self.shape[plane, 1]
+        row, column = np.divmod(pixel - self.offset[plane], row_length)
+        uv = np.stack([row - (self.shape[plane, 0] - 1) / 2, column - (row_length - 1) / 2], axis=1)
+        return plane, uv * self.spacing_mm[plane]
 
     def take(self, index: Selection) -> Planes:
         """The planes at an index array, a mask or a slice."""

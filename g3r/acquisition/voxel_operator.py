@@ -51,11 +51,9 @@ class VoxelOperator:
         psf_points: tuple[int, int, int] = (1, 1, 5),
     ) -> None:
         self.grid = grid
-        plane, uv = planes.plane_id(), planes.pixel_uv_mm()
-        if pixel_index is not None:
-            plane, uv = plane[pixel_index], uv[pixel_index]
-        self.plane = plane
-        self.uv_mm = uv
+        plane = planes.plane_id()
+        self.plane = plane if pixel_index is None else plane[pixel_index]
+        self.uv_mm = planes.pixel_uv_mm(pixel_index)
         axis = [psf_nodes(n) for n in psf_points]
         nodes = np.stack(np.meshgrid(*[a[0] for a in axis], indexing="ij"), -1).reshape(-1, 3)
         self.node_weight = np.einsum("i,j,k->ijk", *[a[1] for a in axis]).ravel()
@@ -129,6 +127,14 @@ def _gather(volume, plane, uv, index_from_plane, index_center, node_index, node_
             if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
                 continue
             fx, fy, fz = x - i, y - j, z - h
+            if 0 <= i < n_i - 1 and 0 <= j < n_j - 1 and 0 <= h < n_k - 1:  # nearly all: no cell cut off
+                v00 = volume[i, j, h] * (1.0 - fz) + volume[i, j, h + 1] * fz
+                v01 = volume[i, j + 1, h] * (1.0 - fz) + volume[i, j + 1, h + 1] * fz
+                v10 = volume[i + 1, j, h] * (1.0 - fz) + volume[i + 1, j, h + 1] * fz
+                v11 = volume[i + 1, j + 1, h] * (1.0 - fz) + volume[i + 1, j + 1, h + 1] * fz
+                v0, v1 = v00 * (1.0 - fy) + v01 * fy, v10 * (1.0 - fy) + v11 * fy
+                total += node_weight[q] * (v0 * (1.0 - fx) + v1 * fx)
+                continue
             for a in range(2):
                 if i + a < 0 or i + a >= n_i:
                     continue
@@ -159,6 +165,18 @@ def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node
                 if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
                     continue
                 fx, fy, fz = x - i, y - j, z - h
+                if 0 <= i < n_i - 1 and 0 <= j < n_j - 1 and 0 <= h < n_k - 1:
+                    w0, w1 = node_weight[q] * value * (1.0 - fx), node_weight[q] * value * fx
+                    w00, w01, w10, w11 = w0 * (1.0 - fy), w0 * fy, w1 * (1.0 - fy), w1 * fy
+                    volume[i, j, h] += w00 * (1.0 - fz)
+                    volume[i, j, h + 1] += w00 * fz
+                    volume[i, j + 1, h] += w01 * (1.0 - fz)
+                    volume[i, j + 1, h + 1] += w01 * fz
+                    volume[i + 1, j, h] += w10 * (1.0 - fz)
+                    volume[i + 1, j, h + 1] += w10 * fz
+                    volume[i + 1, j + 1, h] += w11 * (1.0 - fz)
+                    volume[i + 1, j + 1, h + 1] += w11 * fz
+                    continue
                 for a in range(2):
                     if i + a < 0 or i + a >= n_i:
                         continue
