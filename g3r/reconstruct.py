@@ -37,6 +37,7 @@ from g3r.motion.confidence import (
 from g3r.motion.prior_registration import register_to_prior
 from g3r.motion.template_registration import head_volume_mm3
 from g3r.motion.volume import grid_around
+from g3r.pace import Deadline
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
 from g3r.prior.dgpn import DensityGatedPriorNetwork
@@ -242,12 +243,18 @@ class GaussianReconstructor:
         """
         return self.register(_normalised_slices(stacks)[0])
 
-    def register(self, slices: Slices, settings: ReconstructionSettings | None = None) -> MotionEstimate:
+    def register(
+        self,
+        slices: Slices,
+        settings: ReconstructionSettings | None = None,
+        deadline: Deadline | None = None,
+    ) -> MotionEstimate:
         """Poses of all slices, with this reconstructor's template and pose network.
 
         Args:
             slices: at their header poses, intensities of order one.
             settings: those of the reconstructor when None.
+            deadline: see `estimate_motion`.
         """
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
@@ -257,8 +264,9 @@ class GaussianReconstructor:
             proposals["network"] = pose @ slices.header_pose.inverse()
         template = self.pose_meta.template if self.pose_meta else None
         return estimate_motion(
-            slices, chosen.motion, self._report("motion"), template=template, proposals=proposals
-        )
+            slices, chosen.motion, self._report("motion"), template=template, proposals=proposals,
+            deadline=deadline,
+        )  # fmt: skip
 
     def _start(self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]) -> _Start:
         assert isinstance(self.settings, ReconstructionSettings)

@@ -21,6 +21,7 @@ from g3r.motion.search import search, search_single
 from g3r.motion.settings import MotionSettings
 from g3r.motion.slice_rounds import FittedSlices, SliceRounds, correlation_with_all, refine_slices
 from g3r.motion.template_registration import template_fits
+from g3r.pace import Deadline
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +63,7 @@ def estimate_motion(
     *,
     template: AtlasTemplate | None = None,
     proposals: Mapping[str, RigidPose] | None = None,
+    deadline: Deadline | None = None,
 ) -> MotionEstimate:
     """Poses of all slices, from their header poses.
 
@@ -71,6 +73,7 @@ def estimate_motion(
         progress: called with (rounds done, rounds in all).
         template: mean heads; None leaves that layer out.
         proposals: motions [K] (world from header) by other means, such as the pose network, by name.
+        deadline: registration shortens its search and its rounds to end by then, if it can.
     """
     given = slices
     if settings.flatten:
@@ -82,7 +85,8 @@ def estimate_motion(
     if single:
         found = search_single(slices, parts[0], settings, template)
     else:
-        found = search(slices, parts, settings, template, proposals or {})
+        by_then = deadline.part(SEARCH_SHARE) if deadline else None
+        found = search(slices, parts, settings, template, proposals or {}, by_then)
     motion, placed = found.motion, found.placed
     n_runs, interleave = _runs_of(parts, motion)
     posed = moved(slices, motion)
@@ -90,7 +94,7 @@ def estimate_motion(
         0 if single else settings.n_rounds, settings.steps_per_round, settings.finest_voxel_mm,
         settings.pixels_at_most,
     )  # fmt: skip
-    fitted = refine_slices(posed, rounds, progress)
+    fitted = refine_slices(posed, rounds, progress, deadline.part(ROUNDS_SHARE) if deadline else None)
     held_out = None
     if not single:
         still = [part.stack for part, n in zip(parts, n_runs, strict=True) if n == 1]
@@ -107,6 +111,10 @@ def estimate_motion(
         interleave, n_runs, orientation, fitted.history,
     )  # fmt: skip
 
+
+SEARCH_SHARE, ROUNDS_SHARE = 0.6, 0.7
+"""Of the time that there is, how much the search may take; and of what is left then, how much the rounds may.
+The rest is for the judgement of stacks that lay still and for the orientation."""
 
 LARGEST_LOSS = 0.02
 """A still stack whose held-out correlation falls by more than this as its slices move goes back in line."""

@@ -17,6 +17,7 @@ from g3r.motion.placement import Placement, Prediction, StackPixels, place_again
 from g3r.motion.runs import changes_in_time, price_of_changes, time_orders
 from g3r.motion.stack_registration import refine_stack
 from g3r.motion.whole_sphere import place_around, stack_orientations
+from g3r.pace import Deadline, paced
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ ROUNDS = (
 )  # fmt: skip
 """Random turns (degrees), random shifts (mm) and voxel size (mm) of the rounds of placing runs again."""
 
+
+LEAST_ROUNDS = 2
 
 WIDE_REFINEMENT = ((12.0, 5.0), (8.0, 4.0))
 """Random turns (degrees) and shifts (mm) after a search of the whole sphere."""
@@ -135,6 +138,7 @@ def settle(
     motion: RigidPose,
     others: list[RigidPose],
     rng: np.random.Generator,
+    deadline: Deadline | None = None,
 ) -> tuple[RigidPose, list[Placement]]:
     """Place the runs of every stack again and again in the volume of the other stacks.
 
@@ -144,6 +148,7 @@ def settle(
         motion: [K] world from header, to start from.
         others: rival motions [K] in the same frame, offered in the first round.
         rng: source of randomness.
+        deadline: fewer rounds if they would end after it.
 
     Returns:
         Motions [K], and the last placement of each stack.
@@ -151,7 +156,8 @@ def settle(
     placements: list[Placement] = []
     for part in parts:
         motion = put(motion, part.rows, _searched_widely(slices, part, motion, rng))
-    for number, (turn_deg, shift_mm, voxel_mm) in enumerate(ROUNDS):
+    for number, done in paced(len(ROUNDS), deadline, least=LEAST_ROUNDS):
+        turn_deg, shift_mm, voxel_mm = ROUNDS[int(round(done * len(ROUNDS), 9))]
         placements = []
         for part in parts:
             volume, grid = volume_without(moved(slices, motion), part.stack, voxel_mm)

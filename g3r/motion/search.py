@@ -25,6 +25,7 @@ from g3r.motion.placement import StackPixels
 from g3r.motion.settings import MotionSettings
 from g3r.motion.stack_registration import register_stacks
 from g3r.motion.template_registration import TemplatePlacement, place_in_template
+from g3r.pace import Deadline
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +62,7 @@ def search(
     settings: MotionSettings,
     template: AtlasTemplate | None,
     proposals: Mapping[str, RigidPose],
+    deadline: Deadline | None = None,
 ) -> Searched:
     """Motions of the slices of two or more stacks.
 
@@ -70,6 +72,7 @@ def search(
         settings: which hypotheses, how many attempts.
         template: mean heads; None leaves them out.
         proposals: motions [K] (world from header) by other means, by name.
+        deadline: no attempt begins after it, and the first one ends by it if it can.
     """
     fixed = {"headers": RigidPose.identity(len(slices))}
     if settings.network:
@@ -79,11 +82,11 @@ def search(
     best: tuple[Judgement, Searched] | None = None
     for attempt in range(max(1, settings.attempts)):
         rng = np.random.default_rng([settings.seed, attempt])
-        judgement, found = _attempt(slices, parts, settings, template, fixed, rng)
+        judgement, found = _attempt(slices, parts, settings, template, fixed, rng, deadline)
         if best is None or judgement.cost < best[0].cost:
             best = judgement, found
         least = min(p.correlation for p in best[0].prediction)
-        if least >= SETTLED or not settings.runs:
+        if least >= SETTLED or not settings.runs or (deadline is not None and deadline.remaining_s <= 0):
             break
         logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, least)
     assert best is not None
@@ -97,6 +100,7 @@ def _attempt(
     template: AtlasTemplate | None,
     fixed: Mapping[str, RigidPose],
     rng: np.random.Generator,
+    deadline: Deadline | None,
 ) -> tuple[Judgement, Searched]:
     hypotheses, placed = dict(fixed), None
     if template is not None:
@@ -108,7 +112,7 @@ def _attempt(
     motion, judgement = start, judgements[name]
     if settings.runs:
         rivals = [in_frame_of(slices, start, other) for key, other in hypotheses.items() if key != name]
-        settled, placements = settle(slices, parts, start, rivals, rng)
+        settled, placements = settle(slices, parts, start, rivals, rng, deadline)
         settled, _ = simplify(slices, parts, settled, [one.runs.interleave for one in placements])
         after = judge(slices, parts, settled)
         if after.cost <= judgement.cost - MARGIN:

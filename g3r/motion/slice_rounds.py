@@ -16,6 +16,7 @@ from g3r.geometry import VolumeGrid
 from g3r.motion.normal_equations import SliceModel
 from g3r.motion.slice_registration import register_slices, try_neighbours
 from g3r.motion.volume import grid_around
+from g3r.pace import Deadline, paced
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +38,10 @@ class SliceRounds:
     pixels_at_most: int
 
 
+LEAST_ROUNDS = 3
+"""One round for each voxel size, however little time there is."""
+
+
 @dataclass(frozen=True)
 class FittedSlices:
     """Slices at their last poses with gain, weight and correlation [K], and a line of figures a round."""
@@ -49,7 +54,10 @@ class FittedSlices:
 
 
 def refine_slices(
-    slices: Slices, rounds: SliceRounds, progress: Callable[[int, int], None] = lambda done, total: None
+    slices: Slices,
+    rounds: SliceRounds,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    deadline: Deadline | None = None,
 ) -> FittedSlices:
     """Register every slice to the volume of all, which is made anew in each round.
 
@@ -57,15 +65,17 @@ def refine_slices(
         slices: at poses right to a few millimetres.
         rounds: how long.
         progress: called with (rounds done, rounds in all).
+        deadline: fewer rounds if they would end after it.
     """
     gain = np.ones(len(slices))
     weight = np.ones(len(slices))
     volume: NDArray[np.float32] | None = None
     grid: VolumeGrid | None = None
     history: list[dict[str, float]] = []
-    for number in range(rounds.n_rounds):
+    for number, done in paced(rounds.n_rounds, deadline, least=LEAST_ROUNDS):
         progress(number, rounds.n_rounds)
-        fraction = number / max(1, rounds.n_rounds - 1)
+        # the last round has 1; rounded, so that the steps below do not hang on the last digit
+        fraction = round(min(1.0, done * rounds.n_rounds / max(1, rounds.n_rounds - 1)), 9)
         # coarse to fine: the capture range is about a voxel of the volume's blur
         voxel = rounds.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
         smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
