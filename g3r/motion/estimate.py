@@ -78,7 +78,7 @@ def estimate_motion(
     given = slices
     if settings.flatten:
         slices = flattened(slices)
-    parts = StackPixels.of_all(slices)
+    parts = StackPixels.of_all(slices, settings.n_candidates)
     single = len(parts) == 1
     if template is not None and not (settings.template and template_fits(slices, template)):
         template = None

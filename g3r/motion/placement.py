@@ -21,7 +21,6 @@ CORRELATION_AREA_MM2 = 80.0
 """Area over which residuals at a search's resolution are alike: one independent sample per so much slice."""
 
 N_CANDIDATES = 4000
-"""Random motions tried for one stack in one go."""
 
 PIXELS_OF_A_VOLUME = 100_000
 
@@ -35,22 +34,24 @@ class StackPixels:
         rows: [K] which of all slices these are.
         pixels: at the header poses.
         slice_index: [K].
+        n_candidates: random motions tried for the stack in one go.
     """
 
     stack: int
     rows: NDArray[np.int64]
     pixels: SearchPixels
     slice_index: NDArray[np.int64]
+    n_candidates: int = N_CANDIDATES
 
     @classmethod
-    def of_all(cls, slices: Slices) -> list[StackPixels]:
+    def of_all(cls, slices: Slices, n_candidates: int = N_CANDIDATES) -> list[StackPixels]:
         """An entry for each stack."""
         by_header = slices.with_pose(slices.header_pose)
         parts = []
         for stack in np.unique(slices.stack_id):
             rows = np.flatnonzero(slices.stack_id == stack)
             pixels = SearchPixels.of(by_header.take(rows))
-            parts.append(cls(int(stack), rows, pixels, slices.slice_index[rows]))
+            parts.append(cls(int(stack), rows, pixels, slices.slice_index[rows], n_candidates))
         return parts
 
 
@@ -155,7 +156,7 @@ def place_again(
         )
     else:
         known = present
-    n_each = max(10, N_CANDIDATES // len(known))
+    n_each = max(10, part.n_candidates // len(known))
     candidate = perturbed(known, center, n_each, turn_deg, shift_mm, rng)
     cost = slice_costs(part.pixels, volume, grid, candidate)
     runs = best_runs(cost, candidate, part.slice_index, center, keep=np.arange(len(known)))

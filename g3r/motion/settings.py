@@ -15,6 +15,7 @@ class MotionSettings:
         network: consider the pose network's proposal.
         stacks: consider stacks registered to each other from many starts.
         runs: place runs of slices again in the volume of the other stacks.
+        n_candidates: random motions tried for a stack in one go of the search.
         attempts: searches with other random numbers, at most, where stacks do not predict each other.
         n_rounds: alternations of volume and slices; 0 leaves the slices where the runs are.
         steps_per_round: Gauss-Newton steps of the slices in a round.
@@ -29,6 +30,7 @@ class MotionSettings:
     network: bool = True
     stacks: bool = True
     runs: bool = True
+    n_candidates: int = 4000
     attempts: int = 3
     n_rounds: int = 12
     steps_per_round: int = 5
