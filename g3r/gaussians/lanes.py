@@ -106,7 +106,7 @@ class _Strip:
 
 @intrinsic
 def add_strip(typing_context, image, first, pitch, n_rows, e_0, q_x, q_u, slope, dx_0, u_0, limit, height):
-    """image += height exp(e) on a strip."""
+    """Add height exp(e) to the image on a strip."""
 
     def emit(context, builder, signature, values):
         strip = _Strip(context, builder, values[:-1])
@@ -138,9 +138,7 @@ def strip_sum(typing_context, image, first, pitch, n_rows, e_0, q_x, q_u, slope,
 
 
 @intrinsic
-def strip_moments(
-    typing_context, image, first, pitch, n_rows, e_0, q_x, q_u, slope, dx_0, u_0, limit, dy_0
-):
+def strip_moments(typing_context, image, first, pitch, n_rows, e_0, q_x, q_u, slope, dx_0, u_0, limit, dy_0):
     """Sums of w, w dx, w dy, w dx^2, w dx dy, w dy^2 over a strip, w = image exp(e); lane l has dy_0 + l."""
 
     def emit(context, builder, signature, values):
@@ -156,9 +154,7 @@ def strip_moments(
                     term = strip.mul(term, wide)
                 builder.store(strip.add(builder.load(sums[n]), term), sums[n])
         w, w_x, w_xx = (builder.load(one) for one in sums)
-        dy = strip.add(
-            ir.Constant(_VECTOR, [float(n) for n in range(N_LANES)]), strip.splat(values[-1])
-        )
+        dy = strip.add(ir.Constant(_VECTOR, [float(n) for n in range(N_LANES)]), strip.splat(values[-1]))
         w_y = strip.mul(w, dy)
         vectors = (w, w_x, w_y, w_xx, strip.mul(w_x, dy), strip.mul(w_y, dy))
         return context.make_tuple(builder, signature.return_type, [strip.total(v) for v in vectors])

@@ -37,7 +37,8 @@ def find_pairs(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> Pai
     pairs that no longer touch cost a set-up and no pixels.
     """
     shapes = CloudArrays.of(cloud).shapes
-    return PairFinder(len(cloud)).find(shapes, planes, planes.center_mm - cloud.origin_mm, cutoff_sigma)
+    finder = PairFinder(len(cloud))
+    return finder.find(shapes, planes, planes.rotation, planes.center_mm - cloud.origin_mm, cutoff_sigma)
 
 
 class PairFinder:
@@ -49,15 +50,25 @@ class PairFinder:
         self.order = np.empty(0, np.int32)
 
     def find(
-        self, shapes: NDArray[np.float64], planes: Planes, center_mm: NDArray[np.float64], cutoff_sigma: float
+        self,
+        shapes: NDArray[np.float64],
+        planes: Planes,
+        rotation: NDArray[np.float64],
+        center_mm: NDArray[np.float64],
+        cutoff_sigma: float,
     ) -> PairList:
-        """The pairs of derived shapes [N, 10] with planes around centres [K, 3] (mm from the cloud's origin).
+        """The pairs of derived shapes [N, 10] with planes; the list is valid until the next call.
 
-        The list is valid until the next call.
+        Args:
+            shapes: of the Gaussians.
+            planes: for their sizes and PSFs.
+            rotation: [K, 3, 3] of the planes at present.
+            center_mm: [K, 3] of the planes at present, from the cloud's origin.
+            cutoff_sigma: where a Gaussian ends.
         """
         half = np.zeros((len(planes), 3), np.float32)
         half[:, :2] = (planes.shape - 1) / 2 * planes.spacing_mm
-        single = [array.astype(np.float32) for array in (planes.rotation, center_mm, planes.psf_var_mm2)]
+        single = [array.astype(np.float32) for array in (rotation, center_mm, planes.psf_var_mm2)]
         start = np.zeros(len(planes) + 1, np.int64)
         cut = np.float32(cutoff_sigma**2 * (1 + 1e-5))
         kernels_pairs.columns_of(shapes, self.columns)

@@ -14,7 +14,6 @@ from g3r.gaussians.cloud import GaussianCloud
 from g3r.gaussians.pairs import CloudArrays, PairList, Workspace, find_pairs
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
-
 RECORD_BYTES_AT_MOST = 400_000_000
 """Pairs are set up once and kept for all products if their records take no more than this."""
 
