@@ -21,7 +21,7 @@ from g3r.gaussians.kernels_backward import shape_gradients
 from g3r.gaussians.pairs import PairFinder, PairList, Workspace
 from g3r.gaussians.render import CUTOFF_SIGMA
 
-PAIR_MARGIN_SIGMA = 0.5
+PAIR_MARGIN_SIGMA = 1.0
 """Pair lists are built this much beyond the cut-off, and again before anything has moved by as much."""
 
 N_FIELD_TERMS = 5

@@ -106,6 +106,7 @@ def fit_slices(
         NumericalError: a loss that is not finite.
     """
     trust = weight.astype(np.float32)
+    exact = settings.amplitude == "exact"
     if settings.peak_iterations:
         cloud = solve_peaks(
             cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
@@ -115,9 +116,7 @@ def fit_slices(
     several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
     shading = StackShading(slices) if settings.optimise_shading and several else None
     parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, shading, settings))
-    term = SliceTerm(
-        slices, gain, trust.astype(np.float64), parameters, shading, settings.amplitude == "exact"
-    )
+    term = SliceTerm(slices, gain, trust.astype(np.float64), parameters, shading, exact)
     terms: list[ImageTerm] = [term]
     if prior is not None:
         distilled = ImageTerm(prior.planes, prior.value, prior.weight, cloud.origin_mm)
