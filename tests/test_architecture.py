@@ -18,6 +18,7 @@ BELOW_FITTING = {"geometry", "acquisition", "gaussians", "motion", "prior"}
 ALLOWED = {
     "errors": set(),
     "_version": set(),
+    "_kernel_cache": set(),
     "geometry": set(),
     "acquisition": {"geometry"},
     "gaussians": {"geometry", "acquisition"},

@@ -73,7 +73,7 @@ class PeakSystem:
         out = np.empty(self.n_pixels, np.float32)
         single = peak.astype(np.float32)
         for first, last in self._set_up_parts():
-            kernels_peaks.apply(  # type: ignore[call-arg]
+            kernels_peaks.apply(
                 first, last, single, *self.layout, self.cut, self.records, self.count, self.images, out
             )
         return out
@@ -83,7 +83,7 @@ class PeakSystem:
         buffers = np.zeros((len(self.images), self.n_gaussians))
         weight = np.ascontiguousarray(pixels, dtype=np.float32)
         for first, last in self._set_up_parts():
-            kernels_peaks.apply_adjoint(  # type: ignore[call-arg]
+            kernels_peaks.apply_adjoint(
                 first, last, weight, *self.layout, self.cut, self.records, self.count, self.images, buffers
             )
         return buffers.sum(0)
