@@ -10,6 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from g3r._kernel_cache import ensure_kernel_cache
 from g3r._version import __version__
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from g3r.reconstruct import GaussianReconstructor
 
 __all__ = ["GaussianReconstructor", "__version__", "load_stack"]
+
+ensure_kernel_cache()  # before any kernel is declared
 
 # Resolved on first use (PEP 562), so that `import g3r` stays quick and pulls no torch.
 _HOME = {"GaussianReconstructor": "g3r.reconstruct", "load_stack": "g3r.acquisition.stacks"}

@@ -19,6 +19,7 @@ ALLOWED = {
     "errors": set(),
     "_version": set(),
     "pace": set(),
+    "_kernel_cache": set(),
     "geometry": set(),
     "acquisition": {"geometry"},
     "gaussians": {"geometry", "acquisition"},

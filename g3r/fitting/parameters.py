@@ -1,15 +1,23 @@
-"""What the optimiser moves: the cloud's tensors, poses and gains, each with a step size of its own."""
+"""What the optimiser moves: the cloud's arrays, poses and gains in one buffer, each with a step size."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from g3r.errors import NumericalError
+from g3r.fitting import kernels
 from g3r.gaussians import GaussianCloud
+
+BETA_1, BETA_2 = 0.9, 0.99
+"""Decay of Adam's means of gradients and of their squares."""
+
+NOT_FINITE = "the loss of the fit is not finite; lower the step sizes or check the intensities"
 
 
 @dataclass(frozen=True)
@@ -30,42 +38,75 @@ class LearningRates:
     shift_mm: float = 0.03
 
 
-class CloudParameters:
-    """A cloud under optimisation by Adam, with optional further parameter groups."""
+class FitParameters:
+    """A cloud under optimisation by Adam, with further blocks of parameters where they are given.
+
+    Values, gradients and Adam's two means are flat float32 buffers, taken once; `value` and `gradient` are
+    views of them by name: mean_mm [N, 3], log_scale [N, 3], quaternion_wxyz [N, 4], peak [N], and the rest
+    as given.
+
+    Args:
+        cloud: where the fit starts.
+        rates: step sizes of the cloud.
+        further: start values and step size of other blocks, by name.
+    """
 
     def __init__(
-        self, cloud: GaussianCloud, rates: LearningRates, extra: list[tuple[Tensor, float]] | None = None
+        self,
+        cloud: GaussianCloud,
+        rates: LearningRates,
+        further: Mapping[str, tuple[NDArray[np.floating], float]] | None = None,
     ) -> None:
         self.origin_mm = cloud.origin_mm
-        self.tensors = [p.detach().clone().float().requires_grad_() for p in cloud.parameters]
         sigma = float(cloud.log_scale.mean().exp()) if len(cloud) else 1.0
         height = float(cloud.peak.abs().mean()) if len(cloud) else 1.0
-        steps = [rates.mean_share * sigma, rates.log_scale, rates.quaternion, rates.peak_share * height]
-        groups = [*zip(self.tensors, steps, strict=True), *(extra or [])]
-        self.base = [step for _, step in groups]
-        self.optimiser = torch.optim.Adam(
-            [{"params": [tensor], "lr": step} for tensor, step in groups], betas=(0.9, 0.99), fused=True
-        )
+        names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+        steps = (rates.mean_share * sigma, rates.log_scale, rates.quaternion, rates.peak_share * height)
+        start = {
+            name: (tensor.detach().numpy(), step)
+            for name, tensor, step in zip(names, cloud.parameters, steps, strict=True)
+        } | dict(further or {})
+        n = sum(array.size for array, _ in start.values())
+        self._buffers = np.zeros((4, n), np.float32)  # values, gradients, Adam's means
+        self.value: dict[str, NDArray[np.float32]] = {}
+        self.gradient: dict[str, NDArray[np.float32]] = {}
+        self._blocks: list[tuple[slice, float]] = []
+        end = 0
+        for name, (array, step) in start.items():
+            block = slice(end, end + array.size)
+            end = block.stop
+            self.value[name] = self._buffers[0, block].reshape(array.shape)
+            self.gradient[name] = self._buffers[1, block].reshape(array.shape)
+            self.value[name][...] = array
+            self._blocks.append((block, step))
+        self.n_steps = 0
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.value["peak"])
 
     def cloud(self) -> GaussianCloud:
-        """The present cloud, differentiable."""
-        return GaussianCloud.of(self.tensors, self.origin_mm)
+        """A copy of the present cloud."""
+        names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+        return GaussianCloud.of([torch.from_numpy(self.value[name].copy()) for name in names], self.origin_mm)
 
-    def set_factor(self, factor: float) -> None:
-        """Scale every step size."""
-        for group, base in zip(self.optimiser.param_groups, self.base, strict=True):
-            group["lr"] = base * factor
+    def step(self, loss: float, factor: float) -> None:
+        """One step of Adam down the gradient, with all step sizes scaled by a factor.
 
-    def step(self, loss: Tensor) -> None:
-        """One step down a loss.
+        Args:
+            loss: whose gradient it is.
+            factor: of the step sizes.
 
         Raises:
-            NumericalError: the loss is not finite.
+            NumericalError: the loss is not finite (nothing is changed then), or a gradient is not.
         """
-        if not math.isfinite(loss.item()):
-            raise NumericalError(
-                "the loss of the fit is not finite; lower the step sizes or check the intensities"
-            )
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimiser.step()
+        if not math.isfinite(loss):
+            raise NumericalError(NOT_FINITE)
+        self.n_steps += 1
+        correction, root = 1 - BETA_1**self.n_steps, math.sqrt(1 - BETA_2**self.n_steps)
+        n_bad = 0
+        for block, step in self._blocks:
+            arrays = [buffer[block] for buffer in self._buffers]
+            n_bad += kernels.adam(*arrays, step * factor, BETA_1, BETA_2, correction, root)  # type: ignore[call-arg]
+        if n_bad:
+            raise NumericalError(NOT_FINITE)

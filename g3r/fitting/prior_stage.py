@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
-from g3r.fitting.losses import scale_regulariser, weighted_l1
-from g3r.fitting.parameters import CloudParameters, LearningRates
+from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
-from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
+from g3r.gaussians import GaussianCloud, solve_peaks
 from g3r.geometry import VolumeGrid
-
-PAIR_MARGIN_SIGMA = 0.5
-"""Pair lists are built this much beyond the cut-off and stay in use for several steps."""
 
 NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
@@ -31,14 +27,14 @@ class PriorStageSettings:
         peak_iterations: conjugate-gradient steps for the peaks.
         plane_share: share of the volume's planes in a step.
         scale_weight: weight of the scale regulariser.
-        steps_per_pair_list: steps between two searches for pairs.
+        steps_per_draw: steps between two draws of the planes.
     """
 
     n_steps: int = 30
     peak_iterations: int = 12
     plane_share: float = 0.34
     scale_weight: float = 0.01
-    steps_per_pair_list: int = 10
+    steps_per_draw: int = 10
 
 
 @dataclass(frozen=True)
@@ -96,25 +92,22 @@ def fit_prior(
         The fitted cloud, and the image loss of each step.
     """
     cloud = solve_peaks_on(cloud, target.take(np.arange(0, len(target.planes), 2)), settings.peak_iterations)
-    parameters = CloudParameters(cloud, LearningRates())
-    seed_log_scale = cloud.log_scale.clone()
+    parameters = FitParameters(cloud, LearningRates())
+    term = ImageTerm(target.planes, target.value, target.weight, cloud.origin_mm)
+    objective = CloudObjective(parameters, [term], settings.scale_weight)
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
     for step in range(settings.n_steps):
+        fraction = step / settings.n_steps
         progress(step, settings.n_steps)
-        if step % settings.steps_per_pair_list == 0:
-            chosen = np.sort(rng.choice(len(target.planes), n_planes, replace=False))
-            part = target.take(chosen)
-            value, weight = torch.from_numpy(part.value), torch.from_numpy(part.weight)
-            pairs = find_pairs(parameters.cloud().detach(), part.planes, 3.2 + PAIR_MARGIN_SIGMA)
-        parameters.set_factor(cosine_decay(step / settings.n_steps))
-        current = parameters.cloud()
-        image = weighted_l1(render(current, part.planes, pairs=pairs), value, weight)
-        loss = image + settings.scale_weight * scale_regulariser(current.log_scale, seed_log_scale)
-        parameters.step(loss)
-        history.append(image.item())
+        if step % settings.steps_per_draw == 0:
+            term.choose(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
+        objective.begin()
+        image = objective.add(term, 1.0)
+        parameters.step(image + objective.finish(), cosine_decay(fraction))
+        history.append(image)
     progress(settings.n_steps, settings.n_steps)
-    return parameters.cloud().detach(), history
+    return parameters.cloud(), history
 
 
 def solve_peaks_on(cloud: GaussianCloud, target: VolumeTarget, n_iterations: int) -> GaussianCloud:

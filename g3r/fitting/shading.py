@@ -9,8 +9,7 @@ determines the fields up to what they share; a small ridge keeps that part at ze
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 
@@ -23,7 +22,7 @@ N_TERMS = 5
 class StackShading:
     """Log-fields of all stacks, linear in coefficients [n_stacks, 5].
 
-    The terms are x, y, x^2, xy, y^2, each with zero mean over a stack's masked pixels.
+    The terms, `basis` [5, P], are x, y, x^2, xy, y^2, each with zero mean over a stack's masked pixels.
 
     Args:
         slices: pixels and header poses.
@@ -47,9 +46,9 @@ class StackShading:
             terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
             basis[start:end] = terms - terms[inside].mean(0)
             self.ranges.append((start, end))
-        self.basis = torch.from_numpy(basis)
+        self.basis = np.ascontiguousarray(basis.T)
 
-    def log_field(self, coefficients: Tensor) -> Tensor:
+    def log_field(self, coefficients: NDArray[np.floating]) -> NDArray[np.float32]:
         """Log-intensity of the field at every pixel [P]."""
-        parts = [self.basis[a:b] @ coefficients[n] for n, (a, b) in enumerate(self.ranges)]
-        return torch.cat(parts)
+        single = np.asarray(coefficients, dtype=np.float32)
+        return np.concatenate([single[n] @ self.basis[:, a:b] for n, (a, b) in enumerate(self.ranges)])

@@ -6,18 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.losses import scale_regulariser, weighted_l1
-from g3r.fitting.parameters import CloudParameters, LearningRates
-from g3r.fitting.prior_stage import NO_PROGRESS, PAIR_MARGIN_SIGMA, VolumeTarget
+from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
-from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
-from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes
-from g3r.motion.slice_rounds import slice_weights
+from g3r.fitting.slice_term import SliceTerm
+from g3r.gaussians import GaussianCloud, solve_peaks
 
 MOST_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""
@@ -41,7 +39,7 @@ class SliceStageSettings:
         pose_prior_mm: a slice that moves this far from where registration left it pays as much as a change of
             the mean residual by its own size would; keeps slices put that the data say nothing about.
         reweight_every: steps between two estimates of the trust in slices.
-        steps_per_pair_list: steps between two searches for pairs.
+        steps_per_draw: steps between two draws of the prior's planes.
         optimise_shading: whether stacks have a smooth intensity field each (two stacks or more).
         shading_ridge: weight of the mean squared coefficient of the fields.
         amplitude: "exact", or "printed" for comparison.
@@ -58,7 +56,7 @@ class SliceStageSettings:
     optimise_poses: bool = True
     pose_prior_mm: float = 10.0
     reweight_every: int = 20
-    steps_per_pair_list: int = 10
+    steps_per_draw: int = 10
     optimise_shading: bool = True
     shading_ridge: float = 0.005
     amplitude: str = "exact"
@@ -107,96 +105,72 @@ def fit_slices(
     Raises:
         NumericalError: a loss that is not finite.
     """
-    planes = slices.planes
-    target = torch.from_numpy(slices.value)
-    inside = torch.from_numpy(slices.mask.astype(np.float32))
-    plane_of_pixel = torch.from_numpy(planes.plane_id())
-    trust = torch.from_numpy(weight.astype(np.float32))
-    pixel_weight = inside * trust[plane_of_pixel]
-    n_slices = len(slices)
+    trust = weight.astype(np.float32)
+    exact = settings.amplitude == "exact"
     if settings.peak_iterations:
         cloud = solve_peaks(
-            cloud, planes, slices.value, pixel_weight.numpy(), gain=gain,
+            cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
             n_iterations=settings.peak_iterations, damping=settings.peak_damping,
             amplitude=settings.amplitude,
         )  # fmt: skip
-    turn, shift = torch.zeros(n_slices, 3), torch.zeros(n_slices, 3)
-    log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
-    free_gain = n_slices > 1  # the gain of a single slice cannot be told from the peaks
-    extra = []
-    if settings.optimise_poses:
-        extra += [
-            (turn.requires_grad_(), settings.rates.turn_rad),
-            (shift.requires_grad_(), settings.rates.shift_mm),
-        ]
-    if free_gain:
-        extra += [(log_gain.requires_grad_(), settings.rates.log_gain)]
-    # one stack cannot tell its shading from anatomy
-    shading = (
-        StackShading(slices) if settings.optimise_shading and len(np.unique(slices.stack_id)) > 1 else None
-    )
-    coefficients = torch.zeros(len(np.unique(slices.stack_id)), N_TERMS)
-    if shading:
-        extra.append((coefficients.requires_grad_(), settings.rates.shading))
-    parameters = CloudParameters(cloud, settings.rates, extra)
-    seed_log_scale = cloud.log_scale.detach().clone()
-    radius_mm = float(np.sqrt(((planes.shape * planes.spacing_mm / 2) ** 2).sum(1)).mean()) / 2
-    # with the distance being a mean over the prior's trust, this makes the term the mean over the head of
-    # trust times difference: well-measured heads feel little of it, sparsely measured ones much
-    prior_share = float(prior.weight[prior.weight > 0].mean()) if prior is not None else 0.0
+    several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
+    shading = StackShading(slices) if settings.optimise_shading and several else None
+    parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, shading, settings))
+    term = SliceTerm(slices, gain, trust.astype(np.float64), parameters, shading, exact)
+    terms: list[ImageTerm] = [term]
+    if prior is not None:
+        distilled = ImageTerm(prior.planes, prior.value, prior.weight, cloud.origin_mm)
+        n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
+        # with the distance being a mean over the prior's trust, this makes the term the mean over the head of
+        # trust times difference: well-measured heads feel little of it, sparsely measured ones much
+        prior_share = float(prior.weight[prior.weight > 0].mean())
+        terms.append(distilled)
+    objective = CloudObjective(parameters, terms, settings.scale_weight)
     history: list[dict[str, float]] = []
     for step in range(settings.n_steps):
         fraction = step / settings.n_steps
         progress(step, settings.n_steps)
-        twist = torch.cat([turn, shift], 1) if settings.optimise_poses else None
-        current = parameters.cloud()
-        if step % settings.steps_per_pair_list == 0:
-            pairs = find_pairs(
-                current.detach(), moved_planes(planes, twist), CUTOFF_SIGMA + PAIR_MARGIN_SIGMA
-            )
-            if prior is not None:
-                n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
-                part = prior.take(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
-                part_pairs = find_pairs(current.detach(), part.planes, CUTOFF_SIGMA + PAIR_MARGIN_SIGMA)
-                part_value, part_weight = torch.from_numpy(part.value), torch.from_numpy(part.weight)
-        parameters.set_factor(cosine_decay(fraction))
-        centred = log_gain - log_gain.mean() if free_gain else log_gain
-        pixels = render(
-            current, planes, twist=twist, log_gain=centred, pairs=pairs, amplitude=settings.amplitude
-        )
-        if shading:
-            pixels = pixels * shading.log_field(coefficients).exp()
-        image = weighted_l1(pixels, target, pixel_weight)
-        loss = image + settings.scale_weight * scale_regulariser(current.log_scale, seed_log_scale)
-        entry = {"image": image.item()}
-        if shading:
-            loss = loss + settings.shading_ridge * coefficients.square().mean()
-        strength = prior_strength(settings, fraction, entry["image"])
+        if prior is not None and step % settings.steps_per_draw == 0:
+            distilled.choose(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
+        term.update()
+        objective.begin()
+        image = objective.add(term, 1.0)
+        loss, entry = image, {"image": image}
+        strength = prior_strength(settings, fraction, image)
         if prior is not None and strength > 0:
-            distance = weighted_l1(render(current, part.planes, pairs=part_pairs), part_value, part_weight)
-            loss = loss + strength * prior_share * distance
-            entry |= {"distillation": distance.item(), "distillation_weight": strength}
-        if settings.optimise_poses:
-            moved_mm2 = (shift.square().sum(1) + (radius_mm * turn).square().sum(1)).mean()
-            loss = loss + image.item() * moved_mm2 / settings.pose_prior_mm**2
-        parameters.step(loss)
+            distance = objective.add(distilled, strength * prior_share)
+            loss += strength * prior_share * distance
+            entry |= {"distillation": distance, "distillation_weight": strength}
+        loss += objective.finish() + term.finish(image, settings.pose_prior_mm, settings.shading_ridge)
+        parameters.step(loss, cosine_decay(fraction))
         history.append(entry)
         if step and step % settings.reweight_every == 0:
-            trust = torch.from_numpy(_trust(pixels.detach(), target, inside, plane_of_pixel, n_slices))
-            pixel_weight = inside * trust[plane_of_pixel]
+            term.reweight()
     progress(settings.n_steps, settings.n_steps)
-    final_gain = torch.exp(log_gain - log_gain.mean() if free_gain else log_gain).detach().double().numpy()
-    moved = planes
-    if settings.optimise_poses:
-        moved = moved_planes(planes, torch.cat([turn, shift], 1))
+    term.update()
     return SliceFit(
-        parameters.cloud().detach(),
-        slices.with_pose(moved.pose),
-        final_gain,
-        trust.double().numpy(),
+        parameters.cloud(),
+        slices.with_pose(term.moved_planes().pose),
+        term.gain,
+        term.trust,
         history,
-        coefficients.detach().double().tolist() if shading else [],
+        parameters.value["shading"].astype(float).tolist() if shading else [],
     )
+
+
+def _blocks(
+    slices: Slices, gain: NDArray[np.float64], shading: StackShading | None, settings: SliceStageSettings
+) -> dict[str, tuple[NDArray[np.floating], float]]:
+    """What is fitted along with the cloud: start values and step sizes."""
+    n, rates = len(slices), settings.rates
+    blocks: dict[str, tuple[NDArray[np.floating], float]] = {}
+    if settings.optimise_poses:
+        blocks |= {"turn": (np.zeros((n, 3)), rates.turn_rad), "shift": (np.zeros((n, 3)), rates.shift_mm)}
+    if n > 1:  # the gain of a single slice cannot be told from the peaks
+        blocks["log_gain"] = (np.log(gain), rates.log_gain)
+    if shading:
+        blocks["shading"] = (np.zeros((len(shading.stacks), N_TERMS)), rates.shading)
+    return blocks
 
 
 def prior_strength(settings: SliceStageSettings, fraction: float, residual: float) -> float:
@@ -216,12 +190,3 @@ def prior_strength(settings: SliceStageSettings, fraction: float, residual: floa
     if settings.prior_error <= 0 or not settings.distillation.start > 0:
         return annealed
     return max(annealed, min(residual / settings.prior_error, MOST_PRIOR_STRENGTH))
-
-
-def _trust(
-    pixels: torch.Tensor, target: torch.Tensor, inside: torch.Tensor, plane: torch.Tensor, n_slices: int
-) -> NDArray[np.float32]:
-    """Trust in each slice [K] from its mean absolute residual."""
-    total = torch.zeros(n_slices).index_add_(0, plane, inside * (pixels - target).abs())
-    count = torch.zeros(n_slices).index_add_(0, plane, inside)
-    return slice_weights((total / count.clamp_min(1)).double().numpy()).astype(np.float32)

@@ -1,9 +1,9 @@
-"""Numba kernels of the renderer: pair lists, forward, and backward by moments.
+"""Numba kernels of the renderer: shapes, set-up of (Gaussian, plane) pairs, forward.
 
-Mathematics and names as in docs/method.md, "The renderer". Set-up of a (Gaussian, plane) pair is float64 (a
-nearly flat Gaussian has a condition number of 1e6, beyond float32); the sweep over its pixels is float32.
-Each worker takes every n-th plane, so that the split of work, and with it the order of the sums, depends on
-the number of workers alone.
+Mathematics and names as in docs/method.md, "The renderer". The set-up of a pair is float64 (a nearly flat
+Gaussian has a condition number of 1e6, beyond float32); the sweep over its pixels is float32 (`lanes`).
+A plane is swept in a worker's own small image whose rows are padded, so that sixteen pixels at a time may
+run over the end of a row. Each worker takes every n-th plane; the sums of a pixel do not depend on it.
 """
 
 from __future__ import annotations
@@ -13,33 +13,43 @@ import math
 import numba
 import numpy as np
 
+from g3r.gaussians.lanes import N_LANES, add_strip
+
 f32 = np.float32
+
+LOOSE = {"contract", "arcp", "nsz"}
+"""What the compiler may do to sums here; NaN keeps its meaning, because comparisons guard against it."""
+
+SHAPE_COLUMNS = 10
+"""Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
 
 # Gradient columns of a Gaussian in the buffers: peak, mean (3), covariance xx xy xz yy yz zz, log-volume.
 N_GRADIENTS = 11
 # Gradient columns of a plane: body-frame rotation (3), world translation (3), log-gain.
 N_PLANE_GRADIENTS = 7
 
+PAIR = np.dtype(
+    [
+        ("unit", np.float32), ("e_0", np.float32), ("q_x", np.float32), ("q_u", np.float32),
+        ("slope", np.float32), ("x", np.float32), ("y", np.float32), ("half_x", np.float32),
+        ("half_y", np.float32), ("row", np.int32), ("column", np.int32), ("gaussian", np.int32),
+    ]
+)  # fmt: skip
+"""The 2D Gaussian that a pair leaves on its plane, in pixels.
 
-@numba.njit(inline="always", fastmath=True)
-def fast_exp(e):
-    """exp(e) for e in [-18, 0] within 2e-7 absolutely: a polynomial of e/16, squared four times."""
-    t = e * f32(0.0625)
-    p = f32(1.0) + t * (f32(1.0) + t * (f32(0.5) + t * (f32(1 / 6) + t * (f32(1 / 24) + t * f32(1 / 120)))))
-    p = p * p
-    p = p * p
-    p = p * p
-    return p * p
+Height over the peak (with gain); exponent as in `lanes`; centre at (row + x, column + y); half the sides of
+the box around the ellipse at the cut-off; number of the Gaussian.
+"""
 
 
-@numba.njit(inline="always")
-def observe(mean, cov, j, r, t, psf):
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def observe(shapes, j, r, t, psf):
     """Mean m and covariance S = R^T Sigma R + D of Gaussian j in the frame of a plane (r, t, psf)."""
-    dx, dy, dz = mean[j, 0] - t[0], mean[j, 1] - t[1], mean[j, 2] - t[2]
+    dx, dy, dz = shapes[j, 0] - t[0], shapes[j, 1] - t[1], shapes[j, 2] - t[2]
     mx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
     my = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
     mz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
-    a, b, c, d, e, f = cov[j, 0], cov[j, 1], cov[j, 2], cov[j, 3], cov[j, 4], cov[j, 5]
+    a, b, c, d, e, f = shapes[j, 3], shapes[j, 4], shapes[j, 5], shapes[j, 6], shapes[j, 7], shapes[j, 8]
     u0 = a * r[0, 0] + b * r[1, 0] + c * r[2, 0]
     u1 = b * r[0, 0] + d * r[1, 0] + e * r[2, 0]
     u2 = c * r[0, 0] + e * r[1, 0] + f * r[2, 0]
@@ -58,63 +68,158 @@ def observe(mean, cov, j, r, t, psf):
     return mx, my, mz, sxx, sxy, sxz, syy, syz, szz
 
 
-@numba.njit(inline="always")
-def conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz):
-    """The 2D Gaussian that a 3D one leaves on its plane: exponent at its centre, centre, covariance, det."""
-    iz = 1.0 / szz
-    cx, cy = mx - sxz * iz * mz, my - syz * iz * mz
-    cxx, cxy, cyy = sxx - sxz * sxz * iz, sxy - sxz * syz * iz, syy - syz * syz * iz
-    return -0.5 * mz * mz * iz, cx, cy, cxx, cxy, cyy, cxx * cyy - cxy * cxy
-
-
-@numba.njit(inline="always")
-def sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx):
-    """Index of the centre and the range of x rows that the ellipse touches."""
-    px, py = cx / sx + 0.5 * (n_x - 1), cy / sy + 0.5 * (n_y - 1)
-    half = math.sqrt(c2 * cxx) / sx
-    return px, py, max(0, math.ceil(px - half)), min(n_x - 1, math.floor(px + half))
-
-
-@numba.njit(cache=True)
-def pair_mask(mean, cov, r, t, psf, half_x, half_y, cut, chosen):
-    """Number of Gaussians whose ellipsoid at the cut-off may touch a plane; their numbers into `chosen`."""
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut, exact, records):
+    """Describe the pairs of a plane that touch it, one after the other in `records`; returns their number."""
+    n_x, n_y = size[0], size[1]
+    over_x, over_y = 1.0 / spacing[0], 1.0 / spacing[1]
+    sx, sy = spacing[0], spacing[1]
+    middle_x, middle_y = 0.5 * (n_x - 1), 0.5 * (n_y - 1)
     n = 0
-    for j in range(len(mean)):
-        dx, dy, dz = mean[j, 0] - t[0], mean[j, 1] - t[1], mean[j, 2] - t[2]
-        touches = True
-        for axis in (2, 0, 1):
-            x, y, z = r[0, axis], r[1, axis], r[2, axis]
-            m = dx * x + dy * y + dz * z
-            s = (
-                cov[j, 0] * x * x + cov[j, 3] * y * y + cov[j, 5] * z * z
-                + 2.0 * (cov[j, 1] * x * y + cov[j, 2] * x * z + cov[j, 4] * y * z) + psf[axis]
-            )  # fmt: skip
-            reach = abs(m) - (half_x if axis == 0 else half_y if axis == 1 else 0.0)
-            if reach > 0.0 and reach * reach > cut * s:
-                touches = False
-                break
-        if touches:
-            chosen[n] = j
-            n += 1
+    for pair in range(begin, end):
+        j = order[pair]
+        mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(shapes, j, r, t, psf)
+        # given u_z = 0 the other two are a 2D Gaussian: exponent at its centre, centre, covariance
+        iz = 1.0 / szz
+        kx, ky = sxz * iz, syz * iz
+        e_0 = -0.5 * mz * mz * iz
+        c2 = cut + 2.0 * e_0
+        cxx, cxy, cyy = sxx - kx * sxz, sxy - kx * syz, syy - ky * syz
+        det = cxx * cyy - cxy * cxy
+        if not (c2 > 0.0 and det > 0.0):
+            continue
+        px, py = (mx - kx * mz) * over_x + middle_x, (my - ky * mz) * over_y + middle_y
+        half_x, half_y = math.sqrt(c2 * cxx) * over_x, math.sqrt(c2 * cyy) * over_y
+        if not (px + half_x >= 0.0 and py + half_y >= 0.0 and px - half_x < n_x and py - half_y < n_y):
+            continue
+        unit = gain
+        if exact:
+            unit *= shapes[j, 9] * math.sqrt(iz / det)
+        over_cxx = 1.0 / cxx
+        row, column = math.floor(px), math.floor(py)
+        record = records[n]
+        record.unit = f32(unit)
+        record.e_0 = f32(e_0)
+        record.q_x = f32(-0.5 * sx * sx * over_cxx)
+        record.q_u = f32(-0.5 * sy * sy * cxx / det)
+        record.slope = f32(cxy * over_cxx * sx * over_y)
+        record.x, record.y = f32(px - row), f32(py - column)
+        record.half_x, record.half_y = f32(half_x), f32(half_y)
+        record.row, record.column, record.gaussian = row, column, j
+        n += 1
     return n
 
 
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def strip_rows(record, cut, first, last, n_x):
+    """First row and number of rows of the ellipse between two columns (given from its centre).
+
+    The row furthest out is the ellipse's own if its column is in the strip, else where a border cuts it.
+    """
+    hx, hy, slope = record.half_x, record.half_y, record.slope
+    up, down = slope * hx, -slope * hx
+    top, bottom = hx, -hx
+    if not (first <= min(up, down) and max(up, down) <= last):
+        c2 = f32(cut) + f32(2.0) * record.e_0
+        over = f32(1.0) / (hy * hy)
+        lean = slope * hx * hx * over
+        narrow = hx * math.sqrt(f32(-0.5) * c2 / record.q_u) * over
+        up, down = min(max(up, first), last), min(max(down, first), last)
+        top = lean * up + narrow * math.sqrt(max(hy * hy - up * up, f32(0.0)))
+        bottom = lean * down - narrow * math.sqrt(max(hy * hy - down * down, f32(0.0)))
+    start = max(-record.row, math.ceil(record.x + bottom))
+    stop = min(n_x - 1 - record.row, math.floor(record.x + top))
+    return start, stop - start + 1
+
+
+@numba.njit(forceinline=True)
+def strip_columns(record, n_y):
+    """First and last column of the ellipse on the plane, relative to the record's."""
+    start = max(-record.column, math.ceil(record.y - record.half_y))
+    stop = min(n_y - 1 - record.column, math.floor(record.y + record.half_y))
+    return start, stop
+
+
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def sweep_plane(records, n, peak, cut, n_x, n_y, image):
+    """Add the Gaussians of `n` records to the padded image of their plane."""
+    pitch = n_y + N_LANES
+    limit = f32(-0.5 * cut)
+    for i in range(n):
+        record = records[i]
+        height = record.unit * f32(peak[record.gaussian])
+        start, stop = strip_columns(record, n_y)
+        for column in range(start, stop + 1, N_LANES):
+            dy = f32(column) - record.y
+            last = f32(min(column + N_LANES - 1, stop)) - record.y
+            row, n_rows = strip_rows(record, cut, dy, last, n_x)
+            dx = f32(row) - record.x
+            first = (record.row + row) * pitch + record.column + column
+            add_strip(
+                image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy,
+                limit, height,
+            )  # fmt: skip
+
+
+@numba.njit(forceinline=True)
+def clear(image, n_x, n_y):
+    """Zero the padded image of a plane."""
+    image[: n_x * (n_y + N_LANES) + N_LANES] = f32(0.0)
+
+
+@numba.njit(forceinline=True)
+def load(image, pixels, offset, n_x, n_y):
+    """Copy the pixels of a plane into padded rows, zero in the padding."""
+    pitch = n_y + N_LANES
+    for x in range(n_x):
+        begin, row = offset + x * n_y, x * pitch
+        image[row : row + n_y] = pixels[begin : begin + n_y]
+        image[row + n_y : row + pitch] = f32(0.0)
+    image[n_x * pitch : n_x * pitch + N_LANES] = f32(0.0)
+
+
 @numba.njit(parallel=True, cache=True)
-def covariances(log_scale, quaternion, cov, log_volume):
-    """Sigma (xx xy xz yy yz zz) and ln(s1 s2 s3) of every Gaussian, float64."""
+def forward(
+    shapes, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact, images,
+    records, out,
+):  # fmt: skip
+    """Every pair's Gaussian, gain included, on the flat pixels `out`.
+
+    images and records are scratch space, one row for each worker (`Workspace`).
+    """
+    n_workers = len(images)
+    for worker in numba.prange(n_workers):
+        image, mine = images[worker], records[worker]
+        for k in range(worker, len(rotation), n_workers):
+            n_x, n_y = shape[k, 0], shape[k, 1]
+            clear(image, n_x, n_y)
+            n = set_up_plane(
+                shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
+                gain[k], cut, exact, mine,
+            )  # fmt: skip
+            sweep_plane(mine, n, peak, cut, n_x, n_y, image)
+            for x in range(n_x):
+                begin, row = offset[k] + x * n_y, x * (n_y + N_LANES)
+                out[begin : begin + n_y] = image[row : row + n_y]
+
+
+@numba.njit(parallel=True, cache=True)
+def derive_shapes(mean, log_scale, quaternion, shapes):
+    """Centre, Sigma and s1 s2 s3 of every Gaussian, float64 (columns as `SHAPE_COLUMNS` says)."""
     for j in numba.prange(len(log_scale)):
         r = quaternion_matrix(quaternion, j)
         s0, s1, s2 = math.exp(log_scale[j, 0]), math.exp(log_scale[j, 1]), math.exp(log_scale[j, 2])
         v0, v1, v2 = s0 * s0, s1 * s1, s2 * s2
-        n = 0
+        n = 3
         for a in range(3):
+            shapes[j, a] = mean[j, a]
             for b in range(a, 3):
-                cov[j, n] = r[a][0] * r[b][0] * v0 + r[a][1] * r[b][1] * v1 + r[a][2] * r[b][2] * v2
+                shapes[j, n] = r[a][0] * r[b][0] * v0 + r[a][1] * r[b][1] * v1 + r[a][2] * r[b][2] * v2
                 n += 1
-        log_volume[j] = log_scale[j, 0] + log_scale[j, 1] + log_scale[j, 2]
+        shapes[j, 9] = s0 * s1 * s2
 
 
-@numba.njit(inline="always")
+@numba.njit(forceinline=True)
 def quaternion_matrix(quaternion, j):
     """Rotation (tuple of rows) of quaternion j, which is normalised first."""
     w, x, y, z = (
@@ -127,107 +232,3 @@ def quaternion_matrix(quaternion, j):
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-
-
-@numba.njit(parallel=True, cache=True, fastmath=True)
-def forward(
-    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut,
-    exact, n_workers, out,
-):  # fmt: skip
-    """Add every pair's Gaussian, gain included, onto the flat pixels `out`."""
-    n_planes = len(rotation)
-    for worker in numba.prange(n_workers):
-        for k in range(worker, n_planes, n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
-            sx, sy = spacing[k, 0], spacing[k, 1]
-            for pair in range(start[k], start[k + 1]):
-                j = order[pair]
-                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(
-                    mean, cov, j, rotation[k], center[k], psf[k]
-                )
-                ez, cx, cy, cxx, cxy, cyy, det = conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz)
-                c2 = cut + 2.0 * ez
-                if c2 <= 0.0 or not det > 0.0:
-                    continue
-                height = gain[k] * peak[j] * math.exp(ez)
-                if exact:
-                    height *= math.exp(log_volume[j]) / math.sqrt(det * szz)
-                px, py, x0, x1 = sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx)
-                amplitude = f32(height)
-                qx, qxy, qy = (
-                    f32(-0.5 * cyy / det * sx * sx),
-                    cxy / det * sx * sy,
-                    f32(-0.5 * cxx / det * sy * sy),
-                )
-                slope, width = cxy / cxx * sx / sy, math.sqrt(det / cxx) / sy
-                for x in range(x0, x1 + 1):
-                    ddx = x - px
-                    half = width * math.sqrt(max(c2 - ddx * ddx * sx * sx / cxx, 0.0))
-                    middle = py + slope * ddx
-                    y0, y1 = max(0, math.ceil(middle - half)), min(n_y - 1, math.floor(middle + half))
-                    base, linear = qx * f32(ddx) * f32(ddx), f32(qxy * ddx)
-                    row = offset[k] + x * n_y
-                    first = f32(y0 - py)
-                    for n in range(y1 - y0 + 1):
-                        ddy = first + f32(n)
-                        out[row + y0 + n] += amplitude * fast_exp(base + ddy * (linear + qy * ddy))
-
-
-@numba.njit(inline="always")
-def sweep_moments(weight, row0, n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx, sy):
-    """Six moments (mm) of weight times the 2D Gaussian about the Gaussian's centre on the plane."""
-    qx, qxy, qy = f32(-0.5 * cyy / det * sx * sx), cxy / det * sx * sy, f32(-0.5 * cxx / det * sy * sy)
-    slope, width = cxy / cxx * sx / sy, math.sqrt(det / cxx) / sy
-    m0 = m1 = m2 = m3 = m4 = m5 = 0.0
-    for x in range(x0, x1 + 1):
-        ddx = x - px
-        half = width * math.sqrt(max(c2 - ddx * ddx * sx * sx / cxx, 0.0))
-        middle = py + slope * ddx
-        y0, y1 = max(0, math.ceil(middle - half)), min(n_y - 1, math.floor(middle + half))
-        base, linear = qx * f32(ddx) * f32(ddx), f32(qxy * ddx)
-        row = row0 + x * n_y
-        first = f32(y0 - py)
-        s0, s1, s2 = f32(0.0), f32(0.0), f32(0.0)
-        for n in range(y1 - y0 + 1):
-            ddy = first + f32(n)
-            g = weight[row + y0 + n] * fast_exp(base + ddy * (linear + qy * ddy))
-            s0 += g
-            s1 += g * ddy
-            s2 += g * ddy * ddy
-        m0 += float(s0)
-        m1 += ddx * s0
-        m2 += float(s1)
-        m3 += ddx * ddx * s0
-        m4 += ddx * s1
-        m5 += float(s2)
-    return m0, m1 * sx, m2 * sy, m3 * sx * sx, m4 * sx * sy, m5 * sy * sy
-
-
-@numba.njit(parallel=True, cache=True, fastmath=True)
-def adjoint_peak(
-    mean, cov, log_volume, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact,
-    n_workers, weight, buffers,
-):  # fmt: skip
-    """A^T w for y = A c: gradient of sum(w y) in the peaks alone, into buffers [n_workers, N]."""
-    n_planes = len(rotation)
-    for worker in numba.prange(n_workers):
-        for k in range(worker, n_planes, n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
-            sx, sy = spacing[k, 0], spacing[k, 1]
-            for pair in range(start[k], start[k + 1]):
-                j = order[pair]
-                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(
-                    mean, cov, j, rotation[k], center[k], psf[k]
-                )
-                ez, cx, cy, cxx, cxy, cyy, det = conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz)
-                c2 = cut + 2.0 * ez
-                if c2 <= 0.0 or not det > 0.0:
-                    continue
-                height = gain[k] * math.exp(ez)
-                if exact:
-                    height *= math.exp(log_volume[j]) / math.sqrt(det * szz)
-                px, py, x0, x1 = sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx)
-                moments = sweep_moments(
-                    weight, offset[k], n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx, sy
-                )
-                buffers[worker, j] += height * moments[0]

@@ -7,154 +7,211 @@ import math
 import numba
 import numpy as np
 
-from g3r.gaussians.kernels import conditional, observe, quaternion_matrix, sweep_bounds, sweep_moments
+from g3r.gaussians.kernels import (
+    LOOSE,
+    load,
+    observe,
+    quaternion_matrix,
+    set_up_plane,
+    strip_columns,
+    strip_rows,
+)
+from g3r.gaussians.lanes import N_LANES, strip_moments
+
+f32 = np.float32
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def pair_moments(record, cut, n_x, n_y, image):
+    """Moments (in pixels) of image times exp(e) about the Gaussian's centre on the plane."""
+    pitch = n_y + N_LANES
+    limit = f32(-0.5 * cut)
+    m0 = m1 = m2 = m3 = m4 = m5 = f32(0.0)
+    start, stop = strip_columns(record, n_y)
+    for column in range(start, stop + 1, N_LANES):
+        dy = f32(column) - record.y
+        last = f32(min(column + N_LANES - 1, stop)) - record.y
+        row, n_rows = strip_rows(record, cut, dy, last, n_x)
+        dx = f32(row) - record.x
+        first = (record.row + row) * pitch + record.column + column
+        a0, a1, a2, a3, a4, a5 = strip_moments(
+            image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy, limit, dy
+        )
+        m0, m1, m2, m3, m4, m5 = m0 + a0, m1 + a1, m2 + a2, m3 + a3, m4 + a4, m5 + a5
+    return m0, m1, m2, m3, m4, m5
+
+
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def gather_plane(
+    records, n, shapes, peak, r, t, psf, size, spacing, cut, exact, image, buffer, plane, with_pose
+):
+    """Gradients of sum(image * pixels of the plane), added to those of its Gaussians and of the plane.
+
+    image holds dL/dy in padded rows, buffer [N, 11] and plane [7] the gradients (columns as in `kernels`).
+    The chain goes through the 2D Gaussian of centre m_xy - k m_z and covariance C = S_xy - k k^T S_zz with
+    k = S_xy,z / S_zz; for the exact amplitude ln B has -ln|S| / 2 = -(ln|C| + ln S_zz) / 2.
+    """
+    n_x, n_y = size[0], size[1]
+    sx, sy = spacing[0], spacing[1]
+    p0 = p1 = p2 = p3 = p4 = p5 = p6 = 0.0
+    for i in range(n):
+        record = records[i]
+        m0, m1, m2, m3, m4, m5 = pair_moments(record, cut, n_x, n_y, image)
+        j = record.gaussian
+        mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(shapes, j, r, t, psf)
+        iz = 1.0 / szz
+        kx, ky = sxz * iz, syz * iz
+        cxx, cxy, cyy = sxx - kx * sxz, sxy - kx * syz, syy - ky * syz
+        over_det = 1.0 / (cxx * cyy - cxy * cxy)
+        ixx, ixy, iyy = cyy * over_det, -cxy * over_det, cxx * over_det
+        g0 = float(record.unit) * m0
+        height = float(record.unit) * peak[j]
+        whole = height * m0
+        amplitude = whole if exact else 0.0
+        # dL/dcentre = C^-1 M1, dL/dC = (C^-1 M2 C^-1 - M0 C^-1) / 2
+        hx, hy = height * sx, height * sy
+        gx, gy = hx * m1, hy * m2
+        gxx, gxy, gyy = hx * sx * m3, hx * sy * m4, hy * sy * m5
+        dx, dy = ixx * gx + ixy * gy, ixy * gx + iyy * gy
+        axx, axy = ixx * gxx + ixy * gxy, ixx * gxy + ixy * gyy
+        ayx, ayy = ixy * gxx + iyy * gxy, ixy * gxy + iyy * gyy
+        txx = 0.5 * (axx * ixx + axy * ixy - amplitude * ixx)
+        txy = 0.5 * (axx * ixy + axy * iyy - amplitude * ixy)
+        tyy = 0.5 * (ayx * ixy + ayy * iyy - amplitude * iyy)
+        # back through k, to S and m
+        wx, wy = txx * kx + txy * ky, txy * kx + tyy * ky
+        dkx, dky = -mz * dx - 2.0 * szz * wx, -mz * dy - 2.0 * szz * wy
+        dz = -(kx * dx + ky * dy) - whole * mz * iz
+        txz, tyz = 0.5 * dkx * iz, 0.5 * dky * iz
+        tzz = 0.5 * iz * (whole * mz * mz * iz - amplitude) - (wx * kx + wy * ky) - (dkx * kx + dky * ky) * iz
+        world_x = r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz
+        world_y = r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz
+        world_z = r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz
+        out = buffer[j]
+        out[0] += g0
+        out[1] += world_x
+        out[2] += world_y
+        out[3] += world_z
+        # dL/dSigma = R T R^T
+        q0 = r[0, 0] * txx + r[0, 1] * txy + r[0, 2] * txz
+        q1 = r[0, 0] * txy + r[0, 1] * tyy + r[0, 2] * tyz
+        q2 = r[0, 0] * txz + r[0, 1] * tyz + r[0, 2] * tzz
+        out[4] += q0 * r[0, 0] + q1 * r[0, 1] + q2 * r[0, 2]
+        out[5] += q0 * r[1, 0] + q1 * r[1, 1] + q2 * r[1, 2]
+        out[6] += q0 * r[2, 0] + q1 * r[2, 1] + q2 * r[2, 2]
+        q0 = r[1, 0] * txx + r[1, 1] * txy + r[1, 2] * txz
+        q1 = r[1, 0] * txy + r[1, 1] * tyy + r[1, 2] * tyz
+        q2 = r[1, 0] * txz + r[1, 1] * tyz + r[1, 2] * tzz
+        out[7] += q0 * r[1, 0] + q1 * r[1, 1] + q2 * r[1, 2]
+        out[8] += q0 * r[2, 0] + q1 * r[2, 1] + q2 * r[2, 2]
+        q0 = r[2, 0] * txx + r[2, 1] * txy + r[2, 2] * txz
+        q1 = r[2, 0] * txy + r[2, 1] * tyy + r[2, 2] * tyz
+        q2 = r[2, 0] * txz + r[2, 1] * tyz + r[2, 2] * tzz
+        out[9] += q0 * r[2, 0] + q1 * r[2, 1] + q2 * r[2, 2]
+        out[10] += amplitude
+        if with_pose:
+            # body-frame turn dL/dw = dL/dm x m + 2 (A_23, A_31, A_12), A = T S' - S' T, S' = S - D
+            ux, uy, uz = sxx - psf[0], syy - psf[1], szz - psf[2]
+            a12 = txx * sxy + txy * uy + txz * syz - (ux * txy + sxy * tyy + sxz * tyz)
+            a13 = txx * sxz + txy * syz + txz * uz - (ux * txz + sxy * tyz + sxz * tzz)
+            a23 = txy * sxz + tyy * syz + tyz * uz - (sxy * txz + uy * tyz + syz * tzz)
+            p0 += dy * mz - dz * my + 2.0 * a23
+            p1 += dz * mx - dx * mz - 2.0 * a13
+            p2 += dx * my - dy * mx + 2.0 * a12
+            p3 -= world_x
+            p4 -= world_y
+            p5 -= world_z
+        p6 += whole
+    plane[0] += p0
+    plane[1] += p1
+    plane[2] += p2
+    plane[3] += p3
+    plane[4] += p4
+    plane[5] += p5
+    plane[6] += p6
+
+
+@numba.njit(parallel=True, cache=True)
 def backward(
-    mean, cov, log_volume, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut,
-    exact, n_workers, weight, buffers, plane_gradient,
+    shapes, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact, images,
+    records, weight, buffers, plane_gradient,
 ):  # fmt: skip
-    """Gradients of sum(weight * pixels) by the moments G0, G1, G2 of each pair.
+    """Gradients of sum(weight * pixels) by the moments of each pair.
 
     buffers [n_workers, N, 11] and plane_gradient [K, 7] are added to; columns as in `kernels`.
     """
-    n_planes = len(rotation)
+    n_workers = len(images)
     for worker in numba.prange(n_workers):
-        for k in range(worker, n_planes, n_workers):
+        image, mine = images[worker], records[worker]
+        for k in range(worker, len(rotation), n_workers):
             n_x, n_y = shape[k, 0], shape[k, 1]
-            sx, sy = spacing[k, 0], spacing[k, 1]
-            r = rotation[k]
-            for pair in range(start[k], start[k + 1]):
-                j = order[pair]
-                mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(mean, cov, j, r, center[k], psf[k])
-                ez, cx, cy, cxx, cxy, cyy, det = conditional(mx, my, mz, sxx, sxy, sxz, syy, syz, szz)
-                c2 = cut + 2.0 * ez
-                if c2 <= 0.0 or not det > 0.0:
-                    continue
-                # with the gain in the weight, gradients below are those of the gained image
-                unit = gain[k] * math.exp(ez)
-                if exact:
-                    unit *= math.exp(log_volume[j]) / math.sqrt(det * szz)
-                px, py, x0, x1 = sweep_bounds(c2, cx, cy, cyy, n_x, n_y, sx, sy, cxx)
-                m0, m1, m2, m3, m4, m5 = sweep_moments(
-                    weight, offset[k], n_y, x0, x1, px, py, c2, cxx, cxy, cyy, det, sx, sy
-                )
-                # from moments about the centre on the plane to those of d = u - m, times B and the gain
-                ax, ay, dz = cx - mx, cy - my, -mz
-                g0 = unit * m0
-                g1x, g1y, g1z = unit * (m1 + m0 * ax), unit * (m2 + m0 * ay), g0 * dz
-                gxx = unit * (m3 + 2.0 * m1 * ax + m0 * ax * ax)
-                gxy = unit * (m4 + m1 * ay + m2 * ax + m0 * ax * ay)
-                gyy = unit * (m5 + 2.0 * m2 * ay + m0 * ay * ay)
-                gxz, gyz, gzz = g1x * dz, g1y * dz, g0 * dz * dz
-                i_det = 1.0 / (det * szz)
-                pxx, pxy = (syy * szz - syz * syz) * i_det, (sxz * syz - sxy * szz) * i_det
-                pxz, pyy = (sxy * syz - sxz * syy) * i_det, (sxx * szz - sxz * sxz) * i_det
-                pyz, pzz = (sxy * sxz - sxx * syz) * i_det, (sxx * syy - sxy * sxy) * i_det
-                c = peak[j]
-                # dL/dm = c B P G1
-                dmx = c * (pxx * g1x + pxy * g1y + pxz * g1z)
-                dmy = c * (pxy * g1x + pyy * g1y + pyz * g1z)
-                dmz = c * (pxz * g1x + pyz * g1y + pzz * g1z)
-                # dL/dS = c B (P G2 P - G0 P) / 2; the second term comes from the amplitude factor alone
-                a0, a1 = pxx * gxx + pxy * gxy + pxz * gxz, pxx * gxy + pxy * gyy + pxz * gyz
-                a2 = pxx * gxz + pxy * gyz + pxz * gzz
-                b0, b1 = pxy * gxx + pyy * gxy + pyz * gxz, pxy * gxy + pyy * gyy + pyz * gyz
-                b2 = pxy * gxz + pyy * gyz + pyz * gzz
-                e0, e1 = pxz * gxx + pyz * gxy + pzz * gxz, pxz * gxy + pyz * gyy + pzz * gyz
-                e2 = pxz * gxz + pyz * gyz + pzz * gzz
-                n0 = g0 if exact else 0.0
-                h = 0.5 * c
-                txx = h * (a0 * pxx + a1 * pxy + a2 * pxz - n0 * pxx)
-                txy = h * (a0 * pxy + a1 * pyy + a2 * pyz - n0 * pxy)
-                txz = h * (a0 * pxz + a1 * pyz + a2 * pzz - n0 * pxz)
-                tyy = h * (b0 * pxy + b1 * pyy + b2 * pyz - n0 * pyy)
-                tyz = h * (b0 * pxz + b1 * pyz + b2 * pzz - n0 * pyz)
-                tzz = h * (e0 * pxz + e1 * pyz + e2 * pzz - n0 * pzz)
-                wx = r[0, 0] * dmx + r[0, 1] * dmy + r[0, 2] * dmz
-                wy = r[1, 0] * dmx + r[1, 1] * dmy + r[1, 2] * dmz
-                wz = r[2, 0] * dmx + r[2, 1] * dmy + r[2, 2] * dmz
-                out = buffers[worker, j]
-                out[0] += g0
-                out[1] += wx
-                out[2] += wy
-                out[3] += wz
-                # R T R^T
-                n = 4
-                for a in range(3):
-                    q0 = r[a, 0] * txx + r[a, 1] * txy + r[a, 2] * txz
-                    q1 = r[a, 0] * txy + r[a, 1] * tyy + r[a, 2] * tyz
-                    q2 = r[a, 0] * txz + r[a, 1] * tyz + r[a, 2] * tzz
-                    for b in range(a, 3):
-                        out[n] += q0 * r[b, 0] + q1 * r[b, 1] + q2 * r[b, 2]
-                        n += 1
-                out[10] += c * n0
-                # planes: body-frame turn dL/dw = dL/dm x m + 2 (A_23, A_31, A_12), A = T S' - S' T
-                ux, uy, uz = sxx - psf[k, 0], syy - psf[k, 1], szz - psf[k, 2]
-                a12 = txx * sxy + txy * uy + txz * syz - (ux * txy + sxy * tyy + sxz * tyz)
-                a13 = txx * sxz + txy * syz + txz * uz - (ux * txz + sxy * tyz + sxz * tzz)
-                a23 = txy * sxz + tyy * syz + tyz * uz - (sxy * txz + uy * tyz + syz * tzz)
-                plane = plane_gradient[k]
-                plane[0] += dmy * mz - dmz * my + 2.0 * a23
-                plane[1] += dmz * mx - dmx * mz - 2.0 * a13
-                plane[2] += dmx * my - dmy * mx + 2.0 * a12
-                plane[3] -= wx
-                plane[4] -= wy
-                plane[5] -= wz
-                plane[6] += c * g0
+            load(image, weight, offset[k], n_x, n_y)
+            n = set_up_plane(
+                shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
+                gain[k], cut, exact, mine,
+            )  # fmt: skip
+            gather_plane(
+                mine, n, shapes, peak, rotation[k], center[k], psf[k], shape[k], spacing[k], cut, exact,
+                image, buffers[worker], plane_gradient[k], True,
+            )  # fmt: skip
 
 
-@numba.njit(cache=True)
-def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
-    n_workers = len(buffers)
-    g = buffers[0, j].copy()
-    for worker in range(1, n_workers):
-        g += buffers[worker, j]
-    peak_grad[j] = g[0]
-    mean_grad[j, 0], mean_grad[j, 1], mean_grad[j, 2] = g[1], g[2], g[3]
-    t = ((g[4], g[5], g[6]), (g[5], g[7], g[8]), (g[6], g[8], g[9]))
-    r = quaternion_matrix(quaternion, j)
-    rows = np.zeros((3, 3))
-    for a in range(3):
-        s = math.exp(log_scale[j, a])
-        total = 0.0
-        for i in range(3):
-            dm = 2.0 * (t[i][0] * r[0][a] + t[i][1] * r[1][a] + t[i][2] * r[2][a]) * s
-            total += dm * r[i][a] * s
-            rows[i, a] = dm * s
-        scale_grad[j, a] = total + g[10]
+@numba.njit(forceinline=True)
+def _quaternion_gradient(quaternion, j, rows, out):
+    """Gradient in quaternion j of sum(rows * R), which the normalisation keeps at right angles to it."""
     w, x, y, z = (
         float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]),
     )  # fmt: skip
     length = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
-    dw = 2 * (z * (rows[1, 0] - rows[0, 1]) + y * (rows[0, 2] - rows[2, 0]) + x * (rows[2, 1] - rows[1, 2]))
-    dx = 2 * (
-        y * (rows[0, 1] + rows[1, 0]) + z * (rows[0, 2] + rows[2, 0]) + w * (rows[2, 1] - rows[1, 2])
-        - 2 * x * (rows[1, 1] + rows[2, 2])
-    )  # fmt: skip
-    dy = 2 * (
-        x * (rows[0, 1] + rows[1, 0]) + z * (rows[1, 2] + rows[2, 1]) + w * (rows[0, 2] - rows[2, 0])
-        - 2 * y * (rows[0, 0] + rows[2, 2])
-    )  # fmt: skip
-    dz = 2 * (
-        x * (rows[0, 2] + rows[2, 0]) + y * (rows[1, 2] + rows[2, 1]) + w * (rows[1, 0] - rows[0, 1])
-        - 2 * z * (rows[0, 0] + rows[1, 1])
-    )  # fmt: skip
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
+    dw = 2 * (z * (r10 - r01) + y * (r02 - r20) + x * (r21 - r12))
+    dx = 2 * (y * (r01 + r10) + z * (r02 + r20) + w * (r21 - r12) - 2 * x * (r11 + r22))
+    dy = 2 * (x * (r01 + r10) + z * (r12 + r21) + w * (r02 - r20) - 2 * y * (r00 + r22))
+    dz = 2 * (x * (r02 + r20) + y * (r12 + r21) + w * (r10 - r01) - 2 * z * (r00 + r11))
     along = w * dw + x * dx + y * dy + z * dz
-    quaternion_grad[j, 0] = (dw - along * w) / length
-    quaternion_grad[j, 1] = (dx - along * x) / length
-    quaternion_grad[j, 2] = (dy - along * y) / length
-    quaternion_grad[j, 3] = (dz - along * z) / length
+    out[j, 0] = (dw - along * w) / length
+    out[j, 1] = (dx - along * x) / length
+    out[j, 2] = (dy - along * y) / length
+    out[j, 3] = (dz - along * z) / length
+
+
+@numba.njit
+def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
+    for worker in range(1, len(buffers)):
+        for column in range(buffers.shape[2]):
+            buffers[0, j, column] += buffers[worker, j, column]
+    g = buffers[0, j]
+    peak_grad[j] = g[0]
+    mean_grad[j, 0], mean_grad[j, 1], mean_grad[j, 2] = g[1], g[2], g[3]
+    r = quaternion_matrix(quaternion, j)
+    v0 = 2 * math.exp(2 * float(log_scale[j, 0]))
+    v1 = 2 * math.exp(2 * float(log_scale[j, 1]))
+    v2 = 2 * math.exp(2 * float(log_scale[j, 2]))
+    # rows = 2 T R diag(s^2)
+    t0, t1, t2 = (g[4], g[5], g[6]), (g[5], g[7], g[8]), (g[6], g[8], g[9])
+    rows = (
+        (_along(t0, r, 0) * v0, _along(t0, r, 1) * v1, _along(t0, r, 2) * v2),
+        (_along(t1, r, 0) * v0, _along(t1, r, 1) * v1, _along(t1, r, 2) * v2),
+        (_along(t2, r, 0) * v0, _along(t2, r, 1) * v1, _along(t2, r, 2) * v2),
+    )
+    for a in range(3):
+        scale_grad[j, a] = rows[0][a] * r[0][a] + rows[1][a] * r[1][a] + rows[2][a] * r[2][a] + g[10]
+    _quaternion_gradient(quaternion, j, rows, quaternion_grad)
+
+
+@numba.njit(forceinline=True)
+def _along(t, r, a):
+    """Product of a row with column a of a rotation."""
+    return t[0] * r[0][a] + t[1] * r[1][a] + t[2] * r[2][a]
 
 
 @numba.njit(parallel=True, cache=True)
 def shape_gradients(log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
-    """Sum the workers' buffers and turn dL/dSigma into gradients of log-scales and quaternions.
+    """Sum the workers' buffers (into the first) and turn dL/dSigma into gradients of log-scales and turns.
 
     Sigma = M M^T with M = R diag(s): dL/dM = 2 T M, dL/dln s_a = sum_i dM_ia M_ia (+ the log-volume's),
-    dL/dR = dM diag(s); the quaternion's gradient is projected off its own direction by the normalisation.
+    dL/dR = dM diag(s).
     """
     for j in numba.prange(len(log_scale)):
         _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad)

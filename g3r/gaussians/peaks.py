@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes
-from g3r.gaussians import kernels
+from g3r.gaussians import kernels, kernels_peaks
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.pairs import CloudArrays, PairList, find_pairs
+from g3r.gaussians.pairs import CloudArrays, PairList, Workspace, find_pairs
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
+RECORD_BYTES_AT_MOST = 400_000_000
+"""Pairs are set up once and kept for all products if their records take no more than this."""
 
-@dataclass(frozen=True)
+
 class PeakSystem:
     """The linear map from peaks [N] to pixels [P] and its exact adjoint (CPU)."""
 
-    before: tuple
-    after: tuple
-    n_gaussians: int
-    n_pixels: int
-    cut: float
-    exact: bool
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        planes: Planes,
+        gain: NDArray[np.floating] | None,
+        pairs: PairList,
+        cutoff_sigma: float,
+        exact: bool,
+    ) -> None:
+        self.n_gaussians, self.n_pixels = len(cloud), planes.n_pixels
+        self.cut, self.exact = cutoff_sigma**2, exact
+        factor = np.asarray(np.ones(len(planes)) if gain is None else gain, dtype=np.float64)
+        self.shapes = CloudArrays.of(cloud).shapes
+        self.described = plane_arguments(planes, planes.center_mm - cloud.origin_mm, factor, pairs)
+        self.layout = (planes.shape, planes.offset, pairs.start)
+        self.parts = _parts(pairs.start, RECORD_BYTES_AT_MOST // kernels.PAIR.itemsize)
+        longest = max((int(pairs.start[b] - pairs.start[a]) for a, b in self.parts), default=0)
+        self.records = np.zeros(longest, kernels.PAIR)
+        self.count = np.zeros(len(planes), np.int64)
+        self.images = Workspace.of(planes, 0).images
+        self.is_set_up = False
 
     @classmethod
     def of(
@@ -40,32 +56,48 @@ class PeakSystem:
         """The system for the shapes of a cloud (its peaks are not read)."""
         if pairs is None:
             pairs = find_pairs(cloud, planes, cutoff_sigma)
-        factor = np.asarray(np.ones(len(planes)) if gain is None else gain, dtype=np.float64)
-        arrays = CloudArrays.of(cloud)
-        before, after = plane_arguments(arrays, planes, planes.center_mm - cloud.origin_mm, factor, pairs)
-        return cls(before, after, len(cloud), planes.n_pixels, cutoff_sigma**2, amplitude == "exact")
+        return cls(cloud, planes, gain, pairs, cutoff_sigma, amplitude == "exact")
+
+    def _set_up_parts(self) -> Iterator[tuple[int, int]]:
+        """Ranges of planes, each with its records in place; one range of all where they can be kept."""
+        for first, last in self.parts:
+            if not self.is_set_up:
+                kernels_peaks.set_up(  # type: ignore[call-arg]
+                    first, last, self.shapes, *self.described, self.cut, self.exact, self.records, self.count
+                )
+            yield first, last
+        self.is_set_up = len(self.parts) == 1
 
     def forward(self, peak: NDArray[np.floating]) -> NDArray[np.float32]:
         """Pixels [P] of peaks [N]."""
-        out = np.zeros(self.n_pixels, np.float32)
-        kernels.forward(  # type: ignore[call-arg]
-            *self.before,
-            peak.astype(np.float32),
-            *self.after,
-            self.cut,
-            self.exact,
-            numba.get_num_threads(),
-            out,
-        )
+        out = np.empty(self.n_pixels, np.float32)
+        single = peak.astype(np.float32)
+        for first, last in self._set_up_parts():
+            kernels_peaks.apply(
+                first, last, single, *self.layout, self.cut, self.records, self.count, self.images, out
+            )
         return out
 
     def adjoint(self, pixels: NDArray[np.float32]) -> NDArray[np.float64]:
         """A^T of pixels [P], as [N] float64."""
-        n_workers = numba.get_num_threads()
-        buffers = np.zeros((n_workers, self.n_gaussians))
+        buffers = np.zeros((len(self.images), self.n_gaussians))
         weight = np.ascontiguousarray(pixels, dtype=np.float32)
-        kernels.adjoint_peak(*self.before, *self.after, self.cut, self.exact, n_workers, weight, buffers)  # type: ignore[call-arg]
+        for first, last in self._set_up_parts():
+            kernels_peaks.apply_adjoint(
+                first, last, weight, *self.layout, self.cut, self.records, self.count, self.images, buffers
+            )
         return buffers.sum(0)
+
+
+def _parts(start: NDArray[np.int64], most_pairs: int) -> list[tuple[int, int]]:
+    """Ranges of planes with at most so many pairs each (or one plane)."""
+    parts, first = [], 0
+    while first < len(start) - 1:
+        last = int(np.searchsorted(start, start[first] + most_pairs, side="right")) - 1
+        last = min(max(last, first + 1), len(start) - 1)
+        parts.append((first, last))
+        first = last
+    return parts
 
 
 def solve_peaks(

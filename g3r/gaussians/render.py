@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from torch import Tensor
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import kernels, kernels_backward
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.pairs import CloudArrays, PairList, find_pairs
+from g3r.gaussians.pairs import CloudArrays, PairList, Workspace, find_pairs
 from g3r.gaussians.reference import render_reference
 from g3r.geometry import RigidPose
 
@@ -88,19 +87,13 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
 
 
 def plane_arguments(
-    arrays: CloudArrays,
-    planes: Planes,
-    center: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    pairs: PairList,
-) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Arguments of the kernels in front of and behind the cloud's peaks."""
-    before = (arrays.mean, arrays.covariance, arrays.log_volume)
-    after = (
+    planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: PairList
+) -> tuple[Any, ...]:
+    """Arguments of the kernels that describe planes and pairs."""
+    return (
         planes.rotation, center, gain, planes.psf_var_mm2, planes.shape, planes.spacing_mm, planes.offset,
         pairs.start, pairs.gaussian,
     )  # fmt: skip
-    return before, after
 
 
 class _Render(torch.autograd.Function):
@@ -122,11 +115,13 @@ class _Render(torch.autograd.Function):
         moved = moved_planes(planes, twist)
         gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
         arrays = CloudArrays.of(GaussianCloud(mean, log_scale, quaternion, peak, origin_mm))
-        before, after = plane_arguments(arrays, moved, moved.center_mm - origin_mm, gain, pairs)
+        described = plane_arguments(moved, moved.center_mm - origin_mm, gain, pairs)
+        work = Workspace.of(planes, pairs.most)
         out = np.zeros(planes.n_pixels, np.float32)
-        n_workers = numba.get_num_threads()
-        kernels.forward(*before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, out)  # type: ignore[call-arg]
-        ctx.saved = (arrays, before, after, cutoff_sigma, exact, n_workers, twist)
+        kernels.forward(  # type: ignore[call-arg]
+            arrays.shapes, arrays.peak, *described, cutoff_sigma**2, exact, work.images, work.records, out
+        )
+        ctx.saved = (arrays, described, work, cutoff_sigma, exact, twist)
         ctx.like = [
             None if p is None else p.dtype for p in (mean, log_scale, quaternion, peak, twist, log_gain)
         ]
@@ -134,14 +129,15 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        arrays, before, after, cutoff_sigma, exact, n_workers, twist = ctx.saved
-        n, n_planes = len(arrays.mean), len(after[0])
-        buffers = np.zeros((n_workers, n, kernels.N_GRADIENTS))
+        arrays, described, work, cutoff_sigma, exact, twist = ctx.saved
+        n, n_planes = len(arrays.peak), len(described[0])
+        buffers = np.zeros((len(work.images), n, kernels.N_GRADIENTS))
         plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
         weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
         kernels_backward.backward(  # type: ignore[call-arg]
-            *before, arrays.peak, *after, cutoff_sigma**2, exact, n_workers, weight, buffers, plane_gradient
-        )
+            arrays.shapes, arrays.peak, *described, cutoff_sigma**2, exact, work.images, work.records, weight,
+            buffers, plane_gradient,
+        )  # fmt: skip
         peak, mean = np.empty(n), np.empty((n, 3))
         scale, quaternion = np.empty((n, 3)), np.empty((n, 4))
         kernels_backward.shape_gradients(

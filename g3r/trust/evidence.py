@@ -57,10 +57,10 @@ def mean_residual(
         grid: of the result.
     """
     log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
-    rendered = render(cloud, slices.planes, log_gain=log_gain)
+    rendered = render(cloud, slices.planes, log_gain=log_gain).numpy()
     if shading:
-        rendered = rendered * StackShading(slices).log_field(torch.tensor(shading)).exp()
-    size = np.abs(slices.value - rendered.numpy())[slices.pixel_index] / gain[slices.pixel_plane]
+        rendered = rendered * np.exp(StackShading(slices).log_field(np.array(shading)))
+    size = np.abs(slices.value - rendered)[slices.pixel_index] / gain[slices.pixel_plane]
     low, high = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
     coarse = VolumeGrid.isotropic(np.minimum(low, high), np.maximum(low, high), RESIDUAL_VOXEL_MM)
     operator = VoxelOperator(slices.planes, coarse, slices.pixel_index)

@@ -1,0 +1,72 @@
+"""Numba kernels that find which Gaussians may touch which planes."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from g3r.gaussians.kernels import LOOSE
+
+f32 = np.float32
+
+SLACK_MM = 1e-4
+"""What float32 may be wrong by in the distance of a Gaussian from a plane of the same scene."""
+
+
+@numba.njit(parallel=True, cache=True)
+def columns_of(shapes, columns):
+    """Mean and covariance [9, N] in float32, each a row of its own, so that the search runs in vectors."""
+    for j in numba.prange(len(shapes)):
+        for n in range(9):
+            columns[n, j] = shapes[j, n]
+
+
+@numba.njit(fastmath=LOOSE, error_model="numpy")
+def _mark(x, y, z, xx, xy, xz, yy, yz, zz, r, t, psf, half, cut, marks):
+    """1 for each Gaussian whose ellipsoid at the cut-off may touch a plane's rectangle, else 0."""
+    for j in range(len(x)):
+        dx, dy, dz = x[j] - t[0], y[j] - t[1], z[j] - t[2]
+        slack = f32(SLACK_MM) + f32(1e-6) * (abs(dx) + abs(dy) + abs(dz))
+        touches = True
+        for axis in range(3):
+            a, b, c = r[0, axis], r[1, axis], r[2, axis]
+            m = dx * a + dy * b + dz * c
+            s = (
+                xx[j] * a * a + yy[j] * b * b + zz[j] * c * c
+                + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c) + psf[axis]
+            )  # fmt: skip
+            reach = max(abs(m) - slack - half[axis], f32(0.0))
+            touches &= reach * reach <= cut * s
+        marks[j] = touches
+
+
+@numba.njit(parallel=True, cache=True)
+def find(columns, rotation, center, psf, half, cut, marks, start, order):
+    """Numbers of the Gaussians of each plane, ascending, into `order`; of none into an empty `order`.
+
+    Called twice: first start [K + 1] is made, then order [start[K]] is filled.
+    marks [n_workers, N] is scratch space. All but start and order are float32.
+    """
+    n_workers, n_planes = len(marks), len(rotation)
+    counting = len(order) == 0
+    for worker in numba.prange(n_workers):
+        mark = marks[worker]
+        for k in range(worker, n_planes, n_workers):
+            _mark(
+                columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[6],
+                columns[7], columns[8], rotation[k], center[k], psf[k], half[k], cut, mark,
+            )  # fmt: skip
+            if counting:
+                n = 0
+                for j in range(len(mark)):
+                    n += mark[j]
+                start[k + 1] = n
+            else:
+                n = start[k]
+                for j in range(len(mark)):
+                    if mark[j]:
+                        order[n] = j
+                        n += 1
+    if counting:
+        for k in range(n_planes):
+            start[k + 1] += start[k]

@@ -1,0 +1,293 @@
+"""The explicit objective against autograd of the same loss through render(), and finite differences."""
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+import torch
+from test_stages import BALL, GRID, make_slices, seeded, true_cloud
+
+from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.errors import NumericalError
+from g3r.fitting import objective as objective_module
+from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.prior_stage import VolumeTarget
+from g3r.fitting.shading import StackShading
+from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
+from g3r.fitting.slice_term import SliceTerm
+from g3r.gaussians import GaussianCloud, render
+
+SETTINGS = SliceStageSettings(scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0)
+STRENGTH = 0.4
+
+
+@pytest.fixture(scope="module")
+def volume() -> np.ndarray:
+    return volume_from_pixels(render(true_cloud(), volume_planes(GRID), cutoff_sigma=6.0).numpy(), GRID)
+
+
+class Scene:
+    """A loss with every term, at a point where nothing is zero.
+
+    The cut-off is raised to 6 sigma, so that the dense reference sees the same image.
+    """
+
+    def __init__(self, volume: np.ndarray, seed: int, amplitude: str = "exact") -> None:
+        rng = np.random.default_rng(seed)
+        self.slices = make_slices()
+        n, self.amplitude = len(self.slices), amplitude
+        self.trust = rng.uniform(0.2, 1, n).astype(np.float32).astype(float)
+        cloud = seeded(volume)
+        cloud = cloud.take(torch.arange(0, len(cloud), 3))
+        self.shading = StackShading(self.slices)
+        blocks = {
+            "turn": (rng.normal(0, 0.05, (n, 3)), 1e-3),
+            "shift": (rng.normal(0, 0.3, (n, 3)), 0.03),
+            "log_gain": (rng.normal(0, 0.2, n), 2e-3),
+            "shading": (rng.normal(0, 0.2, (3, 5)), 8e-3),
+        }
+        self.parameters = FitParameters(cloud, LearningRates(), blocks)
+        self.prior = VolumeTarget.of(0.9 * volume, (BALL * 0.7).astype(np.float32), GRID)
+        self.chosen = np.array([1, 5, 9, 14])
+        exact = amplitude == "exact"
+        ones = np.ones(n)
+        self.term = SliceTerm(self.slices, ones, self.trust, self.parameters, self.shading, exact)
+        self.distilled = ImageTerm(self.prior.planes, self.prior.value, self.prior.weight, cloud.origin_mm)
+        self.distilled.choose(self.chosen)
+        self.objective = CloudObjective(self.parameters, [self.term, self.distilled], SETTINGS.scale_weight)
+        self.seed = self.objective.seed_log_scale
+        for name in ("mean_mm", "log_scale", "quaternion_wxyz", "peak"):
+            value = self.parameters.value[name]
+            value += rng.normal(0, 0.1, value.shape).astype(np.float32)
+
+    def evaluate(self) -> float:
+        """The explicit loss; its gradient is in the parameters."""
+        self.term.update()
+        self.objective.begin()
+        image = self.objective.add(self.term, 1.0)
+        distance = self.objective.add(self.distilled, STRENGTH)
+        self.image = image
+        regulariser = self.objective.finish()
+        others = self.term.finish(image, SETTINGS.pose_prior_mm, SETTINGS.shading_ridge)
+        return image + STRENGTH * distance + regulariser + others
+
+    def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
+        """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
+        leaves = {
+            name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()
+        }
+        cloud = GaussianCloud(*[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "peak")],
+                              self.parameters.origin_mm)  # fmt: skip
+        log_gain = leaves["log_gain"] - leaves["log_gain"].mean()
+        twist = torch.cat([leaves["turn"], leaves["shift"]], 1)
+        pixels = render(
+            cloud, self.slices.planes, twist=twist, log_gain=log_gain, backend="reference",
+            amplitude=self.amplitude,
+        )  # fmt: skip
+        basis = torch.tensor(self.shading.basis).double()
+        of_pixel = self.slices.stack_id[self.slices.planes.plane_id()]
+        pixels = pixels * (leaves["shading"][of_pixel] * basis.T).sum(1).exp()
+        weight = torch.tensor(self.slices.mask * self.trust[self.slices.planes.plane_id()])
+        image = (weight * (pixels - torch.tensor(self.slices.value)).abs()).sum() / weight.sum()
+        part = self.prior.take(self.chosen)
+        weight = torch.tensor(part.weight).double()
+        near = render(cloud, part.planes, backend="reference") - torch.tensor(part.value)
+        loss = image + STRENGTH * (weight * near.abs()).sum() / weight.sum()
+        away = leaves["log_scale"] - torch.tensor(self.seed)
+        loss = loss + SETTINGS.scale_weight * away.square().mean()
+        loss = loss + SETTINGS.shading_ridge * leaves["shading"].square().mean()
+        radius = (
+            np.sqrt(((self.slices.planes.shape * self.slices.planes.spacing_mm / 2) ** 2).sum(1)).mean() / 2
+        )
+        moved = leaves["shift"].square().sum(1) + (radius * leaves["turn"]).square().sum(1)
+        loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
+        loss.backward()
+        return loss.item(), {name: leaf.grad.numpy() for name, leaf in leaves.items()}
+
+
+@pytest.fixture
+def far_cutoff(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(objective_module, "CUTOFF_SIGMA", 6.0)
+
+
+@pytest.mark.usefixtures("far_cutoff")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume: np.ndarray, seed: int):
+    scene = Scene(volume, seed)
+    expected, expected_gradient = scene.oracle()
+    assert scene.evaluate() == pytest.approx(expected, rel=1e-5)
+    for name, gradient in expected_gradient.items():
+        found = scene.parameters.gradient[name]
+        # |residual| has a kink: a pixel on it may fall to the other side
+        assert np.linalg.norm(found - gradient) < 2e-3 * np.linalg.norm(gradient), name
+
+
+@pytest.mark.usefixtures("far_cutoff")
+def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
+    scene = Scene(volume, 2)
+    scene.evaluate()
+    image = scene.image
+    gradient = {name: g.astype(float) for name, g in scene.parameters.gradient.items()}
+    rng = np.random.default_rng(3)
+    for name, g in gradient.items():
+        value = scene.parameters.value[name]
+        start, direction = value.copy(), rng.uniform(size=value.shape) * np.sign(g)
+        direction *= 0.02 / np.linalg.norm(direction)
+        values = []
+        for sign in (1, -1):
+            value[...] = start + sign * direction
+            values.append(scene.evaluate())
+            # the image's value scales the pose prior as a constant
+            values[-1] += (image - scene.image) * scene.term.finish(1.0, SETTINGS.pose_prior_mm, 0.0)
+        value[...] = start
+        slope = float((g * direction).sum())
+        assert (values[0] - values[1]) / 2 == pytest.approx(slope, rel=0.03), name
+
+
+def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray):
+    scene = Scene(volume, 4)
+    cloud = scene.parameters.cloud()
+    value = render(cloud, scene.prior.planes).numpy()
+    parameters = FitParameters(cloud, LearningRates())
+    term = ImageTerm(scene.prior.planes, value, np.ones_like(value), cloud.origin_mm)
+    objective = CloudObjective(parameters, [term], 0.0)
+    objective.begin()
+    assert objective.add(term, 1.0) == 0
+    objective.finish()
+    assert all((g == 0).all() for g in parameters.gradient.values())
+
+
+def test_where_nothing_counts_the_term_is_zero(volume: np.ndarray):
+    scene = Scene(volume, 5)
+    term = ImageTerm(
+        scene.prior.planes, scene.prior.value, 0 * scene.prior.weight, scene.parameters.origin_mm
+    )
+    objective = CloudObjective(scene.parameters, [term], 0.0)
+    objective.begin()
+    assert objective.add(term, 1.0) == 0
+    objective.finish()
+    assert (scene.parameters.gradient["mean_mm"] == 0).all()
+
+
+def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
+    """The list in use always holds every pair within the cut-off, and it is not made anew at every step."""
+    scene = Scene(volume, 6)
+    for _ in range(12):
+        loss = scene.evaluate()
+        for term in scene.objective.terms:
+            shapes, cutoff = scene.objective.shapes, objective_module.CUTOFF_SIGMA
+            finder = objective_module.PairFinder(len(shapes))
+            needed = finder.find(shapes, term.planes, term.rotation, term.center_mm, cutoff)
+            for k in range(len(term.planes)):
+                held = term.pairs.gaussian[term.pairs.start[k] : term.pairs.start[k + 1]]
+                now = needed.gaussian[needed.start[k] : needed.start[k + 1]]
+                assert np.isin(now, held).all()
+        scene.parameters.step(loss, 0.1)
+    assert scene.objective.n_searches < 6
+
+
+def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray):
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba was started with one thread")
+    before, found = numba.get_num_threads(), []
+    try:
+        for n_threads in (1, 2):
+            numba.set_num_threads(n_threads)
+            scene = Scene(volume, 7)
+            loss = scene.evaluate()
+            found.append((loss, {name: g.copy() for name, g in scene.parameters.gradient.items()}))
+    finally:
+        numba.set_num_threads(before)
+    (one, one_gradient), (two, two_gradient) = found
+    assert one == pytest.approx(two, rel=1e-6)
+    for name, gradient in one_gradient.items():
+        assert np.linalg.norm(gradient - two_gradient[name]) <= 1e-5 * np.linalg.norm(gradient), name
+
+
+def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: np.ndarray):
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba was started with one thread")
+    slices, ones = make_slices(), np.ones(24)
+    prior = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
+    before, images = numba.get_num_threads(), []
+    try:
+        for n_threads in (1, 2):
+            numba.set_num_threads(n_threads)
+            fit = fit_slices(
+                seeded(volume), slices, ones, ones, prior, SliceStageSettings(n_steps=8),
+                np.random.default_rng(0),
+            )  # fmt: skip
+            images.append(render(fit.cloud, volume_planes(GRID)).numpy())
+    finally:
+        numba.set_num_threads(before)
+    assert np.abs(images[0] - images[1]).max() <= 1e-5 * np.abs(images[0]).max()
+
+
+def one_gaussian() -> GaussianCloud:
+    return GaussianCloud(
+        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0),
+        np.zeros(3),
+    )  # fmt: skip
+
+
+def test_a_step_is_that_of_torch_adam():
+    rng = np.random.default_rng(8)
+    rates = LearningRates()
+    parameters = FitParameters(one_gaussian(), rates, {"extra": (rng.normal(size=(5, 2)), 0.01)})
+    leaves = {name: torch.tensor(value.copy()) for name, value in parameters.value.items()}
+    steps = (rates.mean_share, rates.log_scale, rates.quaternion, rates.peak_share * 2, 0.01)
+    groups = [{"params": [leaf], "lr": step} for leaf, step in zip(leaves.values(), steps, strict=True)]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    for n in range(20):
+        for name, leaf in leaves.items():
+            gradient = 10.0 ** rng.uniform(-7, 3, leaf.shape) * rng.choice([-1, 1], leaf.shape)
+            parameters.gradient[name][...] = gradient
+            leaf.grad = torch.tensor(gradient, dtype=torch.float32)
+        factor = 1 / (1 + n)
+        for group, step in zip(adam.param_groups, steps, strict=True):
+            group["lr"] = step * factor
+        adam.step()
+        parameters.step(0.0, factor)
+    for name, leaf in leaves.items():
+        np.testing.assert_allclose(parameters.value[name], leaf.numpy(), rtol=2e-5, atol=2e-6)
+
+
+def test_a_step_is_about_as_long_as_its_rate_says():
+    rates = LearningRates()
+    parameters = FitParameters(one_gaussian(), rates)
+    for gradient in parameters.gradient.values():
+        gradient[...] = 1.0
+    parameters.step(1.0, 0.5)
+    cloud = parameters.cloud()
+    np.testing.assert_allclose(cloud.mean_mm, -0.5 * rates.mean_share, rtol=1e-4)  # sigma is 1 mm
+    np.testing.assert_allclose(cloud.log_scale, -0.5 * rates.log_scale, rtol=1e-4)
+    np.testing.assert_allclose(cloud.peak, 2 - 0.5 * rates.peak_share * 2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_stops_the_fit(bad: float):
+    parameters = FitParameters(one_gaussian(), LearningRates())
+    with pytest.raises(NumericalError, match="not finite") as caught:
+        parameters.step(bad, 1.0)
+    assert caught.value.exit_code == 4
+    assert torch.equal(parameters.cloud().peak, one_gaussian().peak)
+
+
+def test_a_gradient_that_is_not_finite_stops_the_fit():
+    parameters = FitParameters(one_gaussian(), LearningRates())
+    parameters.gradient["mean_mm"][0, 1] = np.nan
+    with pytest.raises(NumericalError, match="not finite"):
+        parameters.step(1.0, 1.0)
+
+
+def test_pixels_that_are_not_finite_stop_the_fit(volume: np.ndarray):
+    slices, ones = make_slices(), np.ones(24)
+    value = slices.value.copy()
+    value[np.flatnonzero(slices.mask)[5]] = np.nan
+    settings = SliceStageSettings(n_steps=2, peak_iterations=0)
+    with pytest.raises(NumericalError, match="not finite"):
+        fit_slices(
+            seeded(volume), replace(slices, value=value), ones, ones, None, settings, np.random.default_rng(0)
+        )
