@@ -14,6 +14,7 @@ from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_peaks
 from g3r.geometry import VolumeGrid
+from g3r.pace import Deadline, paced
 
 NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
@@ -82,11 +83,12 @@ def fit_prior(
     settings: PriorStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
+    deadline: Deadline | None = None,
 ) -> tuple[GaussianCloud, list[float]]:
     """Fit a seeded cloud to the prior volume.
 
     Peaks first, by least squares on every second plane; then Adam on everything with the L1 loss on random
-    planes and the scale regulariser.
+    planes and the scale regulariser; fewer steps if they would end after the deadline.
 
     Returns:
         The fitted cloud, and the image loss of each step.
@@ -97,8 +99,7 @@ def fit_prior(
     objective = CloudObjective(parameters, [term], settings.scale_weight)
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
-    for step in range(settings.n_steps):
-        fraction = step / settings.n_steps
+    for step, fraction in paced(settings.n_steps, deadline):
         progress(step, settings.n_steps)
         if step % settings.steps_per_draw == 0:
             term.choose(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))

@@ -16,6 +16,7 @@ from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, solve_peaks
+from g3r.pace import Deadline, paced
 
 MOST_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""
@@ -88,6 +89,7 @@ def fit_slices(
     settings: SliceStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
+    deadline: Deadline | None = None,
 ) -> SliceFit:
     """Refine a cloud against slices.
 
@@ -101,6 +103,7 @@ def fit_slices(
         settings: how long and how hard.
         rng: draws the prior's planes.
         progress: called with (steps done, steps in all).
+        deadline: fewer steps if they would end after it; schedules run to their ends even so.
 
     Raises:
         NumericalError: a loss that is not finite.
@@ -127,8 +130,7 @@ def fit_slices(
         terms.append(distilled)
     objective = CloudObjective(parameters, terms, settings.scale_weight)
     history: list[dict[str, float]] = []
-    for step in range(settings.n_steps):
-        fraction = step / settings.n_steps
+    for step, fraction in paced(settings.n_steps, deadline):
         progress(step, settings.n_steps)
         if prior is not None and step % settings.steps_per_draw == 0:
             distilled.choose(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
