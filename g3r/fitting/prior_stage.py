@@ -14,6 +14,7 @@ from g3r.fitting.losses import scale_regulariser, weighted_l1
 from g3r.fitting.parameters import CloudParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, find_pairs, render, solve_peaks
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 
 PAIR_MARGIN_SIGMA = 0.5
@@ -32,6 +33,7 @@ class PriorStageSettings:
         plane_share: share of the volume's planes in a step.
         scale_weight: weight of the scale regulariser.
         steps_per_pair_list: steps between two searches for pairs.
+        cutoff_sigma: where a Gaussian ends.
     """
 
     n_steps: int = 30
@@ -39,6 +41,7 @@ class PriorStageSettings:
     plane_share: float = 0.34
     scale_weight: float = 0.01
     steps_per_pair_list: int = 10
+    cutoff_sigma: float = CUTOFF_SIGMA
 
 
 @dataclass(frozen=True)
@@ -95,21 +98,24 @@ def fit_prior(
     Returns:
         The fitted cloud, and the image loss of each step.
     """
-    cloud = solve_peaks_on(cloud, target.take(np.arange(0, len(target.planes), 2)), settings.peak_iterations)
+    every_second = target.take(np.arange(0, len(target.planes), 2))
+    cloud = solve_peaks_on(cloud, every_second, settings.peak_iterations, settings.cutoff_sigma)
     parameters = CloudParameters(cloud, LearningRates())
     seed_log_scale = cloud.log_scale.clone()
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
+    reach_sigma = settings.cutoff_sigma + PAIR_MARGIN_SIGMA
     for step in range(settings.n_steps):
         progress(step, settings.n_steps)
         if step % settings.steps_per_pair_list == 0:
             chosen = np.sort(rng.choice(len(target.planes), n_planes, replace=False))
             part = target.take(chosen)
             value, weight = torch.from_numpy(part.value), torch.from_numpy(part.weight)
-            pairs = find_pairs(parameters.cloud().detach(), part.planes, 3.2 + PAIR_MARGIN_SIGMA)
+            pairs = find_pairs(parameters.cloud().detach(), part.planes, reach_sigma)
         parameters.set_factor(cosine_decay(step / settings.n_steps))
         current = parameters.cloud()
-        image = weighted_l1(render(current, part.planes, pairs=pairs), value, weight)
+        seen = render(current, part.planes, pairs=pairs, cutoff_sigma=settings.cutoff_sigma)
+        image = weighted_l1(seen, value, weight)
         loss = image + settings.scale_weight * scale_regulariser(current.log_scale, seed_log_scale)
         parameters.step(loss)
         history.append(image.item())
@@ -117,6 +123,11 @@ def fit_prior(
     return parameters.cloud().detach(), history
 
 
-def solve_peaks_on(cloud: GaussianCloud, target: VolumeTarget, n_iterations: int) -> GaussianCloud:
+def solve_peaks_on(
+    cloud: GaussianCloud, target: VolumeTarget, n_iterations: int, cutoff_sigma: float = CUTOFF_SIGMA
+) -> GaussianCloud:
     """Peaks of a cloud by least squares on the planes of a volume."""
-    return solve_peaks(cloud, target.planes, target.value, target.weight, n_iterations=n_iterations)
+    return solve_peaks(
+        cloud, target.planes, target.value, target.weight, n_iterations=n_iterations,
+        cutoff_sigma=cutoff_sigma,
+    )  # fmt: skip

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.losses import scale_regulariser, weighted_l1
+from g3r.fitting.observer import FitObserver
 from g3r.fitting.parameters import CloudParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, PAIR_MARGIN_SIGMA, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
@@ -45,6 +46,7 @@ class SliceStageSettings:
         optimise_shading: whether stacks have a smooth intensity field each (two stacks or more).
         shading_ridge: weight of the mean squared coefficient of the fields.
         amplitude: "exact", or "printed" for comparison.
+        cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
         rates: step sizes.
     """
 
@@ -62,6 +64,7 @@ class SliceStageSettings:
     optimise_shading: bool = True
     shading_ridge: float = 0.005
     amplitude: str = "exact"
+    cutoff_sigma: float = CUTOFF_SIGMA
     rates: LearningRates = field(default_factory=LearningRates)
 
 
@@ -90,6 +93,7 @@ def fit_slices(
     settings: SliceStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
+    observer: FitObserver | None = None,
 ) -> SliceFit:
     """Refine a cloud against slices.
 
@@ -103,6 +107,7 @@ def fit_slices(
         settings: how long and how hard.
         rng: draws the prior's planes.
         progress: called with (steps done, steps in all).
+        observer: sees the cloud as the fit goes on; None for nobody.
 
     Raises:
         NumericalError: a loss that is not finite.
@@ -118,7 +123,7 @@ def fit_slices(
         cloud = solve_peaks(
             cloud, planes, slices.value, pixel_weight.numpy(), gain=gain,
             n_iterations=settings.peak_iterations, damping=settings.peak_damping,
-            amplitude=settings.amplitude,
+            amplitude=settings.amplitude, cutoff_sigma=settings.cutoff_sigma,
         )  # fmt: skip
     turn, shift = torch.zeros(n_slices, 3), torch.zeros(n_slices, 3)
     log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
@@ -145,25 +150,25 @@ def fit_slices(
     # trust times difference: well-measured heads feel little of it, sparsely measured ones much
     prior_share = float(prior.weight[prior.weight > 0].mean()) if prior is not None else 0.0
     history: list[dict[str, float]] = []
+    reach_sigma = settings.cutoff_sigma + PAIR_MARGIN_SIGMA
     for step in range(settings.n_steps):
         fraction = step / settings.n_steps
         progress(step, settings.n_steps)
         twist = torch.cat([turn, shift], 1) if settings.optimise_poses else None
         current = parameters.cloud()
         if step % settings.steps_per_pair_list == 0:
-            pairs = find_pairs(
-                current.detach(), moved_planes(planes, twist), CUTOFF_SIGMA + PAIR_MARGIN_SIGMA
-            )
+            pairs = find_pairs(current.detach(), moved_planes(planes, twist), reach_sigma)
             if prior is not None:
                 n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
                 part = prior.take(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
-                part_pairs = find_pairs(current.detach(), part.planes, CUTOFF_SIGMA + PAIR_MARGIN_SIGMA)
+                part_pairs = find_pairs(current.detach(), part.planes, reach_sigma)
                 part_value, part_weight = torch.from_numpy(part.value), torch.from_numpy(part.weight)
         parameters.set_factor(cosine_decay(fraction))
         centred = log_gain - log_gain.mean() if free_gain else log_gain
         pixels = render(
-            current, planes, twist=twist, log_gain=centred, pairs=pairs, amplitude=settings.amplitude
-        )
+            current, planes, twist=twist, log_gain=centred, pairs=pairs, amplitude=settings.amplitude,
+            cutoff_sigma=settings.cutoff_sigma,
+        )  # fmt: skip
         if shading:
             pixels = pixels * shading.log_field(coefficients).exp()
         image = weighted_l1(pixels, target, pixel_weight)
@@ -173,7 +178,8 @@ def fit_slices(
             loss = loss + settings.shading_ridge * coefficients.square().mean()
         strength = prior_strength(settings, fraction, entry["image"])
         if prior is not None and strength > 0:
-            distance = weighted_l1(render(current, part.planes, pairs=part_pairs), part_value, part_weight)
+            seen = render(current, part.planes, pairs=part_pairs, cutoff_sigma=settings.cutoff_sigma)
+            distance = weighted_l1(seen, part_value, part_weight)
             loss = loss + strength * prior_share * distance
             entry |= {"distillation": distance.item(), "distillation_weight": strength}
         if settings.optimise_poses:
@@ -184,6 +190,9 @@ def fit_slices(
         if step and step % settings.reweight_every == 0:
             trust = torch.from_numpy(_trust(pixels.detach(), target, inside, plane_of_pixel, n_slices))
             pixel_weight = inside * trust[plane_of_pixel]
+        if observer and ((step + 1) % observer.every == 0 or step + 1 == settings.n_steps):
+            moved = moved_planes(planes, torch.cat([turn, shift], 1) if settings.optimise_poses else None)
+            observer(step + 1, parameters.cloud().detach(), moved.pose)
     progress(settings.n_steps, settings.n_steps)
     final_gain = torch.exp(log_gain - log_gain.mean() if free_gain else log_gain).detach().double().numpy()
     moved = planes

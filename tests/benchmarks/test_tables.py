@@ -7,10 +7,10 @@ import json
 import pytest
 
 from benchmarks import motion_bias, motion_layers, motion_sweep
-from benchmarks.runs import changed, preset_settings
-from benchmarks.tables import between_markers, markdown_table, put_into, write_json
+from benchmarks.runs import preset_settings
+from g3r.bench.record import between_markers, markdown_table, put_between_markers, write_json
 from g3r.errors import InputError
-from g3r.presets import PRESETS
+from g3r.presets import PRESETS, changed
 
 
 def test_markdown_table():
@@ -25,7 +25,7 @@ def test_only_what_is_between_the_markers_changes(tmp_path):
     path = tmp_path / "page.md"
     path.write_text("before\n<!-- t:begin -->\nold\n<!-- t:end -->\nafter | t:begin\n", encoding="utf-8")
     for _ in range(2):  # a second time changes nothing
-        put_into(path, "t", "\nnew \\1 line\n")
+        put_between_markers(path, "t", "\nnew \\1 line\n")
         assert path.read_text(encoding="utf-8") == (
             "before\n<!-- t:begin -->\nnew \\1 line\n<!-- t:end -->\nafter | t:begin\n"
         )
@@ -41,7 +41,7 @@ def test_markers_must_be_there_once(text):
 
 def test_a_document_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match=r"page\.md: no such file"):
-        put_into(tmp_path / "page.md", "t", "x")
+        put_between_markers(tmp_path / "page.md", "t", "x")
 
 
 def test_json_is_written_whole(tmp_path):
