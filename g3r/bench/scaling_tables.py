@@ -20,10 +20,10 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
     parts = [_exponent_table(record)]
     parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
     parts.append(
-        "Exponents are slopes between logarithms, with their standard errors: over the largest decade of sizes, "
-        "where the fixed cost of a call no longer counts, and over all sizes. The design predicts 1 for time; "
-        f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of several "
-        f"calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
+        "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
+        "sizes, where the fixed cost of a call no longer counts, and over all. The design predicts 1; "
+        f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
+        f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
     )
     return "\n\n".join(parts)
 

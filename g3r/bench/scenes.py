@@ -20,7 +20,7 @@ HEAD_MM = 50.0
 SIGMA_MM = 1.2
 THICKNESS_MM = 2.5
 PIXEL_MM = 0.8
-"""In-plane width of the PSF, whatever the spacing of the pixels: else finer pixels would mean another scene."""
+"""In-plane width of the PSF, whatever the spacing of the pixels: finer ones shall not mean another scene."""
 
 N_STACKS = 3
 
@@ -80,9 +80,10 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
     value = render(cloud, planes).numpy()
     value = value + 0.02 * rng.standard_normal(len(value)).astype(np.float32) * value.mean()
     index = np.concatenate([np.arange(n) for n in per_stack])
+    stack_id = np.repeat(np.arange(N_STACKS), per_stack)
     return Slices(
-        planes, value.astype(np.float32), np.ones(len(value), bool), np.repeat(np.arange(N_STACKS), per_stack),
-        index, np.full(size.n_slices, THICKNESS_MM), planes.pose,
+        planes, value.astype(np.float32), np.ones(len(value), bool), stack_id, index,
+        np.full(size.n_slices, THICKNESS_MM), planes.pose,
     )  # fmt: skip
 
 

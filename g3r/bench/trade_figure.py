@@ -26,6 +26,7 @@ def draw_trade(record: Mapping[str, Any], path: Path) -> None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullLocator
 
     cases = record["cases"]
     figure = Figure(figsize=(6.2 * len(cases) + 0.4, 5.2), layout="constrained")
@@ -49,8 +50,9 @@ def draw_trade(record: Mapping[str, Any], path: Path) -> None:
         highest = max(point.psnr_db for point in points)
         axis.set_ylim(min(lowest, highest - 1) - LEAST_SHOWN_DB / 2, highest + 0.5)
         axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
+        axis.xaxis.set_minor_locator(NullLocator())
         axis.set_title(name, fontsize=11)
         axis.set_xlabel("seconds of the whole command")
         axis.grid(color="#e5e5e5", lw=0.6, which="both")
@@ -73,7 +75,7 @@ def _draw_front(axis: Any, points: list[Point], legend: dict[str, Any]) -> None:
 def _draw_sweeps(axis: Any, case: Mapping[str, Any], base: str, legend: dict[str, Any]) -> None:
     for sweep, variants in case.get("sweeps", {}).items():
         offset = sweep_offset(case, base)
-        rows = sorted(variants.values(), key=lambda row: row["seconds"])
+        rows = list(variants.values())
         (line,) = axis.plot(
             [row["seconds"] + offset for row in rows], [row["psnr_db"] for row in rows], ".-",
             color=SWEEP_COLOURS.get(sweep, "#666666"), lw=0.9, ms=5, zorder=3,
