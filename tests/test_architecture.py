@@ -140,7 +140,13 @@ def test_the_pipeline_needs_no_training_packages() -> None:
 @pytest.mark.parametrize("command", ["infer", "simulate", "evaluate", "pretrain", "export", "bench"])
 def test_help_is_light(command: str) -> None:
     statement = f"import g3r.cli.{command} as c; c.main(['--help'])"
-    assert modules_after(statement, *HEAVY) == set()
+    assert modules_after(statement, *HEAVY, "numba", "scipy", "numpy") == set()
+
+
+@pytest.mark.parametrize("command", ["scaling", "trade"])
+def test_help_of_a_benchmark_is_light(command: str) -> None:
+    statement = f"import g3r.cli.bench as c; c.main(['{command}', '--help'])"
+    assert modules_after(statement, *HEAVY, "numba", "scipy", "numpy") == set()
 
 
 def test_unknown_public_name() -> None:

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
+    from g3r.acquisition.planes import Planes, Slices
     from g3r.bench.scenes import SceneSize
+    from g3r.gaussians import GaussianCloud
 
 STEP, SEARCH, PEAKS, WRITING = "optimiser step", "pair search", "peaks", "volume"
 """What is measured: forward, backward and update; `find_pairs`; `solve_peaks`; `render` of a volume."""
@@ -20,10 +22,13 @@ STEP, SEARCH, PEAKS, WRITING = "optimiser step", "pair search", "peaks", "volume
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, PEAKS, WRITING)),
     "slices": ("n_slices", 6, (STEP, SEARCH, PEAKS)),
-    "pixels per slice": ("n_pixels", 256, (STEP, PEAKS)),
-    "output voxels": ("n_voxels", 8000, (WRITING,)),
+    "pixels per slice": ("n_pixels", 1024, (STEP, PEAKS)),
+    "output voxels": ("n_voxels", 27_000, (WRITING,)),
 }
 """What grows: its field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
+
+PIXEL_FIELDS = ("n_pixels", "n_voxels")
+"""These leave the number of pairs (nearly) as it is, whose set-up is then no part of what grows."""
 
 N_SIZES = 8
 """Each twice the one before: 2^7 = 128, two decades."""
@@ -73,51 +78,76 @@ def run(options: argparse.Namespace) -> int:
 
 
 def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
-    """A row per size: `size`, `pairs`, `evaluations`, and of each operation `seconds` and `bytes`."""
+    """A row per size: `size`, `pairs`, `evaluations`, and of each operation `seconds` and `bytes`.
+
+    Where pixels grow and pairs do not, also `setup_seconds`: those of the same pairs without pixels.
+    """
     from g3r.bench.scenes import SceneSize
 
     field, smallest, operations = GROWING[name]
+    base = SceneSize(n_slices=12) if field == "n_pixels" else SceneSize()
     wanted = [smallest * 2**k for k in range(n_sizes)]
-    return [measured_scene(replace(SceneSize(), **{field: n}), field, operations) for n in wanted]
+    return [measured_scene(replace(base, **{field: n}), field, operations) for n in wanted]
 
 
 def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> dict[str, Any]:
     """One size: work, seconds and memory of each operation."""
-    from g3r.bench.cost import least_cpu_seconds, peak_extra_bytes
-    from g3r.bench.scenes import made_cloud, made_slices, made_volume_planes, pixel_evaluations
-    from g3r.gaussians import find_pairs, render, solve_peaks
+    from g3r.bench.cost import peak_extra_bytes
+    from g3r.bench.scenes import (
+        corner_slices,
+        corners,
+        made_cloud,
+        made_slices,
+        made_volume_planes,
+        pixel_evaluations,
+    )
+    from g3r.gaussians import find_pairs
     from g3r.gaussians.render import CUTOFF_SIGMA
 
     cloud = made_cloud(size)
-    volume = made_volume_planes(size)
-    slices = made_slices(size, cloud)
+    volume, slices = made_volume_planes(size), made_slices(size, cloud)
     planes = volume if operations == (WRITING,) else slices.planes
     pairs = find_pairs(cloud, planes, CUTOFF_SIGMA)
+    calls = scene_calls(cloud, slices, volume)
+    row: dict[str, Any] = {
+        "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
+        "pairs": len(pairs),
+        "evaluations": round(pixel_evaluations(cloud, planes, pairs, CUTOFF_SIGMA)),
+        "seconds": {name: calls[name][0]() for name in operations},
+        "bytes": {name: peak_extra_bytes(calls[name][1]) for name in operations},
+    }
+    if field in PIXEL_FIELDS:
+        bare = scene_calls(cloud, corner_slices(slices), corners(volume))
+        row["setup_seconds"] = {name: bare[name][0]() for name in operations}
+    return row
+
+
+def scene_calls(
+    cloud: GaussianCloud, slices: Slices, volume: Planes
+) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
+    """Of each operation: what gives its seconds, and a single call of it."""
+    from g3r.bench.cost import least_cpu_seconds
+    from g3r.gaussians import find_pairs, render, solve_peaks
+    from g3r.gaussians.render import CUTOFF_SIGMA
+
     weight = slices.mask.astype("float32")
-    calls: dict[str, Callable[[], object]] = {
+    pairs = find_pairs(cloud, slices.planes, CUTOFF_SIGMA)
+    single: dict[str, Callable[[], object]] = {
         SEARCH: lambda: find_pairs(cloud, slices.planes, CUTOFF_SIGMA),
         PEAKS: lambda: solve_peaks(
             cloud, slices.planes, slices.value, weight, n_iterations=PEAK_ITERATIONS, pairs=pairs
         ),
         WRITING: lambda: render(cloud, volume),
-        STEP: lambda: step_seconds(cloud, slices),
     }
-    row: dict[str, Any] = {
-        "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
-        "pairs": len(pairs),
-        "evaluations": round(pixel_evaluations(cloud, planes, pairs, CUTOFF_SIGMA)),
-        "seconds": {},
-        "bytes": {},
-    }
-    for operation in operations:
-        call = calls[operation]
-        seconds = step_seconds(cloud, slices) if operation == STEP else least_cpu_seconds(call)
-        row["seconds"][operation] = seconds
-        row["bytes"][operation] = peak_extra_bytes(call)
-    return row
+
+    def timed(call: Callable[[], object]) -> Callable[[], float]:
+        return lambda: least_cpu_seconds(call)
+
+    step = lambda: step_seconds(cloud, slices)  # noqa: E731
+    return {STEP: (step, step), **{name: (timed(call), call) for name, call in single.items()}}
 
 
-def step_seconds(cloud: Any, slices: Any) -> float:
+def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
     """CPU seconds of one optimiser step: the least of several in a fit, without its start.
 
     Forward, backward and update of all that a fit of the slices moves; no distillation, and no search for

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,24 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
     parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
     parts.append(
         "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
-        "sizes, where the fixed cost of a call no longer counts, and over all. The design predicts 1; "
+        "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so much "
+        "per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs do "
+        "not: the judged exponent is that of the seconds less those of the same pairs with a pixel in each "
+        "corner of their planes (set-up). Elsewhere it is that of all seconds. "
         f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
         f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
     )
     return "\n\n".join(parts)
+
+
+def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Exponent | None:
+    """Of the largest decade, without the set-up of pairs where that was measured; None if nothing is left."""
+    cost = [row["seconds"][operation] - row.get("setup_seconds", {}).get(operation, 0.0) for row in rows]
+    if min(cost[-2:]) <= 0:
+        return None
+    size = [row["size"] for row in rows]
+    usable = [(n, c) for n, c in zip(size, cost, strict=True) if c > 0]
+    return fitted_exponent([n for n, _ in usable], [c for _, c in usable], largest_decade=True)
 
 
 def exponents(rows: list[dict[str, Any]], operation: str, kind: str) -> tuple[Exponent, Exponent] | None:
@@ -52,15 +65,18 @@ def _exponent_table(record: Mapping[str, Any]) -> str:
         for operation in rows[0]["seconds"]:
             time, memory = (exponents(rows, operation, kind) for kind in ("seconds", "bytes"))
             assert time is not None
-            outside = not LEAST_EXPONENT <= time[0].value <= MOST_EXPONENT
+            judged = judged_exponent(rows, operation)
+            outside = judged is None or not LEAST_EXPONENT <= judged.value <= MOST_EXPONENT
             cells = [
                 f"{operation}, {name}", f"{work[0]:.2f}", f"{work[1]:.2f}",
-                _written(time[0]) + (" (!)" if outside else ""), _written(time[1]),
+                
+                (_written(judged) if judged else "") + (" (!)" if outside else ""),
+                _written(time[0]), _written(time[1]),
                 _written(memory[0]) if memory else "not measured",
             ]  # fmt: skip
             lines.append(cells)
     head = [
-        "exponent of", "pairs", "pixel evaluations", "seconds, largest decade", "seconds, all sizes",
+        "exponent of", "pairs", "pixel evaluations", "judged", "seconds, largest decade", "seconds, all sizes",
         "memory, largest decade",
     ]  # fmt: skip
     return markdown_table(head, lines)

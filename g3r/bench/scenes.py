@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -85,6 +85,19 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
         planes, value.astype(np.float32), np.ones(len(value), bool), stack_id, index,
         np.full(size.n_slices, THICKNESS_MM), planes.pose,
     )  # fmt: skip
+
+
+def corners(planes: Planes) -> Planes:
+    """The same rectangles with a pixel in each corner only: the same pairs, and hardly a pixel in them."""
+    return replace(
+        planes, shape=np.full((len(planes), 2), 2), spacing_mm=(planes.shape - 1) * planes.spacing_mm
+    )
+
+
+def corner_slices(slices: Slices) -> Slices:
+    """Slices with four pixels each; see `corners`."""
+    n = 4 * len(slices)
+    return replace(slices, planes=corners(slices.planes), value=np.ones(n, np.float32), mask=np.ones(n, bool))
 
 
 def made_volume_planes(size: SceneSize) -> Planes:
