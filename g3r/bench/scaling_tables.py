@@ -21,8 +21,8 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
     parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
     parts.append(
         "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
-        "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so much "
-        "per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs do "
+        "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so "
+        "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs do "
         "not: the judged exponent is that of the seconds less those of the same pairs with a pixel in each "
         "corner of their planes (set-up). Elsewhere it is that of all seconds. "
         f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
@@ -76,8 +76,8 @@ def _exponent_table(record: Mapping[str, Any]) -> str:
             ]  # fmt: skip
             lines.append(cells)
     head = [
-        "exponent of", "pairs", "pixel evaluations", "judged", "seconds, largest decade", "seconds, all sizes",
-        "memory, largest decade",
+        "exponent of", "pairs", "pixel evaluations", "judged", "seconds, largest decade",
+        "seconds, all sizes", "memory, largest decade",
     ]  # fmt: skip
     return markdown_table(head, lines)
 
@@ -92,13 +92,16 @@ def _written(exponent: Exponent) -> str:
 def _growth_table(name: str, rows: list[dict[str, Any]]) -> str:
     operations = list(rows[0]["seconds"])
     head = [name, "pairs", "pixel evaluations"]
-    head += [f"{operation}, {unit}" for operation in operations for unit in ("ms", "MB")]
+    units = ("ms", "MB", "set-up ms") if "setup_seconds" in rows[0] else ("ms", "MB")
+    head += [f"{operation}, {unit}" for operation in operations for unit in units]
     lines = []
     for row in rows:
         cells = [f"{row['size']:,}", f"{row['pairs']:,}", f"{row['evaluations']:,}"]
         for operation in operations:
             held = row["bytes"][operation]
             cells += [f"{1000 * row['seconds'][operation]:.1f}", "" if held is None else f"{held / MB:.1f}"]
+            if "setup_seconds" in row:
+                cells.append(f"{1000 * row['setup_seconds'][operation]:.1f}")
         lines.append(cells)
     return markdown_table(head, lines)
 
