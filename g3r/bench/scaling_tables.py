@@ -22,9 +22,9 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
     parts.append(
         "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
         "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so "
-        "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs do "
-        "not: the judged exponent is that of the seconds less those of the same pairs with a pixel in each "
-        "corner of their planes (set-up). Elsewhere it is that of all seconds. "
+        "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs "
+        "do not: the judged exponent is that of the seconds less those of the same pairs with a pixel in "
+        "each corner of their planes (set-up). Elsewhere it is that of all seconds. "
         f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
         f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
     )
