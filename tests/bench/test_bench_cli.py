@@ -90,7 +90,7 @@ def test_scaling_measures_what_grows(tmp_path):
     rows = measured_growth("output voxels", 2)
     assert [row["size"] for row in rows] == [30**3, 38**3]
     assert rows[1]["evaluations"] > 1.5 * rows[0]["evaluations"]
-    assert all(row["seconds"]["volume"] > row["setup_seconds"]["volume"] > 0 for row in rows)
+    assert all(row[key]["volume"] > 0 for row in rows for key in ("seconds", "setup_seconds"))
     record = {"machine": MACHINE, "growing": {"output voxels": rows}}
     assert "volume, output voxels" in scaling_tables(record)
     draw_scaling(record, tmp_path / "scaling.png")
