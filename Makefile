@@ -12,6 +12,9 @@ ATLAS ?=
 PRETRAIN_ARGS ?=
 POSE_ARGS ?=
 BENCH_ARGS ?=
+# of `make bench`: folders of g3r-simulate; phantoms are made when empty
+CASES ?=
+PHANTOM_CASES := runs/bench/phantom-cases
 # of `make ablate-networks`: small patches of subjects that all variants share
 SHORT_TRAINING ?= --data.num_workers=0 --data.patch_size=32 --data.batch_size=2 --data.distinct_epochs=2 \
 	--model.warmup_steps=60 --trainer.check_val_every_n_epoch=2
@@ -22,7 +25,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions clean
+.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench bench-phantom clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -104,6 +107,18 @@ bench-cases: install ## with and without the prior on the cases (G3R_TEST_DATA):
 ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
 	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \
 		--figure docs/images/prior-networks.png $(BENCH_ARGS) -- $(SHORT_TRAINING)
+
+bench: install ## kernels, scaling and speed against accuracy, on phantoms or on CASES="DIR ..." (BENCH_ARGS=--sweeps)
+	$(if $(CASES),,$(BIN)/g3r-simulate --phantom 30 --resolution 0.8 --thickness 3 --seed 61002 --force --output $(PHANTOM_CASES)/phantom-30)
+	$(if $(CASES),,$(BIN)/g3r-simulate --phantom 24 --resolution 0.8 --thickness 3 --seed 61003 --force --output $(PHANTOM_CASES)/phantom-24)
+	$(BIN)/g3r-bench kernels
+	$(BIN)/g3r-bench scaling --docs docs/tradeoff.md --figure docs/images/scaling.png
+	$(BIN)/g3r-bench trade $(or $(CASES),$(PHANTOM_CASES)/phantom-30 $(PHANTOM_CASES)/phantom-24) \
+		--docs docs/tradeoff.md --figure docs/images/tradeoff.png $(BENCH_ARGS)
+
+bench-phantom: install ## a small phantom of the size that other methods were timed on: seconds of `fast`
+	$(BIN)/python -m benchmarks.peer_phantom --force --output $(PHANTOM_CASES)/small
+	$(BIN)/g3r-bench trade $(PHANTOM_CASES)/small --presets fast --output runs/bench/phantom $(BENCH_ARGS)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -12,7 +12,7 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,8 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     from benchmarks.lesion_runs import lesion_run, lesion_subject
     from benchmarks.prior_volumes import file_digest
-    from benchmarks.runs import available_cores, machine, preset_settings, use_threads
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.reconstruct import DEFAULT_CHECKPOINT, GaussianReconstructor
 
     if options.docs and options.development:
@@ -110,7 +111,7 @@ def _run(options: argparse.Namespace) -> int:
     print(text)
     print(f"{record['seconds']:.0f} s")
     if options.docs:
-        put_into(options.docs, "lesions", text)
+        put_between_markers(options.docs, "lesions", text)
     if options.figure:
         from benchmarks.lesion_figure import draw_lesions_kept
 

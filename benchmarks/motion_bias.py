@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 
 if TYPE_CHECKING:
     from benchmarks.subjects import SubjectRecipe
@@ -26,7 +26,7 @@ VARIANTS: dict[str, Mapping[str, Any]] = {
     "estimated": {},
     "not estimated": {"slice_stage.optimise_shading": False},
 }
-"""What is compared; options as `benchmarks.runs.changed` reads them."""
+"""What is compared; options as `g3r.presets.changed` reads them."""
 
 DEFAULT_FOLDER = Path("runs") / "bench" / "motion-bias"
 
@@ -67,17 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import (
-        available_cores,
-        changed,
-        machine,
-        preset_settings,
-        reconstructed,
-        registered,
-        use_threads,
-    )
+    from benchmarks.runs import preset_settings, reconstructed, registered
     from benchmarks.subjects import simulated_subject, test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.evaluation.case import load_case
+    from g3r.presets import changed
 
     atlas, settings = test_data_folder() / "atlas", preset_settings(options.preset)
     threads = options.threads or available_cores()
@@ -103,7 +97,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "bias.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "bias", text)
+        put_between_markers(options.docs, "bias", text)
     return 0
 
 

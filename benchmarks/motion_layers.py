@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Layer:
 
     Args:
         name: in tables and figures.
-        options: settings with which registration ends after this layer (see `benchmarks.runs.changed`).
+        options: settings with which registration ends after this layer (see `g3r.presets.changed`).
         full: whether the layer is part of the fit, so that the whole reconstruction is run.
     """
 
@@ -96,8 +96,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import available_cores, machine, preset_settings, use_threads
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.evaluation.case import load_case
 
     folders = case_folders(test_data_folder() / "cases", options.cases)
@@ -120,7 +121,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "layers.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "layers", text)
+        put_between_markers(options.docs, "layers", text)
     if options.figure:
         from benchmarks.motion_figure import draw_slice_errors
 
@@ -149,7 +150,8 @@ def measure_case(
 ) -> dict[str, Any]:
     """Errors after each layer, and scores with everything and with a layer left out."""
     from benchmarks.motion_figure import jerk_slices
-    from benchmarks.runs import changed, reconstructed, registered
+    from benchmarks.runs import reconstructed, registered
+    from g3r.presets import changed
 
     header = case.header_error()
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}

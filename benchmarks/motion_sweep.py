@@ -14,7 +14,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
@@ -94,8 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import available_cores, machine
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine
 
     atlas = test_data_folder() / "atlas"
     threads = options.threads or max(1, available_cores() // options.jobs)
@@ -122,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "sweep.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "sweep-turned" if options.turned else "sweep", text)
+        put_between_markers(options.docs, "sweep-turned" if options.turned else "sweep", text)
     return 0
 
 
@@ -130,8 +130,9 @@ def _one(
     recipe: SubjectRecipe, atlas: Path, cache: Path, preset: str, full: bool, ckpt: str | None, threads: int
 ) -> dict[str, Any]:
     """One subject in a worker process."""
-    from benchmarks.runs import Run, preset_settings, reconstructed, registered, use_threads
+    from benchmarks.runs import Run, preset_settings, reconstructed, registered
     from benchmarks.subjects import simulated_subject
+    from g3r.bench.record import use_threads
     from g3r.evaluation.case import load_case
 
     use_threads(threads)

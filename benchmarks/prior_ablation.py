@@ -15,7 +15,7 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ FITS: dict[str, Mapping[str, Any]] = {
     "prior as initialisation": {"distillation": False},
     "with distillation": {},
 }
-"""What is fitted, as changes of the settings (see `benchmarks.runs.changed`); the last is the product."""
+"""What is fitted, as changes of the settings (see `g3r.presets.changed`); the last is the product."""
 
 VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS)
 """In the order of the table."""
@@ -96,8 +96,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from benchmarks.prior_volumes import file_digest
-    from benchmarks.runs import available_cores, machine, preset_settings
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine
     from g3r.reconstruct import DEFAULT_CHECKPOINT
 
     if options.docs and options.development:
@@ -137,7 +138,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "ablation.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "ablation", text)
+        put_between_markers(options.docs, "ablation", text)
     if options.figure:
         from benchmarks.prior_figures import draw_ablation
 
@@ -167,8 +168,8 @@ def _one(
     threads: int,
 ) -> dict[str, Any]:
     """One subject from its first stacks, in a worker process."""
-    from benchmarks.runs import use_threads
     from benchmarks.subjects import simulated_subject
+    from g3r.bench.record import use_threads
     from g3r.evaluation.case import load_case
 
     use_threads(threads)
@@ -180,7 +181,7 @@ def _one(
 def measure(case: SimulatedCase, settings: ReconstructionSettings, ckpt: str | None) -> dict[str, Any]:
     """Scores of every variant of one subject, after one registration that all of them share."""
     from benchmarks.prior_volumes import aligned_scores, figures
-    from benchmarks.runs import changed
+    from g3r.presets import changed
     from g3r.reconstruct import GaussianReconstructor
 
     start = time.perf_counter()

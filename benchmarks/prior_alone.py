@@ -10,7 +10,7 @@ from statistics import mean
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 
 if TYPE_CHECKING:
     from g3r.prior.dgpn import DensityGatedPriorNetwork
@@ -57,8 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     from benchmarks.motion_layers import THICKNESS_MM, case_folders
     from benchmarks.prior_volumes import file_digest
-    from benchmarks.runs import available_cores, machine, preset_settings, use_threads
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.evaluation.case import load_case
     from g3r.prior import load_prior
     from g3r.reconstruct import DEFAULT_CHECKPOINT
@@ -86,7 +87,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "alone.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "alone", text)
+        put_between_markers(options.docs, "alone", text)
     return 0
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.command import parser_of, run_command
 from benchmarks.motion_layers import THICKNESS_MM
 from benchmarks.prior_ablation import BASELINE, VARIANTS, measure
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 
 MOST_LOSS_DB = 0.1
 """From several stacks the prior may not cost more than this."""
@@ -34,8 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from benchmarks.prior_volumes import file_digest
-    from benchmarks.runs import available_cores, machine, preset_settings, use_threads
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.evaluation.case import load_case
     from g3r.reconstruct import DEFAULT_CHECKPOINT
 
@@ -58,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "cases.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "cases", text)
+        put_between_markers(options.docs, "cases", text)
     return 0
 
 

@@ -23,7 +23,7 @@ from benchmarks.prior_network_scores import (
     inference_seconds,
     validation_volumes,
 )
-from benchmarks.tables import markdown_table, put_into, write_json, write_text
+from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -114,8 +114,8 @@ def names(variants: Iterable[Variant]) -> list[str]:
 def _run(options: argparse.Namespace) -> int:
     import yaml
 
-    from benchmarks.runs import available_cores, machine, use_threads
     from benchmarks.subjects import test_data_folder
+    from g3r.bench.record import available_cores, machine, use_threads
 
     config = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
     threads = options.threads or available_cores()
@@ -160,7 +160,7 @@ def _run(options: argparse.Namespace) -> int:
     write_text(options.output / "networks.md", text)
     print(text)
     if options.docs:
-        put_into(options.docs, "networks", text)
+        put_between_markers(options.docs, "networks", text)
     if options.figure:
         from benchmarks.prior_figures import draw_networks
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r._version import __version__
 from g3r.acquisition.images import Volume
 from g3r.acquisition.planes import slices_from_stacks
 from g3r.errors import InputError
@@ -125,43 +122,3 @@ def preset_settings(name: str) -> ReconstructionSettings:
     if name not in PRESETS:
         raise InputError(f"--preset {name}; expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
-
-
-def changed(settings: Any, options: Mapping[str, Any]) -> Any:
-    """Settings with some fields replaced; `motion.n_rounds` names a field of a record inside.
-
-    Raises:
-        ValueError: no such field.
-    """
-    for path, value in options.items():
-        name, _, rest = path.partition(".")
-        if not is_dataclass(settings) or name not in {field.name for field in fields(settings)}:
-            raise ValueError(f"{type(settings).__name__} has no field {name!r}")
-        inner = changed(getattr(settings, name), {rest: value}) if rest else value
-        settings = replace(settings, **{name: inner})  # type: ignore[type-var]
-    return settings
-
-
-def use_threads(n_threads: int) -> None:
-    """Give both thread pools the same number, at most what the process was started with."""
-    import numba
-    import torch
-
-    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    numba.set_num_threads(min(n_threads, most))
-    torch.set_num_threads(min(n_threads, most))
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
-def machine() -> dict[str, Any]:
-    """What the seconds depend on."""
-    return {
-        "g3r": __version__,
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "cores": available_cores(),
-    }

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.command import parser_of, run_command
-from benchmarks.tables import put_into, write_json, write_text
+from g3r.bench.record import put_between_markers, write_json, write_text
 
 if TYPE_CHECKING:
     from benchmarks.uncertainty_data import Judged
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from benchmarks.runs import available_cores, changed, preset_settings, use_threads
+    from benchmarks.runs import preset_settings
     from benchmarks.subjects import test_data_folder
     from benchmarks.uncertainty_data import (
         NO_REGISTRATION,
@@ -55,6 +55,8 @@ def _run(options: argparse.Namespace) -> int:
         judged,
         unregistered_recipe,
     )
+    from g3r.bench.record import available_cores, use_threads
+    from g3r.presets import changed
     from g3r.reconstruct import GaussianReconstructor
 
     atlas = test_data_folder() / "atlas"
@@ -127,7 +129,7 @@ def _check(options: argparse.Namespace, found: list[Judged]) -> str:
     text = check_text(record)
     write_text(options.output / "check.md", text)
     if options.docs:
-        put_into(options.docs, "uncertainty", text)
+        put_between_markers(options.docs, "uncertainty", text)
     if options.figure:
         from benchmarks.uncertainty_figure import draw_calibration
 

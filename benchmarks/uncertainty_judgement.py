@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.tables import markdown_table
+from g3r.bench.record import markdown_table
 
 if TYPE_CHECKING:
     from benchmarks.uncertainty_data import Judged

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
 
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
@@ -79,3 +81,18 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
 }
 """Settings by name, from quick to careful."""
+
+
+def changed(settings: Any, options: Mapping[str, Any]) -> Any:
+    """Settings with some fields replaced; `motion.n_rounds` names a field of a record inside.
+
+    Raises:
+        ValueError: no such field.
+    """
+    for path, value in options.items():
+        name, _, rest = path.partition(".")
+        if not is_dataclass(settings) or name not in {field.name for field in fields(settings)}:
+            raise ValueError(f"{type(settings).__name__} has no field {name!r}")
+        inner = changed(getattr(settings, name), {rest: value}) if rest else value
+        settings = replace(settings, **{name: inner})  # type: ignore[type-var]
+    return settings

@@ -22,6 +22,7 @@ from g3r.acquisition.planes import (
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
+from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_share import estimate_prior_share
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import fit_slices
@@ -83,6 +84,7 @@ class GaussianReconstructor:
         settings: see `ReconstructionSettings`, or the name of a preset.
         progress: called with (stage, done, total) as each stage goes on.
         pose_checkpoint: pose network and mean heads, written by g3r-export; those shipped when None.
+        observer: sees the cloud as the fit to the slices goes on.
 
     Raises:
         InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
@@ -92,6 +94,7 @@ class GaussianReconstructor:
     settings: ReconstructionSettings | str = "balanced"
     progress: Progress = lambda stage, done, total: None
     pose_checkpoint: str | os.PathLike[str] | None = None
+    observer: FitObserver | None = None
     pose_network: PoseNetwork | None = field(init=False, default=None)
     pose_meta: PoseCheckpoint | None = field(init=False, default=None)
     network: DensityGatedPriorNetwork | None = field(init=False, default=None)
@@ -200,14 +203,16 @@ class GaussianReconstructor:
                 distil_to = VolumeTarget.of(prior, unmeasured.astype(np.float32), prior_grid)
             fit = fit_slices(
                 cloud, slices, gain, motion.weight, distil_to, settings.slice_stage, rng,
-                self._report("fit to slices"),
+                self._report("fit to slices"), observer=self.observer,
             )  # fmt: skip
         with clock("volume"):
             grid = _output_grid(prior_grid, settings.resolution_mm)
             mask = prior_mask
             if grid is not prior_grid:
                 mask = foreground_mask(fit.slices, grid, fit.weight)
-            volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * mask
+            cutoff = settings.slice_stage.cutoff_sigma
+            pixels = render(fit.cloud, volume_planes(grid), cutoff_sigma=cutoff).numpy()
+            volume = volume_from_pixels(pixels, grid) * mask
             if not np.isfinite(volume).all():
                 raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         intensity = first_scale * scale

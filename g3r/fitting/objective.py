@@ -46,6 +46,7 @@ class ImageTerm:
         basis: [5, P] terms of the planes' log-intensity fields; None where there are none.
         with_pose: whether gradients of poses are wanted.
         exact: the amplitude, as in `render`.
+        cutoff_sigma: where a Gaussian ends.
     """
 
     moved_mm = 0.0
@@ -60,9 +61,10 @@ class ImageTerm:
         basis: NDArray[np.float32] | None = None,
         with_pose: bool = False,
         exact: bool = True,
+        cutoff_sigma: float = CUTOFF_SIGMA,
     ) -> None:
         self.every, self.value, self.weight, self.origin_mm = planes, value, weight, origin_mm
-        self.with_pose, self.exact = with_pose, exact
+        self.with_pose, self.exact, self.cutoff_sigma = with_pose, exact, cutoff_sigma
         self.basis = np.zeros((N_FIELD_TERMS, 0), np.float32) if basis is None else basis
         self.weight_of_plane = np.add.reduceat(weight, planes.offset[:-1], dtype=np.float64)
         self.finder: PairFinder | None = None
@@ -90,7 +92,7 @@ class ImageTerm:
     def find_pairs(self, shapes: NDArray[np.float64]) -> None:
         """Search the pairs of the present planes, with the margin."""
         self.finder = self.finder or PairFinder(len(shapes))
-        cutoff = CUTOFF_SIGMA + PAIR_MARGIN_SIGMA
+        cutoff = self.cutoff_sigma + PAIR_MARGIN_SIGMA
         self.pairs = self.finder.find(shapes, self.planes, self.rotation, self.center_mm, cutoff)
         if self.work is None or self.work.records.shape[1] < self.pairs.most:
             self.work = Workspace.of(self.every, self.pairs.most + self.pairs.most // 8)
@@ -109,7 +111,7 @@ class ImageTerm:
         planes = self.planes
         kernels.image_l1(
             shapes, peak, self.rotation, self.center_mm, self.gain, planes.psf_var_mm2, planes.shape,
-            planes.spacing_mm, self.offset, self.pairs.start, self.pairs.gaussian, CUTOFF_SIGMA**2,
+            planes.spacing_mm, self.offset, self.pairs.start, self.pairs.gaussian, self.cutoff_sigma**2,
             self.exact, self.work.images, self.work.records, self.value, self.weight, self.trust,
             factor / total, self.with_pose, self.basis, self.coefficients, buffers, self.plane_gradient,
             self.field_gradient, self.residual,
@@ -154,8 +156,8 @@ class CloudObjective:
     def _have_moved(self) -> bool:
         # the largest shift of any plane goes with the narrowest PSF of all: too early rather than too late
         farthest = kernels.farthest_move(  # type: ignore[call-arg]
-            *self._geometry, self.then, CUTOFF_SIGMA, max(term.moved_mm for term in self.terms),
-            min(term.least_psf_mm2 for term in self.terms),
+            *self._geometry, self.then, max(term.cutoff_sigma for term in self.terms),
+            max(term.moved_mm for term in self.terms), min(term.least_psf_mm2 for term in self.terms),
         )  # fmt: skip
         return farthest > PAIR_MARGIN_SIGMA
 

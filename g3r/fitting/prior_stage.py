@@ -13,6 +13,7 @@ from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_peaks
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.pace import Deadline, paced
 
@@ -29,6 +30,7 @@ class PriorStageSettings:
         plane_share: share of the volume's planes in a step.
         scale_weight: weight of the scale regulariser.
         steps_per_draw: steps between two draws of the planes.
+        cutoff_sigma: where a Gaussian ends.
     """
 
     n_steps: int = 30
@@ -36,6 +38,7 @@ class PriorStageSettings:
     plane_share: float = 0.34
     scale_weight: float = 0.01
     steps_per_draw: int = 10
+    cutoff_sigma: float = CUTOFF_SIGMA
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,12 @@ def fit_prior(
     Returns:
         The fitted cloud, and the image loss of each step.
     """
-    cloud = solve_peaks_on(cloud, target.take(np.arange(0, len(target.planes), 2)), settings.peak_iterations)
+    every_second = target.take(np.arange(0, len(target.planes), 2))
+    cloud = solve_peaks_on(cloud, every_second, settings.peak_iterations, settings.cutoff_sigma)
     parameters = FitParameters(cloud, LearningRates())
-    term = ImageTerm(target.planes, target.value, target.weight, cloud.origin_mm)
+    term = ImageTerm(
+        target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
+    )
     objective = CloudObjective(parameters, [term], settings.scale_weight)
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
@@ -111,6 +117,11 @@ def fit_prior(
     return parameters.cloud(), history
 
 
-def solve_peaks_on(cloud: GaussianCloud, target: VolumeTarget, n_iterations: int) -> GaussianCloud:
+def solve_peaks_on(
+    cloud: GaussianCloud, target: VolumeTarget, n_iterations: int, cutoff_sigma: float = CUTOFF_SIGMA
+) -> GaussianCloud:
     """Peaks of a cloud by least squares on the planes of a volume."""
-    return solve_peaks(cloud, target.planes, target.value, target.weight, n_iterations=n_iterations)
+    return solve_peaks(
+        cloud, target.planes, target.value, target.weight, n_iterations=n_iterations,
+        cutoff_sigma=cutoff_sigma,
+    )  # fmt: skip

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.observer import FitObserver
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
@@ -44,6 +45,7 @@ class SliceStageSettings:
         optimise_shading: whether stacks have a smooth intensity field each (two stacks or more).
         shading_ridge: weight of the mean squared coefficient of the fields.
         amplitude: "exact", or "printed" for comparison.
+        cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
         rates: step sizes.
     """
 
@@ -61,6 +63,7 @@ class SliceStageSettings:
     optimise_shading: bool = True
     shading_ridge: float = 0.005
     amplitude: str = "exact"
+    cutoff_sigma: float = CUTOFF_SIGMA
     rates: LearningRates = field(default_factory=LearningRates)
 
 
@@ -90,6 +93,7 @@ def fit_slices(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
     deadline: Deadline | None = None,
+    observer: FitObserver | None = None,
 ) -> SliceFit:
     """Refine a cloud against slices.
 
@@ -104,6 +108,7 @@ def fit_slices(
         rng: draws the prior's planes.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it; schedules run to their ends even so.
+        observer: sees the cloud as the fit goes on; None for nobody.
 
     Raises:
         NumericalError: a loss that is not finite.
@@ -114,15 +119,19 @@ def fit_slices(
         cloud = solve_peaks(
             cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
             n_iterations=settings.peak_iterations, damping=settings.peak_damping,
-            amplitude=settings.amplitude,
+            amplitude=settings.amplitude, cutoff_sigma=settings.cutoff_sigma,
         )  # fmt: skip
     several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
     shading = StackShading(slices) if settings.optimise_shading and several else None
     parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, shading, settings))
-    term = SliceTerm(slices, gain, trust.astype(np.float64), parameters, shading, exact)
+    term = SliceTerm(
+        slices, gain, trust.astype(np.float64), parameters, shading, exact, settings.cutoff_sigma
+    )
     terms: list[ImageTerm] = [term]
     if prior is not None:
-        distilled = ImageTerm(prior.planes, prior.value, prior.weight, cloud.origin_mm)
+        distilled = ImageTerm(
+            prior.planes, prior.value, prior.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
+        )
         n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
         # with the distance being a mean over the prior's trust, this makes the term the mean over the head of
         # trust times difference: well-measured heads feel little of it, sparsely measured ones much
@@ -148,6 +157,9 @@ def fit_slices(
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             term.reweight()
+        if observer and ((step + 1) % observer.every == 0 or step + 1 == settings.n_steps):
+            term.update()
+            observer(step + 1, parameters.cloud(), term.moved_planes().pose)
     progress(settings.n_steps, settings.n_steps)
     term.update()
     return SliceFit(

@@ -10,7 +10,7 @@ from g3r.acquisition.planes import Planes, Slices
 from g3r.fitting.objective import ImageTerm
 from g3r.fitting.parameters import FitParameters
 from g3r.fitting.shading import StackShading
-from g3r.gaussians.render import right_jacobian
+from g3r.gaussians.render import CUTOFF_SIGMA, right_jacobian
 from g3r.geometry import RigidPose
 from g3r.motion.slice_rounds import slice_weights
 
@@ -28,6 +28,7 @@ class SliceTerm(ImageTerm):
         parameters: of the fit.
         shading: fields of the stacks; None where there are none.
         exact: the amplitude, as in `render`.
+        cutoff_sigma: where a Gaussian ends.
     """
 
     def __init__(
@@ -38,10 +39,12 @@ class SliceTerm(ImageTerm):
         parameters: FitParameters,
         shading: StackShading | None = None,
         exact: bool = True,
+        cutoff_sigma: float = CUTOFF_SIGMA,
     ) -> None:
         super().__init__(
             slices.planes, slices.value, slices.mask.astype(np.float32), parameters.origin_mm,
             basis=shading.basis if shading else None, with_pose="turn" in parameters.value, exact=exact,
+            cutoff_sigma=cutoff_sigma,
         )  # fmt: skip
         self.parameters = parameters
         self.gain, self.trust = gain.astype(np.float64), weight.astype(np.float64)

@@ -20,12 +20,11 @@ from benchmarks import (
 )
 from benchmarks.prior_figures import draw_ablation, draw_networks
 from benchmarks.prior_volumes import aligned_scores, slices_at_true_poses
-from benchmarks.runs import changed
 from g3r.acquisition.images import Volume
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.presets import PRESETS
+from g3r.presets import PRESETS, changed
 
 
 def ablation_rows(gain=(2.0, 1.0, 0.5)):
@@ -73,7 +72,7 @@ def test_ablation_variants_are_settings_that_exist():
 
 
 def test_ablation_keeps_only_what_was_made_alike(tmp_path):
-    from benchmarks.tables import write_json
+    from g3r.bench.record import write_json
 
     rows = ablation_rows()
     write_json(tmp_path / "ablation.json", {"preset": "balanced", "weights": "abc", "subjects": rows})

@@ -2,52 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from benchmarks import motion_bias, motion_layers, motion_sweep
-from benchmarks.runs import changed, preset_settings
-from benchmarks.tables import between_markers, markdown_table, put_into, write_json
+from benchmarks.runs import preset_settings
 from g3r.errors import InputError
-from g3r.presets import PRESETS
-
-
-def test_markdown_table():
-    assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == (
-        "| a | b |\n| --- | ---: |\n| x | 1 |\n| y | 2.5 |"
-    )
-    with pytest.raises(ValueError, match="row of 1 cells"):
-        markdown_table(["a", "b"], [["x"]])
-
-
-def test_only_what_is_between_the_markers_changes(tmp_path):
-    path = tmp_path / "page.md"
-    path.write_text("before\n<!-- t:begin -->\nold\n<!-- t:end -->\nafter | t:begin\n", encoding="utf-8")
-    for _ in range(2):  # a second time changes nothing
-        put_into(path, "t", "\nnew \\1 line\n")
-        assert path.read_text(encoding="utf-8") == (
-            "before\n<!-- t:begin -->\nnew \\1 line\n<!-- t:end -->\nafter | t:begin\n"
-        )
-
-
-@pytest.mark.parametrize(
-    "text", ["", "<!-- t:begin -->", "<!-- t:end --><!-- t:begin -->", "<!-- t:begin --><!-- t:end -->" * 2]
-)
-def test_markers_must_be_there_once(text):
-    with pytest.raises(InputError, match="markers"):
-        between_markers(text, "t", "x")
-
-
-def test_a_document_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"page\.md: no such file"):
-        put_into(tmp_path / "page.md", "t", "x")
-
-
-def test_json_is_written_whole(tmp_path):
-    write_json(tmp_path / "made" / "record.json", {"a": 1})
-    assert json.loads((tmp_path / "made" / "record.json").read_text()) == {"a": 1}
-    assert [path.name for path in (tmp_path / "made").iterdir()] == ["record.json"]
+from g3r.presets import PRESETS, changed
 
 
 def subject(level, median, p90, *, warned, psnr=None):

@@ -1,0 +1,82 @@
+"""One run of the command `g3r-infer` in a process of its own: seconds, memory, what it wrote."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from g3r.errors import InputError, NumericalError
+from g3r.evaluation.case import SimulatedCase
+
+PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
+
+KIB = 1024
+
+
+@dataclass(frozen=True)
+class CommandRun:
+    """A finished run.
+
+    Attributes:
+        seconds: wall time from the start of the process until it had ended, its files written.
+        cpu_seconds: of all its threads.
+        peak_bytes: most memory that it held at once.
+        record: its run.json.
+    """
+
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: int
+    record: dict[str, Any]
+
+
+def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]:
+    """Arguments of g3r-infer for a simulated subject."""
+    numbers = range(len(case.stacks))
+    return [
+        "--stacks", *[str(case.folder / f"stack-{n}.nii.gz") for n in numbers],
+        "--masks", *[str(case.folder / f"mask-{n}.nii.gz") for n in numbers],
+        "--thickness", *[f"{stack.thickness_mm:g}" for stack in case.stacks],
+        "--preset", preset, "--output", str(output), "--quiet",
+    ]  # fmt: skip
+
+
+def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
+    """Run g3r-infer as it is in this package, and measure the process.
+
+    Args:
+        arguments: with `--output` being `output`.
+        output: folder that it writes; an earlier one is removed.
+
+    Raises:
+        InputError: it refused its input (its own line is passed on).
+        NumericalError: it ended in another way.
+    """
+    shutil.rmtree(output, ignore_errors=True)
+    path = os.pathsep.join(filter(None, [str(PACKAGE_FOLDER), os.environ.get("PYTHONPATH")]))
+    start = time.perf_counter()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "g3r.cli.infer", *arguments],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert child.stderr is not None
+    said = child.stderr.read().decode(errors="replace").strip()  # to the end of the process
+    _, status, usage = os.wait4(child.pid, 0)
+    seconds = time.perf_counter() - start
+    child.stderr.close()
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode == InputError.exit_code:
+        raise InputError(said.removeprefix("g3r-infer: "))
+    if child.returncode:
+        raise NumericalError(f"g3r-infer ended with {child.returncode}: {said[-2000:]}")
+    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
+    peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else KIB)
+    return CommandRun(seconds, usage.ru_utime + usage.ru_stime, peak, record)

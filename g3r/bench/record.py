@@ -1,0 +1,162 @@
+"""Records of measurements: on which machine, as JSON, and as tables between a document's markers."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from g3r._version import __version__
+from g3r.errors import InputError
+
+PACKAGES = ("numpy", "torch", "numba")
+"""Whose versions decide speed."""
+
+
+def machine(n_threads: int | None = None) -> dict[str, Any]:
+    """What seconds depend on: processor, cores, memory, versions, and the commit of a checkout.
+
+    Args:
+        n_threads: that the measurement used; as many as there are cores when None.
+    """
+    return {
+        "processor": _processor(),
+        "cores": available_cores(),
+        "threads": n_threads or available_cores(),
+        "memory_gb": _memory_gb(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **{name: _installed(name) for name in PACKAGES},
+        "g3r": __version__,
+        "commit": _commit(),
+    }
+
+
+def machine_line(found: dict[str, Any]) -> str:
+    """One line of what `machine` found, for under a table."""
+    return (
+        f"{found['processor']}, {found['cores']} cores, {found['threads']} threads; "
+        f"Python {found['python']}, torch {found['torch']}, numba {found['numba']}; "
+        f"g3r {found['g3r']}, commit {found['commit'] or 'unknown'}."
+    )
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def use_threads(n_threads: int) -> None:
+    """Give both thread pools the same number, at most what the process was started with."""
+    import numba
+    import torch
+
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    numba.set_num_threads(min(n_threads, most))
+    torch.set_num_threads(min(n_threads, most))
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _memory_gb() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (ValueError, OSError, AttributeError):
+        return None
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Of the checkout that this file lies in, with a + for changes that are not committed."""
+    here = Path(__file__).resolve().parents[2]
+    if not (here / ".git").exists():
+        return None
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
+            cwd=here, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return described.stdout.strip()
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table in Markdown; the first column is left-aligned, the others right.
+
+    Raises:
+        ValueError: a row of another length than the head.
+    """
+    for row in rows:
+        if len(row) != len(head):
+            raise ValueError(f"row of {len(row)} cells under {len(head)} columns")
+    rule = ["---", *["---:"] * (len(head) - 1)]
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in [head, rule, *rows])
+
+
+def between_markers(text: str, name: str, content: str) -> str:
+    """The text with what stands between `<!-- name:begin -->` and `<!-- name:end -->` replaced.
+
+    Raises:
+        InputError: the markers are not there exactly once, in this order.
+    """
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise InputError(f"markers {begin} and {end} are not there once each; add them where the table goes")
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{content.strip()}\n{end}{rest.split(end)[1]}"
+
+
+def put_between_markers(path: Path, name: str, content: str) -> None:
+    """Rewrite one table of a document in place.
+
+    Raises:
+        InputError: no such file, or no markers in it.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a document with {name} markers")
+    try:
+        text = between_markers(path.read_text(encoding="utf-8"), name, content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    _write(path, text)
+
+
+def write_json(path: Path, record: Any) -> None:
+    """Write a record, whole or not at all; folders are made."""
+    _write(path, json.dumps(record, indent=1) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text, whole or not at all; folders are made."""
+    _write(path, text.rstrip("\n") + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another --output") from None

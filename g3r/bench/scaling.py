@@ -1,0 +1,182 @@
+"""`g3r-bench scaling`: time and memory as Gaussians, slices, pixels and output voxels grow, one at a time."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from g3r.acquisition.planes import Planes, Slices
+    from g3r.bench.scenes import SceneSize
+    from g3r.gaussians import GaussianCloud
+
+STEP, SEARCH, PEAKS, WRITING = "optimiser step", "pair search", "peaks", "volume"
+"""What is measured: forward, backward and update; `find_pairs`; `solve_peaks`; `render` of a volume."""
+
+GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
+    "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, PEAKS, WRITING)),
+    "slices": ("n_slices", 6, (STEP, SEARCH, PEAKS)),
+    "pixels per slice": ("n_pixels", 1024, (STEP, PEAKS)),
+    "output voxels": ("n_voxels", 27_000, (WRITING,)),
+}
+"""What grows: its field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
+
+PIXEL_FIELDS = ("n_pixels", "n_voxels")
+"""These leave the number of pairs (nearly) as it is, whose set-up is then no part of what grows."""
+
+N_SIZES = 8
+"""Each twice the one before: 2^7 = 128, two decades."""
+
+PEAK_ITERATIONS = 4
+TIMED_STEPS = 6
+
+LEAST_EXPONENT, MOST_EXPONENT = 0.9, 1.15
+
+MARKERS = "scaling"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "--output", type=Path, default=Path("runs") / "bench" / "scaling", help="for scaling.json and .md"
+    )
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw seconds against size")
+    parser.add_argument("--sizes", type=int, default=N_SIZES, help="how many, each twice the one before")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads; seconds are CPU time of all")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure, and write what was found; returns the exit code."""
+    from g3r.bench.record import machine, put_between_markers, use_threads, write_json, write_text
+    from g3r.bench.scaling_tables import draw_scaling, scaling_tables
+
+    if options.sizes < 2:
+        raise InputError(f"--sizes {options.sizes}; expected at least 2, for a slope")
+    if options.threads < 1:
+        raise InputError(f"--threads {options.threads}; expected at least 1")
+    use_threads(options.threads)
+    record: dict[str, Any] = {"machine": machine(options.threads), "growing": {}}
+    for name in GROWING:
+        print(f"g3r-bench scaling: {name}", file=sys.stderr, flush=True)
+        record["growing"][name] = measured_growth(name, options.sizes)
+        write_json(options.output / "scaling.json", record)
+    text = scaling_tables(record)
+    write_text(options.output / "scaling.md", text)
+    print(text)
+    if options.docs:
+        put_between_markers(options.docs, MARKERS, text)
+    if options.figure:
+        draw_scaling(record, options.figure)
+    return 0
+
+
+def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
+    """A row per size: `size`, `pairs`, `evaluations`, and of each operation `seconds` and `bytes`.
+
+    Where pixels grow and pairs do not, also `setup_seconds`: those of the same pairs without pixels.
+    """
+    from g3r.bench.scenes import SceneSize
+
+    field, smallest, operations = GROWING[name]
+    base = SceneSize(n_slices=12) if field == "n_pixels" else SceneSize()
+    wanted = [smallest * 2**k for k in range(n_sizes)]
+    return [measured_scene(replace(base, **{field: n}), field, operations) for n in wanted]
+
+
+def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> dict[str, Any]:
+    """One size: work, seconds and memory of each operation."""
+    from g3r.bench.cost import peak_extra_bytes
+    from g3r.bench.scenes import (
+        corner_slices,
+        corners,
+        made_cloud,
+        made_slices,
+        made_volume_planes,
+        pixel_evaluations,
+    )
+    from g3r.gaussians import find_pairs
+    from g3r.gaussians.render import CUTOFF_SIGMA
+
+    cloud = made_cloud(size)
+    volume, slices = made_volume_planes(size), made_slices(size, cloud)
+    planes = volume if operations == (WRITING,) else slices.planes
+    pairs = find_pairs(cloud, planes, CUTOFF_SIGMA)
+    calls = scene_calls(cloud, slices, volume)
+    row: dict[str, Any] = {
+        "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
+        "pairs": len(pairs),
+        "evaluations": round(pixel_evaluations(cloud, planes, pairs, CUTOFF_SIGMA)),
+        "seconds": {name: calls[name][0]() for name in operations},
+        "bytes": {name: peak_extra_bytes(calls[name][1]) for name in operations},
+    }
+    if field in PIXEL_FIELDS:
+        bare = scene_calls(cloud, corner_slices(slices), corners(volume))
+        row["setup_seconds"] = {name: bare[name][0]() for name in operations}
+    return row
+
+
+def scene_calls(
+    cloud: GaussianCloud, slices: Slices, volume: Planes
+) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
+    """Of each operation: what gives its seconds, and a single call of it."""
+    from g3r.bench.cost import least_cpu_seconds
+    from g3r.gaussians import find_pairs, render, solve_peaks
+    from g3r.gaussians.render import CUTOFF_SIGMA
+
+    weight = slices.mask.astype("float32")
+    pairs = find_pairs(cloud, slices.planes, CUTOFF_SIGMA)
+    single: dict[str, Callable[[], object]] = {
+        SEARCH: lambda: find_pairs(cloud, slices.planes, CUTOFF_SIGMA),
+        PEAKS: lambda: solve_peaks(
+            cloud, slices.planes, slices.value, weight, n_iterations=PEAK_ITERATIONS, pairs=pairs
+        ),
+        WRITING: lambda: render(cloud, volume),
+    }
+
+    def timed(call: Callable[[], object]) -> Callable[[], float]:
+        return lambda: least_cpu_seconds(call)
+
+    step = lambda: step_seconds(cloud, slices)  # noqa: E731
+    return {STEP: (step, step), **{name: (timed(call), call) for name, call in single.items()}}
+
+
+def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
+    """CPU seconds of one optimiser step: the least of several in a fit, without its start.
+
+    Forward, backward and update of all that a fit of the slices moves; no distillation, and no search for
+    pairs, which does not happen in every step.
+    """
+    import time
+
+    import numpy as np
+
+    from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
+
+    moments: list[float] = []
+
+    class Watch:
+        every = 1
+
+        def __call__(self, step: int, cloud: object, pose: object) -> None:
+            moments.append(time.process_time())
+
+    settings = SliceStageSettings(n_steps=TIMED_STEPS, peak_iterations=0)
+    ones = np.ones(len(slices))
+    fit_slices(cloud, slices, ones, ones, None, settings, np.random.default_rng(0), observer=Watch())
+    return float(np.diff(moments).min())
+
+
+def _actual(field: str, size: SceneSize, plane_shape: Any, volume_shape: Any) -> int:
+    """Sides are whole numbers, so pixels and voxels are not quite what was asked for."""
+    if field == "n_pixels":
+        return int(plane_shape.prod())
+    if field == "n_voxels":
+        return int(volume_shape[0]) ** 3
+    return int(getattr(size, field))

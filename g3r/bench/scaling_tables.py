@@ -1,0 +1,135 @@
+"""The record of `g3r-bench scaling` as tables and as a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from g3r.bench.exponents import Exponent, fitted_exponent
+from g3r.bench.record import machine_line, markdown_table
+from g3r.bench.scaling import LEAST_EXPONENT, MOST_EXPONENT
+
+COLOURS = {"optimiser step": "#0072b2", "pair search": "#e69f00", "peaks": "#009e73", "volume": "#cc79a7"}
+
+MB = 1e6
+
+
+def scaling_tables(record: Mapping[str, Any]) -> str:
+    """Exponents first, then the figures that they were fitted to, with the machine under them."""
+    parts = [_exponent_table(record)]
+    parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
+    parts.append(
+        "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
+        "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so "
+        "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs "
+        "do not: the judged exponent is that of the seconds less those of the same pairs with a pixel in "
+        "each corner of their planes (set-up). Elsewhere it is that of all seconds. "
+        f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
+        f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
+    )
+    return "\n\n".join(parts)
+
+
+def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Exponent | None:
+    """Of the largest decade, without the set-up of pairs where that was measured; None if nothing is left."""
+    cost = [row["seconds"][operation] - row.get("setup_seconds", {}).get(operation, 0.0) for row in rows]
+    if min(cost[-2:]) <= 0:
+        return None
+    size = [row["size"] for row in rows]
+    usable = [(n, c) for n, c in zip(size, cost, strict=True) if c > 0]
+    return fitted_exponent([n for n, _ in usable], [c for _, c in usable], largest_decade=True)
+
+
+def exponents(rows: list[dict[str, Any]], operation: str, kind: str) -> tuple[Exponent, Exponent] | None:
+    """Of the largest decade and of all sizes; None where nothing was measured.
+
+    Args:
+        rows: of one growing size.
+        operation: see `g3r.bench.scaling`.
+        kind: "seconds" or "bytes".
+    """
+    cost = [row[kind][operation] for row in rows]
+    if None in cost:
+        return None
+    size = [row["size"] for row in rows]
+    return fitted_exponent(size, cost, largest_decade=True), fitted_exponent(size, cost)
+
+
+def _exponent_table(record: Mapping[str, Any]) -> str:
+    lines = []
+    for name, rows in record["growing"].items():
+        work = [
+            fitted_exponent([r["size"] for r in rows], [r[key] for r in rows], True).value for key in WORK
+        ]
+        for operation in rows[0]["seconds"]:
+            time, memory = (exponents(rows, operation, kind) for kind in ("seconds", "bytes"))
+            assert time is not None
+            judged = judged_exponent(rows, operation)
+            outside = judged is None or not LEAST_EXPONENT <= judged.value <= MOST_EXPONENT
+            cells = [
+                f"{operation}, {name}", f"{work[0]:.2f}", f"{work[1]:.2f}",
+                
+                (_written(judged) if judged else "") + (" (!)" if outside else ""),
+                _written(time[0]), _written(time[1]),
+                _written(memory[0]) if memory else "not measured",
+            ]  # fmt: skip
+            lines.append(cells)
+    head = [
+        "exponent of", "pairs", "pixel evaluations", "judged", "seconds, largest decade",
+        "seconds, all sizes", "memory, largest decade",
+    ]  # fmt: skip
+    return markdown_table(head, lines)
+
+
+WORK = ("pairs", "evaluations")
+
+
+def _written(exponent: Exponent) -> str:
+    return f"{exponent.value:.2f} ± {exponent.spread:.2f}"
+
+
+def _growth_table(name: str, rows: list[dict[str, Any]]) -> str:
+    operations = list(rows[0]["seconds"])
+    head = [name, "pairs", "pixel evaluations"]
+    units = ("ms", "MB", "set-up ms") if "setup_seconds" in rows[0] else ("ms", "MB")
+    head += [f"{operation}, {unit}" for operation in operations for unit in units]
+    lines = []
+    for row in rows:
+        cells = [f"{row['size']:,}", f"{row['pairs']:,}", f"{row['evaluations']:,}"]
+        for operation in operations:
+            held = row["bytes"][operation]
+            cells += [f"{1000 * row['seconds'][operation]:.1f}", "" if held is None else f"{held / MB:.1f}"]
+            if "setup_seconds" in row:
+                cells.append(f"{1000 * row['setup_seconds'][operation]:.1f}")
+        lines.append(cells)
+    return markdown_table(head, lines)
+
+
+def draw_scaling(record: Mapping[str, Any], path: Path) -> None:
+    """A panel per growing size: CPU seconds of each operation, and a grey line of slope 1; written as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    growing = record["growing"]
+    figure = Figure(figsize=(3.4 * len(growing) + 0.4, 3.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(growing), squeeze=False, sharey=True)[0]
+    legend: dict[str, Any] = {}
+    for axis, (name, rows) in zip(axes, growing.items(), strict=True):
+        size = [row["size"] for row in rows]
+        for operation in rows[0]["seconds"]:
+            seconds = [row["seconds"][operation] for row in rows]
+            colour = COLOURS[operation]
+            (legend[operation],) = axis.plot(size, seconds, "o-", color=colour, ms=4, lw=1.2)
+            last = [seconds[-1] * n / size[-1] for n in size]
+            (line,) = axis.plot(size, last, "--", color="#b8b8b8", lw=0.8, zorder=0)
+            legend["proportional"] = line
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.set_xlabel(name)
+        axis.grid(color="#e5e5e5", lw=0.6)
+    axes[0].set_ylabel("CPU seconds")
+    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=5, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,94 @@
+"""How good a result is, on a simulated subject: PSNR and SSIM after alignment, error of the poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import Volume, load_volume
+from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.evaluation.case import SimulatedCase
+from g3r.evaluation.compare import compare
+from g3r.evaluation.metrics import score
+from g3r.evaluation.pose_error import PoseTable, read_poses, target_registration_error
+from g3r.gaussians import GaussianCloud, render
+from g3r.geometry import RigidPose
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a volume and its poses are worth.
+
+    Attributes:
+        psnr_db, ssim: of the volume in the truth's mask, after one rigid motion and an affine fit of the
+            intensities, as `g3r-evaluate --align` scores.
+        tre_mm: median over slices of the error of their poses.
+        remaining: the motion of the volume, after the slices' common one, that alignment still found; takes
+            the truth to the volume.
+    """
+
+    psnr_db: float
+    ssim: float
+    tre_mm: float
+    remaining: RigidPose
+
+    def record(self) -> dict[str, float]:
+        """The figures."""
+        return {
+            "psnr_db": round(self.psnr_db, 3), "ssim": round(self.ssim, 4), "tre_mm": round(self.tre_mm, 3)
+        }  # fmt: skip
+
+
+def quality(
+    case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable
+) -> Quality:
+    """Score a volume [I, J, K] and the slices' poses.
+
+    The volume may stand in another orientation than the truth, further than alignment reaches: the common
+    motion of the slices brings it near first.
+    """
+    error = target_registration_error(case.points_mm, case.true, poses)
+    comparison = compare(
+        Volume(data, moved_affine(error.common, affine), case.name), case.truth, case.truth_mask, align=True
+    )
+    assert comparison.alignment is not None
+    scores = comparison.scores
+    return Quality(scores.psnr_db, scores.ssim, error.median_mm, comparison.alignment.volume_from_reference)
+
+
+def quality_of_folder(case: SimulatedCase, folder: Path) -> Quality:
+    """Score what g3r-infer wrote."""
+    volume = load_volume(folder / "volume.nii.gz")
+    return quality(case, volume.data, volume.affine, read_poses(folder / "slices.tsv"))
+
+
+def cloud_psnr_db(
+    case: SimulatedCase, cloud: GaussianCloud, poses: PoseTable, remaining: RigidPose, cutoff_sigma: float
+) -> float:
+    """PSNR of a cloud in the midst of a fit, read on the truth's own grid.
+
+    Poses drift together with the volume during a fit, so the slices' common motion is that of the moment;
+    what alignment found at the end is added.
+
+    Args:
+        case: with the truth.
+        cloud: Gaussians in the frame of the poses.
+        poses: of the same moment.
+        remaining: see `Quality`.
+        cutoff_sigma: see `render`.
+    """
+    common = target_registration_error(case.points_mm, case.true, poses).common
+    planes = volume_planes(case.truth.grid).moved(common.inverse() @ remaining)
+    pixels = render(cloud, planes, cutoff_sigma=cutoff_sigma).numpy()
+    volume = volume_from_pixels(pixels, case.truth.grid)
+    return float(score(volume, case.truth.data, case.truth_mask).psnr_db)
+
+
+def moved_affine(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An affine whose world is moved by one pose."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation[0], pose.translation_mm[0]
+    return matrix @ affine

@@ -1,0 +1,144 @@
+"""`g3r-bench trade`: seconds, memory and quality of every preset, and of sweeps around one of them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from g3r.evaluation.case import SimulatedCase
+
+PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+
+MARKERS = "trade"
+
+OUTSIDE_STAGES = "start-up, reading, writing"
+"""What the command does besides the stages that run.json times."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("cases", nargs="*", type=Path, metavar="CASE", help="folders of g3r-simulate")
+    parser.add_argument(
+        "--output", type=Path, default=Path("runs") / "bench" / "trade", help="for trade.json and trade.md"
+    )
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw PSNR against seconds")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each command; medians are shown")
+    parser.add_argument("--presets", nargs="+", choices=PRESET_NAMES, default=PRESET_NAMES, metavar="PRESET")
+    parser.add_argument("--sweeps", action="store_true", help="on the first case: sweeps, and curves of fits")
+    parser.add_argument("--base", choices=PRESET_NAMES, default="balanced", help="preset that sweeps vary")
+    parser.add_argument("--thickness", type=float, metavar="MM", help="of slices (None: simulation.json)")
+    parser.add_argument("--threads", type=int, help="CPU threads (None: all cores)")
+    parser.add_argument(
+        "--redraw", action="store_true", help="tables and figure from --output's trade.json, no measuring"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure, and write what was found; returns the exit code."""
+    from g3r.bench.record import put_between_markers, write_text
+    from g3r.bench.trade_tables import trade_tables
+
+    record = _earlier(options.output / "trade.json") if options.redraw else _measure(options)
+    text = trade_tables(record)
+    write_text(options.output / "trade.md", text)
+    print(text)
+    if options.docs:
+        put_between_markers(options.docs, MARKERS, text)
+    if options.figure:
+        from g3r.bench.trade_figure import draw_trade
+
+        draw_trade(record, options.figure)
+    return 0
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    import json
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; measure first, without --redraw")
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def _measure(options: argparse.Namespace) -> dict[str, Any]:
+    from g3r.bench.command_run import infer_arguments, run_infer
+    from g3r.bench.record import available_cores, machine, use_threads, write_json
+    from g3r.evaluation.case import load_case
+
+    if not options.cases:
+        raise InputError("no case given; expected folders written by g3r-simulate")
+    if options.repeats < 1:
+        raise InputError(f"--repeats {options.repeats}; expected at least 1")
+    cases = [load_case(folder, options.thickness) for folder in options.cases]
+    for case in cases:
+        _ = case.truth_mask  # before any work
+    threads = options.threads or available_cores()
+    record: dict[str, Any] = {
+        "machine": machine(threads), "repeats": options.repeats, "base": options.base, "cases": {},
+    }  # fmt: skip
+    path = options.output / "trade.json"
+    with tempfile.TemporaryDirectory(prefix="g3r-bench-") as scratch:
+        output = Path(scratch) / "result"
+        more = [] if options.threads is None else ["--threads", str(threads)]
+        _say("once without measuring, so that kernels are compiled and files cached")
+        run_infer([*infer_arguments(cases[0], "draft", output), *more], output)
+        for case in cases:
+            rows: dict[str, Any] = {}
+            record["cases"][case.name] = {"n_stacks": len(case.stacks), "presets": rows}
+            for preset in options.presets:
+                _say(f"{case.name}: {preset}")
+                arguments = [*infer_arguments(case, preset, output), *more]
+                rows[preset] = measured_command(case, arguments, output, options.repeats)
+                write_json(path, record)
+    if options.sweeps:
+        use_threads(threads)
+        _measure_fits(cases[0], options, record)
+        write_json(path, record)
+    return record
+
+
+def measured_command(case: SimulatedCase, arguments: list[str], output: Path, repeats: int) -> dict[str, Any]:
+    """Medians over runs of one command, and the quality of what the last of them wrote."""
+    from statistics import median
+
+    from g3r.bench.command_run import run_infer
+    from g3r.bench.scores import quality_of_folder
+
+    runs = [run_infer(arguments, output) for _ in range(repeats)]
+    names = list(runs[-1].record["seconds"])
+    wall, cpu = median(run.seconds for run in runs), median(run.cpu_seconds for run in runs)
+    stages = {name: round(median(run.record["seconds"][name] for run in runs), 3) for name in names}
+    stages_cpu = {name: round(median(run.record["cpu_seconds"][name] for run in runs), 3) for name in names}
+    stages[OUTSIDE_STAGES] = round(wall - sum(stages.values()), 3)
+    stages_cpu[OUTSIDE_STAGES] = round(cpu - sum(stages_cpu.values()), 3)
+    return {
+        "seconds": round(wall, 3), "cpu_seconds": round(cpu, 3),
+        "all_seconds": [round(run.seconds, 3) for run in runs],
+        "peak_bytes": max(run.peak_bytes for run in runs),
+        "stages": stages, "stages_cpu": stages_cpu, "n_gaussians": runs[-1].record["n_gaussians"],
+        **quality_of_folder(case, output).record(),
+    }  # fmt: skip
+
+
+def _measure_fits(case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any]) -> None:
+    """Curves during the fit of each preset, and the sweeps, into the record of a case."""
+    from g3r.bench.fits import measured_fit, measured_sweeps
+    from g3r.presets import PRESETS
+
+    found = record["cases"][case.name]
+    found["fits"] = {}
+    for preset in options.presets:
+        _say(f"{case.name}: quality during the fit, {preset}")
+        found["fits"][preset] = measured_fit(case, PRESETS[preset])
+    _say(f"{case.name}: sweeps around {options.base}")
+    found["sweeps"] = measured_sweeps(case, PRESETS[options.base])
+
+
+def _say(line: str) -> None:
+    print(f"g3r-bench trade: {line}", file=sys.stderr, flush=True)

@@ -1,0 +1,57 @@
+"""`g3r-bench`: measure speed against accuracy, the kernels, and how time grows with size."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from g3r.errors import G3RError
+
+COMMANDS = {
+    "kernels": "pair and pixel rates of the renderer, against what the machine can do",
+    "scaling": "time and memory as Gaussians, slices, pixels and voxels grow",
+    "trade": "seconds and quality of every preset, and of sweeps around one",
+}
+"""Each has a module of its name in g3r.bench, with `add_arguments(parser)` and `run(options)`."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The first word of the command; the rest belongs to the one that it names."""
+    lines = "\n".join(f"  {name:<9} {text}" for name, text in COMMANDS.items())
+    parser = argparse.ArgumentParser(
+        prog="g3r-bench",
+        description="Measure g3r on this machine.",
+        epilog=f"commands (each has its own --help):\n{lines}\n\nexit codes: 0 done, 2 usage, 3 bad input",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help=", ".join(COMMANDS))
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    name = build_parser().parse_args(words[:1]).command
+    module = import_module(f"g3r.bench.{name}")
+    parser = argparse.ArgumentParser(
+        prog=f"g3r-bench {name}", description=f"Measure {COMMANDS[name]}.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )  # fmt: skip
+    module.add_arguments(parser)
+    options = parser.parse_args(words[1:])
+    logging.basicConfig(level=logging.WARNING, format=f"g3r-bench {name}: %(message)s", stream=sys.stderr)
+    try:
+        return int(module.run(options))
+    except G3RError as error:
+        print(f"g3r-bench {name}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(f"g3r-bench {name}: interrupted; what was measured until now is in --output", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
