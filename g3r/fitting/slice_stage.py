@@ -17,6 +17,7 @@ from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, solve_peaks
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.pace import Deadline, paced
 
 MOST_PRIOR_STRENGTH = 1.0
