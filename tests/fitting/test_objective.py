@@ -10,7 +10,6 @@ from test_stages import BALL, GRID, make_slices, seeded, true_cloud
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.errors import NumericalError
-from g3r.fitting import objective as objective_module
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import VolumeTarget
@@ -18,6 +17,8 @@ from g3r.fitting.shading import StackShading
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, render
+from g3r.gaussians.pairs import PairFinder
+from g3r.gaussians.render import CUTOFF_SIGMA
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4
@@ -31,10 +32,12 @@ def volume() -> np.ndarray:
 class Scene:
     """A loss with every term, at a point where nothing is zero.
 
-    The cut-off is raised to 6 sigma, so that the dense reference sees the same image.
+    At a cut-off of 6 sigma the dense reference sees the same image.
     """
 
-    def __init__(self, volume: np.ndarray, seed: int, amplitude: str = "exact") -> None:
+    def __init__(
+        self, volume: np.ndarray, seed: int, amplitude: str = "exact", cutoff_sigma: float = CUTOFF_SIGMA
+    ) -> None:
         rng = np.random.default_rng(seed)
         self.slices = make_slices()
         n, self.amplitude = len(self.slices), amplitude
@@ -53,8 +56,12 @@ class Scene:
         self.chosen = np.array([1, 5, 9, 14])
         exact = amplitude == "exact"
         ones = np.ones(n)
-        self.term = SliceTerm(self.slices, ones, self.trust, self.parameters, self.shading, exact)
-        self.distilled = ImageTerm(self.prior.planes, self.prior.value, self.prior.weight, cloud.origin_mm)
+        self.term = SliceTerm(
+            self.slices, ones, self.trust, self.parameters, self.shading, exact, cutoff_sigma
+        )
+        self.distilled = ImageTerm(
+            self.prior.planes, self.prior.value, self.prior.weight, cloud.origin_mm, cutoff_sigma=cutoff_sigma
+        )
         self.distilled.choose(self.chosen)
         self.objective = CloudObjective(self.parameters, [self.term, self.distilled], SETTINGS.scale_weight)
         self.seed = self.objective.seed_log_scale
@@ -107,15 +114,9 @@ class Scene:
         return loss.item(), {name: leaf.grad.numpy() for name, leaf in leaves.items()}
 
 
-@pytest.fixture
-def far_cutoff(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(objective_module, "CUTOFF_SIGMA", 6.0)
-
-
-@pytest.mark.usefixtures("far_cutoff")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume: np.ndarray, seed: int):
-    scene = Scene(volume, seed)
+    scene = Scene(volume, seed, cutoff_sigma=6.0)
     expected, expected_gradient = scene.oracle()
     assert scene.evaluate() == pytest.approx(expected, rel=1e-5)
     for name, gradient in expected_gradient.items():
@@ -124,9 +125,8 @@ def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume:
         assert np.linalg.norm(found - gradient) < 2e-3 * np.linalg.norm(gradient), name
 
 
-@pytest.mark.usefixtures("far_cutoff")
 def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
-    scene = Scene(volume, 2)
+    scene = Scene(volume, 2, cutoff_sigma=6.0)
     scene.evaluate()
     image = scene.image
     gradient = {name: g.astype(float) for name, g in scene.parameters.gradient.items()}
@@ -177,8 +177,8 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
     for _ in range(12):
         loss = scene.evaluate()
         for term in scene.objective.terms:
-            shapes, cutoff = scene.objective.shapes, objective_module.CUTOFF_SIGMA
-            finder = objective_module.PairFinder(len(shapes))
+            shapes, cutoff = scene.objective.shapes, CUTOFF_SIGMA
+            finder = PairFinder(len(shapes))
             needed = finder.find(shapes, term.planes, term.rotation, term.center_mm, cutoff)
             for k in range(len(term.planes)):
                 held = term.pairs.gaussian[term.pairs.start[k] : term.pairs.start[k + 1]]
