@@ -1,0 +1,1 @@
+"""What measures: the trade of speed against accuracy, scaling, and the kernels."""
