@@ -25,7 +25,7 @@ def options(*arguments: str) -> argparse.Namespace:
 
 def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = tmp_path / "speed.md"
-    document.write_text("before\n<!-- kernels:begin -->\nold\n<!-- kernels:end -->\nafter\n")
+    document.write_text("before\n<!-- kernels:begin -->\nstale\n<!-- kernels:end -->\nafter\n")
     arguments = [
         "--sizes",
         "60",
@@ -48,7 +48,7 @@ def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     text = document.read_text()
     assert text.startswith("before\n")
     assert text.endswith("after\n")
-    assert "old" not in text
+    assert "stale" not in text
     assert "| numba | 60 |" in text
     assert "| numba | 60 |" in capsys.readouterr().out
 
