@@ -173,9 +173,19 @@ def load(image, pixels, offset, n_x, n_y):
     pitch = n_y + N_LANES
     for x in range(n_x):
         begin, row = offset + x * n_y, x * pitch
-        image[row : row + n_y] = pixels[begin : begin + n_y]
+        for y in range(n_y):  # slices would compile numba's message about shapes, for seconds
+            image[row + y] = pixels[begin + y]
         image[row + n_y : row + pitch] = f32(0.0)
     image[n_x * pitch : n_x * pitch + N_LANES] = f32(0.0)
+
+
+@numba.njit(forceinline=True)
+def unload(image, pixels, offset, n_x, n_y):
+    """Copy the pixels of a plane from padded rows."""
+    for x in range(n_x):
+        begin, row = offset + x * n_y, x * (n_y + N_LANES)
+        for y in range(n_y):
+            pixels[begin + y] = image[row + y]
 
 
 @numba.njit(parallel=True, cache=True)
@@ -198,9 +208,7 @@ def forward(
                 gain[k], cut, exact, mine,
             )  # fmt: skip
             sweep_plane(mine, n, peak, cut, n_x, n_y, image)
-            for x in range(n_x):
-                begin, row = offset[k] + x * n_y, x * (n_y + N_LANES)
-                out[begin : begin + n_y] = image[row : row + n_y]
+            unload(image, out, offset[k], n_x, n_y)
 
 
 @numba.njit(parallel=True, cache=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from g3r.gaussians.kernels import clear, load, set_up_plane, strip_columns, strip_rows, sweep_plane
+from g3r.gaussians.kernels import clear, load, set_up_plane, strip_columns, strip_rows, sweep_plane, unload
 from g3r.gaussians.lanes import N_LANES, strip_sum
 
 f32 = np.float32
@@ -35,9 +35,7 @@ def apply(first, last, peak, shape, offset, start, cut, records, count, images, 
             n_x, n_y = shape[k, 0], shape[k, 1]
             clear(image, n_x, n_y)
             sweep_plane(records[start[k] - start[first] :], count[k], peak, cut, n_x, n_y, image)
-            for x in range(n_x):
-                begin, row = offset[k] + x * n_y, x * (n_y + N_LANES)
-                out[begin : begin + n_y] = image[row : row + n_y]
+            unload(image, out, offset[k], n_x, n_y)
 
 
 @numba.njit(parallel=True, cache=True)

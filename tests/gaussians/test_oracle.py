@@ -285,6 +285,21 @@ def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(
     assert all(torch.isfinite(leaf.grad).all() for leaf in (*leaves, twist))
 
 
+def test_large_and_slanted_ellipses_of_several_strips_agree_with_the_reference():
+    """Planes many times as wide as the sixteen pixels of a strip, cut by every border."""
+    base = make_cloud(24, 12, spread_mm=15)
+    rng = np.random.default_rng(24)
+    cloud = GaussianCloud(
+        base.mean_mm, torch.tensor(np.log(rng.uniform([0.3, 1, 4], [1, 4, 15], (12, 3)))),
+        *base.parameters[2:], base.origin_mm,
+    )  # fmt: skip
+    for psf in (0.0, 1.0):
+        planes = make_planes(24, n=4, shape=(70, 61), psf=psf)
+        expected = render(cloud, planes, backend="reference").numpy()
+        found = render(single(cloud), planes, cutoff_sigma=6.0).numpy()
+        assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
 # -- cut-off, pair lists, threads ------------------------------------------------------------------
 
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, render, solve_peaks
+from g3r.gaussians import GaussianCloud, peaks, render, solve_peaks
 from g3r.gaussians.peaks import PeakSystem
 
 
@@ -53,6 +53,21 @@ def test_the_system_is_the_renderer():
     expected = render(cloud, planes, log_gain=torch.tensor(np.log(gain)))
     found = PeakSystem.of(cloud, planes, gain).forward(cloud.peak.numpy())
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_records_that_may_not_be_kept_are_made_again(monkeypatch: pytest.MonkeyPatch):
+    cloud, planes = scene()
+    whole = PeakSystem.of(cloud, planes)
+    monkeypatch.setattr(peaks, "RECORD_BYTES_AT_MOST", 5000)
+    parted = PeakSystem.of(cloud, planes)
+    assert len(whole.parts) == 1
+    assert len(parted.parts) > 3
+    assert parted.parts[0][0] == 0
+    assert parted.parts[-1][1] == len(planes)
+    peak, pixels = cloud.peak.numpy(), np.ones(planes.n_pixels, np.float32)
+    for _ in range(2):
+        np.testing.assert_array_equal(parted.forward(peak), whole.forward(peak))
+        np.testing.assert_allclose(parted.adjoint(pixels), whole.adjoint(pixels), rtol=1e-12)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])

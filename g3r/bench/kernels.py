@@ -1,0 +1,111 @@
+"""`g3r-bench kernels`: rates of the renderer against what the machine can do, and the rest of a step."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+SIZES = (1000, 4000, 16000, 64000)
+REFERENCE_GAUSSIANS, REFERENCE_SLICES = 200, 2
+"""The dense reference compares every Gaussian with every pixel: it is timed on this much alone."""
+
+EXPLANATION = (
+    "A pixel counts once for each Gaussian whose ellipse holds it; the set-up of pairs and, backward, the "
+    "chain to all parameters are included. FMA/px and copied B/px: how many fused multiply-adds, and how "
+    "many bytes of memory read and written, the same core manages in the time of one such pixel. step / "
+    "kernels: a whole optimiser step over the two calls; not kernel: its share outside the one kernel that "
+    "it calls."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `g3r-bench kernels`."""
+    parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), help="numbers of Gaussians")
+    parser.add_argument("--repeats", type=int, default=7, help="the least time of so many counts")
+    parser.add_argument("--output", type=Path, default=Path("runs/bench/kernels"), help="for JSON and table")
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure, print the table, write the record."""
+    from g3r.bench.record import put_between_markers
+
+    record = run_kernels(options)
+    text = table(record)
+    print(text)
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "kernels.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    (options.output / "kernels.md").write_text(text, encoding="utf-8")
+    if options.docs:
+        put_between_markers(options.docs, "kernels", text)
+    return 0
+
+
+def run_kernels(options: argparse.Namespace) -> dict[str, Any]:
+    """All measurements, by one thread: CPU seconds, the least of several.
+
+    The copy and fused-multiply-add rates are measured before each size again, so that a machine that others
+    use too is compared with itself.
+    """
+    import numba
+
+    from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
+    from g3r.bench.kernel_timing import numba_rates, reference_rates, step_seconds
+    from g3r.bench.record import machine
+
+    before, rows = numba.get_num_threads(), []
+    numba.set_num_threads(1)
+    try:
+        for size in options.sizes:
+            limits = {"copy_bytes_per_second": copy_bytes_per_second(options.repeats),
+                      "fused_per_second": fused_per_second(options.repeats)}  # fmt: skip
+            rates = numba_rates(size, options.repeats)
+            rows.append(_row("numba", size, limits, rates) | step_seconds(size, options.repeats))
+        rates = reference_rates(REFERENCE_GAUSSIANS, REFERENCE_SLICES, options.repeats)
+        rows.append(_row("reference", REFERENCE_GAUSSIANS, limits, rates))
+    finally:
+        numba.set_num_threads(before)
+    return {"machine": machine(), "date": time.strftime("%Y-%m-%d"), "repeats": options.repeats, "rows": rows}
+
+
+def _row(backend: str, n_gaussians: int, limits: dict[str, float], rates: dict[str, float]) -> dict[str, Any]:
+    """Rates, and what the machine could have done in their time."""
+    row: dict[str, Any] = {"backend": backend, "n_gaussians": n_gaussians, **limits, **rates}
+    for name in ("forward", "backward"):
+        seconds, n_pixels = rates[f"{name}_seconds"], rates["n_pixels"]
+        row[f"{name}_pixels_per_second"] = n_pixels / seconds
+        row[f"{name}_pairs_per_second"] = rates["n_pairs"] / seconds
+        row[f"{name}_fused_per_pixel"] = limits["fused_per_second"] * seconds / n_pixels
+        row[f"{name}_copied_bytes_per_pixel"] = limits["copy_bytes_per_second"] * seconds / n_pixels
+    return row
+
+
+def table(record: dict[str, Any]) -> str:
+    """The record as Markdown."""
+    where = record["machine"]
+    head = ["backend", "Gaussians", "pairs", "pixels per pair", "forward Mpx/s", "FMA/px", "copied B/px",
+            "backward Mpx/s", "FMA/px", "copied B/px", "step / kernels", "not kernel"]  # fmt: skip
+    lines = [
+        f"{where['processor']}, one core; g3r {where['g3r']}"
+        f"{' at ' + where['commit'] if where['commit'] else ''}, numba {where['numba']}; {record['date']}.",
+        "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head),
+    ]  # fmt: skip
+    for row in record["rows"]:
+        pixels_per_pair = row["n_pixels"] / row["n_pairs"]
+        cells = [row["backend"], f"{row['n_gaussians']:,}", f"{row['n_pairs']:,}", f"{pixels_per_pair:.0f}"]
+        for name in ("forward", "backward"):
+            cells += [
+                f"{row[f'{name}_pixels_per_second'] / 1e6:.0f}",
+                f"{row[f'{name}_fused_per_pixel']:.0f}",
+                f"{row[f'{name}_copied_bytes_per_pixel']:.0f}",
+            ]
+        if "step_seconds" in row:
+            cells += [f"{row['step_over_kernels']:.2f}", f"{100 * row['not_kernel_share']:.0f} %"]
+        else:
+            cells += ["", ""]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", EXPLANATION]
+    return "\n".join(lines) + "\n"
