@@ -10,8 +10,6 @@ import pytest
 from g3r.bench import kernels
 from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
 from g3r.bench.kernel_scene import count_pixels, head_scene, record_space
-from g3r.bench.record import machine, put_between_markers
-from g3r.errors import InputError
 from g3r.gaussians import find_pairs
 from g3r.gaussians.pairs import CloudArrays
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
@@ -85,9 +83,3 @@ def test_a_scene_fills_the_head() -> None:
     assert len(np.unique(scene.slices.stack_id)) == 3
     pairs = find_pairs(scene.cloud, scene.slices.planes, CUTOFF_SIGMA)
     assert len(pairs) > 10 * 500
-
-
-def test_a_document_without_markers_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="kernels:begin"):
-        put_between_markers(tmp_path / "none.md", "kernels", "text")
-    assert machine()["cores"] >= 1
