@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.motion import MotionSettings
@@ -17,7 +18,8 @@ class ReconstructionSettings:
         resolution_mm: voxel size of the volume.
         gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
             (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        flat_gradient: gradient (normalised intensity per mm) below which Gaussians stand twice as far apart.
+        gaussian_bound: largest local root mean square residual against the prior volume (normalised intensity);
+            Gaussians are added until it is kept, down to the spacing above. 0 takes the whole lattice.
         motion: registration.
         prior_stage: stage 1.
         slice_stage: stage 2.
@@ -30,7 +32,8 @@ class ReconstructionSettings:
 
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.14
-    flat_gradient: float = 0.0
+    gaussian_bound: float = 0.0
+    adaptive: AdaptiveSettings = field(default_factory=AdaptiveSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
