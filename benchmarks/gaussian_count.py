@@ -36,10 +36,10 @@ ATLAS_SUBJECT = "sta27"
 FINEST_MM = {"ball": 4.0}
 """Closest spacing of the adaptive clouds; 2.5 voxels for all others."""
 
-BOUNDS = {"ball": (0.2, 0.14, 0.1)}
-USUAL_BOUNDS = (0.16, 0.12, 0.09, 0.07)
-LATTICE_MM = {"ball": (8.0, 6.0, 5.0, 4.0)}
-USUAL_LATTICE = (5.5, 4.5, 3.6, 2.9, 2.4)
+BOUNDS = {"ball": (0.2, 0.1)}
+USUAL_BOUNDS = (0.11, 0.085, 0.065)
+LATTICE_MM = {"ball": (8.0, 6.0, 4.5)}
+USUAL_LATTICE = (4.5, 3.6, 2.9, 2.4)
 
 
 def ball(voxel_mm: float) -> Subject:
@@ -177,7 +177,9 @@ def draw(record: dict[str, Any], path: Path) -> None:
     for axis, (name, case) in zip(axes, cases.items(), strict=True):
         for kind, colour, mark in (("adaptive", "#0072b2", "o"), ("uniform", "#d55e00", "s")):
             rows = sorted(case[kind], key=lambda row: row["n"])
-            axis.plot([r["n"] for r in rows], [r["psnr_db"] for r in rows], marker=mark, color=colour, label=kind)
+            axis.plot(
+                [r["n"] for r in rows], [r["psnr_db"] for r in rows], marker=mark, color=colour, label=kind
+            )
         axis.set_xscale("log")
         axis.set_title(name, fontsize=10)
         axis.set_xlabel("Gaussians")
@@ -229,7 +231,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--subjects", nargs="*", default=[], metavar="NAME", help="(none: all)")
-    parser.add_argument("--voxel", type=float, default=0.8, help="of phantoms, ball and atlas, mm")
+    parser.add_argument("--voxel", type=float, default=1.0, help="of phantoms, ball and atlas, mm")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "bench", help="for the JSON")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw the curves")

@@ -45,7 +45,7 @@ from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.pose_checkpoint import PoseCheckpoint
 from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
-from g3r.run_record import Clock, left_out_notes, run_record
+from g3r.run_record import Clock, left_out_notes, left_out_terms, run_record
 from g3r.trust import estimate_uncertainty
 
 logger = logging.getLogger(__name__)
@@ -222,7 +222,8 @@ class GaussianReconstructor:
             settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
             warnings,
         )  # fmt: skip
-        record["gaussians"] = counts
+        record["gaussians"] = counts | {"n_final": len(fit.cloud)}
+        record["left_out"] = left_out_terms(slices, settings, counts)
         record["uncertainty"] = uncertainty.record
         record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
         for warning in warnings:

@@ -56,10 +56,10 @@ class AdaptiveSettings:
     start: float = 3.0
     growth: float = 1.7
     n_rounds: int = 6
-    filter_share: float = 0.15
+    filter_share: float = 0.2
     smallest_share: float = 0.25
     spare: float = 0.1
-    round_steps: int = 30
+    round_steps: int = 45
     last_steps: int | None = None
     peak_iterations: int = 8
 
@@ -170,9 +170,7 @@ def fit_adaptive(
     cloud = solve_peaks_on(cloud, target, settings.peak_iterations)
     residual = left(cloud)
     done.rms = float(np.sqrt((residual[mask] ** 2).mean()))
-    done.share_over_bound = float(
-        (local_rms(residual, mask, grid, window_mm)[mask] > settings.bound).mean()
-    )
+    done.share_over_bound = float((local_rms(residual, mask, grid, window_mm)[mask] > settings.bound).mean())
     progress(at_most, at_most)
     return cloud, done
 
