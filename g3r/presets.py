@@ -10,6 +10,10 @@ from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.motion import MotionSettings
 
 
+ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
+"""About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
+
+
 @dataclass(frozen=True)
 class ReconstructionSettings:
     """Everything that decides a result, besides the data and the prior's weights.
@@ -18,8 +22,8 @@ class ReconstructionSettings:
         resolution_mm: voxel size of the volume.
         gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
             (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        gaussian_bound: largest local root mean square residual against the prior volume (normalised intensity);
-            Gaussians are added until it is kept, down to the spacing above. 0 takes the whole lattice.
+        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the whole
+            lattice of that spacing.
         motion: registration.
         prior_stage: stage 1.
         slice_stage: stage 2.
@@ -32,8 +36,7 @@ class ReconstructionSettings:
 
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.14
-    gaussian_bound: float = 0.0
-    adaptive: AdaptiveSettings = field(default_factory=AdaptiveSettings)
+    adaptive: AdaptiveSettings | None = ADAPTIVE
     motion: MotionSettings = field(default_factory=MotionSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
@@ -50,6 +53,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
+        adaptive=None,
         prior_views=1,
         motion=replace(_BALANCED.motion, n_rounds=6, finest_voxel_mm=1.6, pixels_at_most=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
@@ -58,6 +62,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "fast": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.5,
+        adaptive=None,
         prior_views=1,
         motion=replace(_BALANCED.motion, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
@@ -67,6 +72,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         gaussian_spacing_pixels=1.96,
+        adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
         prior_views=8,
         motion=replace(_BALANCED.motion, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),

@@ -292,10 +292,9 @@ class GaussianReconstructor:
         """Stage 1: the cloud, its losses, and how its number of Gaussians came about."""
         assert isinstance(self.settings, ReconstructionSettings)
         settings, report = self.settings, self._report("fit to prior")
-        if settings.gaussian_bound > 0:
-            adaptive = replace(settings.adaptive, bound=settings.gaussian_bound)
+        if settings.adaptive is not None:
             cloud, found = fit_adaptive(
-                prior, mask, grid, spacing_mm, adaptive, settings.prior_stage, rng, report
+                prior, mask, grid, spacing_mm, settings.adaptive, settings.prior_stage, rng, report
             )
             counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
             return cloud, found.loss, counts

@@ -167,8 +167,8 @@ def with_twins_merged(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
     a = (peak[first], mean[first], covariance[first])
     b = (peak[second], mean[second], covariance[second])
     c = (-height, middle, spread)
-    change = sum(_product(x, y) for x in (a, b, c) for y in (a, b, c))
-    ok = change < tolerance
+    change = np.sum([_product(x, y) for x in (a, b, c) for y in (a, b, c)], axis=0)
+    ok = np.asarray(change < tolerance)
     if not ok.any():
         return cloud
     keep = np.ones(len(cloud), bool)

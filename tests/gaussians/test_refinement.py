@@ -89,7 +89,9 @@ def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolera
     rng = np.random.default_rng(seed)
     one = cloud_of(rng.uniform(-3, 3, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1))
     near = cloud_of(
-        one.mean_mm.numpy() + rng.uniform(-1, 1, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1),
+        one.mean_mm.numpy() + rng.uniform(-1, 1, (1, 3)),
+        rng.uniform(1.0, 2.2, (1, 3)),
+        rng.uniform(0.02, 0.5, 1),
         Rotation.random(1, rng=rng),
     )  # fmt: skip
     pair = joined(one, near)
