@@ -9,7 +9,6 @@ from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.motion import MotionSettings
 
-
 ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
 """About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
 
@@ -22,8 +21,8 @@ class ReconstructionSettings:
         resolution_mm: voxel size of the volume.
         gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
             (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the whole
-            lattice of that spacing.
+        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the
+            whole lattice of that spacing.
         motion: registration.
         prior_stage: stage 1.
         slice_stage: stage 2.

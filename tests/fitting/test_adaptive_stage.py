@@ -37,7 +37,7 @@ def test_tighter_bounds_need_more_gaussians_and_leave_less():
 
 
 def test_gaussians_are_added_where_the_structure_is():
-    """Of two clouds, the one of the volume with structure in its upper half has more there than the flat one."""
+    """A volume with structure in its upper half has more Gaussians there than a flat one."""
     counts = []
     for volume in (SHEETS, np.full(GRID.shape, 0.6, np.float32)):
         cloud, _ = fitted(0.06, volume)
