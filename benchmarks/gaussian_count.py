@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -204,7 +205,12 @@ def run(options: argparse.Namespace) -> int:
     if unknown:
         raise InputError(f"--subjects {', '.join(unknown)}; expected some of: {'; '.join(SUBJECTS)}")
     record: dict[str, Any] = {"machine": machine(), "voxel_mm": options.voxel, "subjects": {}, "skipped": {}}
+    path = options.output / "gaussian-count.json"
+    if options.reuse and path.is_file():
+        record["subjects"] = _finished(path, options.voxel)
     for name in options.subjects or SUBJECTS:
+        if name in record["subjects"]:
+            continue
         try:
             subject = SUBJECTS[name](options.voxel)
         except InputError as error:
@@ -214,7 +220,7 @@ def run(options: argparse.Namespace) -> int:
             print(f"gaussian_count: {name}: {error}", file=sys.stderr)
             continue
         record["subjects"][name] = curves(subject, name, options.voxel)
-        write_json(options.output / "gaussian-count.json", record)
+        write_json(path, record)
     text = table(record)
     print(text)
     if options.docs:
@@ -222,6 +228,18 @@ def run(options: argparse.Namespace) -> int:
     if options.figure:
         draw(record, options.figure)
     return 0
+
+
+def _finished(path: Path, voxel_mm: float) -> dict[str, Any]:
+    """Subjects that an earlier run has measured.
+
+    Raises:
+        InputError: it measured them on other voxels.
+    """
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if found["voxel_mm"] != voxel_mm:
+        raise InputError(f"{path}: voxels of {found['voxel_mm']} mm; expected {voxel_mm}; leave --reuse out")
+    return {name: found["subjects"][name] for name in SUBJECTS if name in found["subjects"]}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -233,6 +251,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--subjects", nargs="*", default=[], metavar="NAME", help="(none: all)")
     parser.add_argument("--voxel", type=float, default=1.0, help="of phantoms, ball and atlas, mm")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "bench", help="for the JSON")
+    parser.add_argument("--reuse", action="store_true", help="take subjects that --output holds already")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw the curves")
     return run_command("gaussian_count", run, parser.parse_args(argv))
