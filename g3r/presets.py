@@ -6,9 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.motion import MotionSettings
+
+ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
+"""About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,8 @@ class ReconstructionSettings:
         resolution_mm: voxel size of the volume.
         gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
             (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        flat_gradient: gradient (normalised intensity per mm) below which Gaussians stand twice as far apart.
+        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the
+            whole lattice of that spacing.
         motion: registration.
         prior_stage: stage 1.
         slice_stage: stage 2.
@@ -32,7 +37,7 @@ class ReconstructionSettings:
 
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.14
-    flat_gradient: float = 0.0
+    adaptive: AdaptiveSettings | None = ADAPTIVE
     motion: MotionSettings = field(default_factory=MotionSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
@@ -49,6 +54,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
+        adaptive=None,
         prior_views=1,
         motion=replace(
             _BALANCED.motion,
@@ -65,6 +71,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "fast": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.5,
+        adaptive=None,
         prior_views=1,
         motion=replace(_BALANCED.motion, n_candidates=2500, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
@@ -74,6 +81,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         gaussian_spacing_pixels=1.96,
+        adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
         prior_views=8,
         motion=replace(_BALANCED.motion, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +23,12 @@ from g3r.acquisition.planes import (
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, NumericalError
+from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_share import estimate_prior_share
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import fit_slices
-from g3r.gaussians import render
+from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
 from g3r.motion import MotionEstimate, estimate_motion
@@ -45,7 +47,7 @@ from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.pose_checkpoint import PoseCheckpoint
 from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
-from g3r.run_record import Clock, left_out_notes, run_record
+from g3r.run_record import Clock, left_out_notes, left_out_terms, run_record
 from g3r.trust import estimate_uncertainty
 
 logger = logging.getLogger(__name__)
@@ -186,12 +188,8 @@ class GaussianReconstructor:
         slices, prior_mask, prior_grid = start.slices, start.mask, start.grid
         coarse, density = start.coarse, start.density
         with clock("fit to prior"):
-            cloud = seed_cloud(
-                prior, prior_mask, prior_grid, _gaussian_spacing_mm(slices, settings), settings.flat_gradient
-            )
-            target = VolumeTarget.of(prior, prior_mask.astype(np.float32), prior_grid)
-            cloud, prior_history = fit_prior(
-                cloud, target, settings.prior_stage, rng, self._report("fit to prior")
+            cloud, prior_history, counts = self._prior_cloud(
+                prior, prior_mask, prior_grid, _gaussian_spacing_mm(slices, settings), rng
             )
         with clock("fit to slices"):
             distil_to = None
@@ -230,6 +228,8 @@ class GaussianReconstructor:
             settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
             warnings,
         )  # fmt: skip
+        record["gaussians"] = counts | {"n_final": len(fit.cloud)}
+        record["left_out"] = left_out_terms(slices, settings, counts)
         record["uncertainty"] = uncertainty.record
         record["loss"] = {"fit to prior": prior_history, "fit to slices": fit.history}
         for warning in warnings:
@@ -293,6 +293,29 @@ class GaussianReconstructor:
         assert isinstance(self.settings, ReconstructionSettings)
         views = self.settings.prior_views
         return estimate_prior(self.network, start.coarse, start.density, start.sharp, n_views=views)
+
+    def _prior_cloud(
+        self,
+        prior: NDArray[np.float32],
+        mask: NDArray[np.bool_],
+        grid: VolumeGrid,
+        spacing_mm: float,
+        rng: np.random.Generator,
+    ) -> tuple[GaussianCloud, list[float], dict[str, Any]]:
+        """Stage 1: the cloud, its losses, and how its number of Gaussians came about."""
+        assert isinstance(self.settings, ReconstructionSettings)
+        settings, report = self.settings, self._report("fit to prior")
+        if settings.adaptive is not None:
+            cloud, found = fit_adaptive(
+                prior, mask, grid, spacing_mm, settings.adaptive, settings.prior_stage, rng, report
+            )
+            counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
+            return cloud, found.loss, counts
+        cloud = seed_cloud(prior, mask, grid, spacing_mm)
+        counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
+        target = VolumeTarget.of(prior, mask.astype(np.float32), grid)
+        cloud, history = fit_prior(cloud, target, settings.prior_stage, rng, report)
+        return cloud, history, counts
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)

@@ -119,3 +119,45 @@ def left_out_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
                 f"{stack.name}: slices {numbers} left out, fewer than {SMALLEST_SLICE_PIXELS} masked pixels"
             )
     return lines
+
+
+def left_out_terms(
+    slices: Slices, settings: ReconstructionSettings, counts: dict[str, Any]
+) -> list[dict[str, str]]:
+    """Which terms of the model are absent, each with the reason: what the data cannot determine.
+
+    Args:
+        slices: that were fitted.
+        settings: as they were used for these slices.
+        counts: how the number of Gaussians came about.
+    """
+    stage, terms = settings.slice_stage, []
+    single = len(np.unique(slices.stack_id)) == 1
+
+    def absent(term: str, reason: str) -> None:
+        terms.append({"term": term, "reason": reason})
+
+    if len(slices) == 1:
+        absent("gain of the slice", "a single slice: its gain cannot be told from the peaks")
+    if single:
+        absent("shading", "a single stack cannot tell it from anatomy")
+    elif not stage.optimise_shading:
+        absent("shading", "switched off in the settings")
+    if not stage.optimise_poses:
+        absent(
+            "poses in the fit",
+            "a single stack without a prior to hold it drifts" if single else "switched off in the settings",
+        )
+    if not settings.use_prior:
+        absent("distance to the prior", "no prior was asked for")
+    elif not settings.distillation:
+        absent("distance to the prior", "distillation is switched off in the settings")
+    bound = counts.get("bound")
+    if bound is not None:
+        absent(
+            "finer Gaussians",
+            f"the prior volume is within {bound:g} (local root mean square) of them for "
+            f"{100 * (1 - counts['share_over_bound']):.1f} % of the head, or they stand "
+            f"{counts['finest_spacing_mm']:.2f} mm apart, as close as pixels can tell",
+        )
+    return terms

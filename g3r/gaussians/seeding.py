@@ -1,4 +1,4 @@
-"""Where the first Gaussians stand: in the foreground only, closer where the image has structure."""
+"""Where the first Gaussians stand: on a lattice in the foreground, flattened across edges."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from g3r.geometry import VolumeGrid
 SCALE_PER_SPACING = 0.6
 """Sigma of a seed over the lattice spacing: neighbours overlap so that a constant comes out flat to 2 %."""
 
-COARSE_FACTOR = 2
-"""Spacing in regions without structure, over the fine one."""
-
 MOST_ANISOTROPY = 1.6
 """Largest ratio of a seed's sigma to that of a round one of equal volume."""
 
@@ -26,12 +23,10 @@ def seed_cloud(
     mask: NDArray[np.bool_],
     grid: VolumeGrid,
     spacing_mm: float,
-    structure_threshold: float = 0.0,
 ) -> GaussianCloud:
     """Gaussians on a body-centred lattice inside the mask, shaped by the local structure of a volume.
 
-    Where the gradient of the volume stays under the threshold, lattice points twice as far apart and twice
-    as wide do. Each Gaussian is flattened across the edge that it stands on (structure tensor), keeping its
+    Each Gaussian is flattened across the edge that it stands on (structure tensor), keeping its
     volume. Peaks are first guesses that reproduce the local mean.
 
     Args:
@@ -39,7 +34,6 @@ def seed_cloud(
         mask: [I, J, K], foreground.
         grid: their grid.
         spacing_mm: edge of the lattice cell per Gaussian (its volume to the power 1/3).
-        structure_threshold: gradient per mm below which the coarse lattice serves; 0 gives a uniform one.
 
     Returns:
         A cloud with its origin in the middle of the grid.
@@ -56,20 +50,10 @@ def seed_cloud(
     strength = gaussian_filter(np.sqrt((gradient**2).sum(0)), spacing_mm / voxel)
     corners = grid.world(np.argwhere(mask))
     low, high = corners.min(0), corners.max(0)
-    fine = _lattice(low, high, spacing_mm)
-    if structure_threshold > 0:
-        coarse = _lattice(low, high, spacing_mm * COARSE_FACTOR)
-        flat = _sample(strength, grid, coarse) < structure_threshold
-        wide, close = _inside(coarse[flat], mask, grid), _inside(fine, mask, grid)
-        close = close[_sample(strength, grid, close) >= structure_threshold]
-        points = np.concatenate([wide, close])
-        width = np.repeat([spacing_mm * COARSE_FACTOR, spacing_mm], [len(wide), len(close)])
-    else:
-        points = _inside(fine, mask, grid)
-        width = np.full(len(points), spacing_mm)
-    log_scale, quaternion = _shapes(gradient, grid, points, width, strength)
+    points = _inside(_lattice(low, high, spacing_mm), mask, grid)
+    log_scale, quaternion = _shapes(gradient, grid, points, spacing_mm, strength)
     # a lattice of Gaussians of mean volume h^3 adds up to peak (2 pi)^1.5 s1 s2 s3 / h^3
-    overlap = (2 * np.pi) ** 1.5 * np.exp(log_scale.sum(1)) / width**3
+    overlap = (2 * np.pi) ** 1.5 * np.exp(log_scale.sum(1)) / spacing_mm**3
     peak = _sample(volume, grid, points) / overlap
     origin = grid.center_mm
 
@@ -104,12 +88,12 @@ def _shapes(
     gradient: NDArray[np.float32],
     grid: VolumeGrid,
     points: NDArray[np.float64],
-    width: NDArray[np.float64],
+    spacing_mm: float,
     strength: NDArray[np.float32],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Log-scales [N, 3] and quaternions (w x y z) [N, 4] from the structure tensor at the points."""
     tensor = np.empty((len(points), 3, 3))
-    sigma = float(width.min() / grid.spacing_mm.mean())
+    sigma = float(spacing_mm / grid.spacing_mm.mean())
     for a in range(3):
         for b in range(a, 3):
             smooth = gaussian_filter(gradient[a] * gradient[b], sigma)
@@ -125,4 +109,4 @@ def _shapes(
     ratio /= np.exp(np.log(ratio).mean(1, keepdims=True))
     vectors[:, :, 2] *= np.sign(np.linalg.det(vectors))[:, None]
     xyzw = Rotation.from_matrix(vectors).as_quat()
-    return np.log(SCALE_PER_SPACING * width[:, None] * ratio), xyzw[:, [3, 0, 1, 2]]
+    return np.log(SCALE_PER_SPACING * spacing_mm * ratio), xyzw[:, [3, 0, 1, 2]]

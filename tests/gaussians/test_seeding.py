@@ -40,20 +40,6 @@ def test_a_constant_comes_out_flat(spacing: float):
     assert np.abs(found[middle] - 0.7).max() < 0.03 * 0.7
 
 
-def test_the_lattice_is_coarser_where_nothing_happens():
-    """Structure in one half only: fewer Gaussians than a uniform lattice, fine ones where it is."""
-    volume = (0.5 + 0.4 * np.sin(INDEX[..., 0] * 1.2) * (INDEX[..., 2] > 19)).astype(np.float32)
-    uniform = seed_cloud(volume, BALL, GRID, 2.0)
-    cloud = seed_cloud(volume, BALL, GRID, 2.0, structure_threshold=0.03)
-    assert 0.4 * len(uniform) < len(cloud) < 0.75 * len(uniform)
-    volume_share = cloud.log_scale.sum(1).exp().numpy()
-    wide = volume_share > 3 * volume_share.min()
-    third = GRID.index(cloud.mean_mm.double().numpy() + cloud.origin_mm)[:, 2]
-    assert wide.any()
-    assert third[wide].max() < 22
-    assert third[~wide].min() > 14
-
-
 def test_seeds_are_flattened_across_an_edge():
     """At a step along the grid's third axis the smallest sigma points across it, in world axes."""
     volume = (INDEX[..., 2] > 18.5).astype(np.float32)

@@ -1,0 +1,55 @@
+"""run.json names the terms that the data cannot determine, with the reason."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from g3r.acquisition.planes import Planes, Slices
+from g3r.geometry import RigidPose
+from g3r.presets import PRESETS
+from g3r.run_record import left_out_terms
+
+
+def slices_of(stacks: list[int]) -> Slices:
+    n = len(stacks)
+    planes = Planes(
+        np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.ones((n, 2)), np.full((n, 2), 4), np.ones((n, 3))
+    )
+    pixels = np.ones(planes.n_pixels, np.float32)
+    pose = RigidPose(planes.rotation, planes.center_mm)
+    return Slices(planes, pixels, pixels > 0, np.array(stacks), np.arange(n), np.full(n, 2.0), pose)
+
+
+def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:
+    return {entry["term"]: entry["reason"] for entry in left_out_terms(slices, settings, counts or {})}
+
+
+def test_two_stacks_of_slices_determine_everything():
+    assert terms(slices_of([0, 0, 1, 1])) == {}
+
+
+def test_a_single_slice_has_neither_gain_nor_shading():
+    found = terms(slices_of([0]))
+    assert set(found) == {"gain of the slice", "shading"}
+    assert "peaks" in found["gain of the slice"]
+
+
+def test_settings_and_a_missing_prior_are_named():
+    base = PRESETS["balanced"]
+    still = replace(
+        base, use_prior=False,
+        slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_shading=False),
+    )  # fmt: skip
+    found = terms(slices_of([0, 1]), still)
+    assert set(found) == {"shading", "poses in the fit", "distance to the prior"}
+    assert "drifts" in terms(slices_of([0, 0]), still)["poses in the fit"]
+    assert (
+        "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
+    )
+
+
+def test_the_bound_says_why_there_are_no_more_gaussians():
+    counts = {"bound": 0.03, "share_over_bound": 0.05, "finest_spacing_mm": 2.4}
+    reason = terms(slices_of([0, 1]), counts=counts)["finer Gaussians"]
+    assert "0.03" in reason
+    assert "95.0 %" in reason
