@@ -28,6 +28,7 @@ from g3r.gaussians.refinement import (
 )
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
+from g3r.pace import Deadline
 
 WINDOW_SHARE = 0.5
 """Sigma of the neighbourhood in which the residual is judged, over the finest spacing."""
@@ -103,6 +104,7 @@ def fit_adaptive(
     stage: PriorStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
+    deadline: Deadline | None = None,
 ) -> tuple[GaussianCloud, Refinement]:
     """A cloud that shows a volume to within a bound, with few Gaussians.
 
@@ -120,6 +122,7 @@ def fit_adaptive(
         stage: how the optimiser runs.
         rng: draws the planes of the optimiser's steps.
         progress: called with (steps done, steps in all at most).
+        deadline: fewer steps in each round if they would end after it.
 
     Raises:
         ValueError: an empty mask, or a bound that is not positive.
@@ -140,8 +143,10 @@ def fit_adaptive(
     def fitted(cloud: GaussianCloud, n_steps: int) -> GaussianCloud:
         before = done.steps
         run = replace(stage, n_steps=n_steps, peak_iterations=settings.peak_iterations)
-        cloud, loss = fit_prior(cloud, target, run, rng, lambda n, _: progress(before + n, at_most))
-        done.steps += n_steps
+        # the rounds to come take as many steps as they would without a deadline, of what time is left
+        by_then = deadline.part(n_steps / max(1, at_most - before)) if deadline else None
+        cloud, loss = fit_prior(cloud, target, run, rng, lambda n, _: progress(before + n, at_most), by_then)
+        done.steps += len(loss)
         done.loss += loss
         return cloud
 
