@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from g3r.acquisition.voxel_operator import MOST_SCATTER_BUFFERS
 from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.motion import MotionSettings
+from g3r.prior.inference import HALO_VOXELS, MAX_WHOLE_VOXELS, TILE_VOXELS
 
 ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
 """About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
@@ -30,6 +32,9 @@ class ReconstructionSettings:
         slice_stage: stage 2.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
+        prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
+            tiles; see `estimate_prior`.
+        scatter_buffers: at most so many threads scatter at once; fewer take less memory.
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
@@ -43,6 +48,10 @@ class ReconstructionSettings:
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     prior_views: int = 4
     prior_voxel_mm: float = 0.8
+    prior_whole_voxels: int = MAX_WHOLE_VOXELS
+    prior_tile_voxels: int = TILE_VOXELS
+    prior_halo_voxels: int = HALO_VOXELS
+    scatter_buffers: int = MOST_SCATTER_BUFFERS
     use_prior: bool = True
     distillation: bool = True
     seed: int = 0

@@ -22,6 +22,7 @@ from g3r.acquisition.planes import (
 )
 from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
 from g3r.acquisition.stacks import Stack
+from g3r.acquisition.voxel_operator import use_scatter_buffers
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.observer import FitObserver
@@ -137,6 +138,7 @@ class GaussianReconstructor:
         assert isinstance(self.settings, ReconstructionSettings)
         settings, clock, notes, warnings = self.settings, Clock(), [], []
         rng = np.random.default_rng(settings.seed)
+        use_scatter_buffers(settings.scatter_buffers)
         slices, first_scale = _normalised_slices(stacks)
         notes += left_out_notes(stacks, slices)
         single = len(np.unique(slices.stack_id)) == 1
@@ -189,7 +191,7 @@ class GaussianReconstructor:
         coarse, density = start.coarse, start.density
         with clock("fit to prior"):
             cloud, prior_history, counts = self._prior_cloud(
-                prior, prior_mask, prior_grid, _gaussian_spacing_mm(slices, settings), rng
+                prior, prior_mask, prior_grid, settings.gaussian_spacing_pixels * slices.pixel_edge_mm, rng
             )
         with clock("fit to slices"):
             distil_to = None
@@ -217,7 +219,9 @@ class GaussianReconstructor:
         prior_share = None
         if settings.use_prior:
             with clock("prior share"):
-                prior_share = estimate_prior_share(fit, density, prior_grid, mask, grid, rng)
+                prior_share = estimate_prior_share(
+                    fit, density, prior_grid, mask, grid, rng, record_bytes=settings.slice_stage.record_bytes
+                )
         with clock("uncertainty"):
             uncertainty = estimate_uncertainty(
                 volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,
@@ -291,8 +295,12 @@ class GaussianReconstructor:
         if self.network is None:
             return start.sharp
         assert isinstance(self.settings, ReconstructionSettings)
-        views = self.settings.prior_views
-        return estimate_prior(self.network, start.coarse, start.density, start.sharp, n_views=views)
+        settings = self.settings
+        return estimate_prior(
+            self.network, start.coarse, start.density, start.sharp, n_views=settings.prior_views,
+            max_whole_voxels=settings.prior_whole_voxels, tile_voxels=settings.prior_tile_voxels,
+            halo_voxels=settings.prior_halo_voxels,
+        )  # fmt: skip
 
     def _prior_cloud(
         self,
@@ -319,12 +327,6 @@ class GaussianReconstructor:
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)
-
-
-def _gaussian_spacing_mm(slices: Slices, settings: ReconstructionSettings) -> float:
-    """Cell edge per Gaussian: the settings' number of (typical) pixels, as cubes of equal volume."""
-    covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
-    return settings.gaussian_spacing_pixels * float(np.median(covered_mm3)) ** (1 / 3)
 
 
 def _normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:

@@ -32,6 +32,8 @@ ALLOWED = {
     "presets": BELOW_FITTING | {"fitting"},
 }
 OPEN_TO_ALL = {"errors", "_version", "pace"}
+ALLOWED["memory_size"] = set()
+ALLOWED["memory"] = {"memory_size"} | BELOW_FITTING | {"fitting", "presets"}
 ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "presets"}
 ROOMS = {*ALLOWED, "result", "reconstruct", "bench", "cli"}
 ALLOWED["result"] = ROOMS - {"reconstruct", "bench", "cli", "result"}

@@ -16,6 +16,7 @@ from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
+    from g3r.memory import MemoryPlan
     from g3r.presets import ReconstructionSettings
     from g3r.reconstruct import Progress
     from g3r.result import ReconstructionResult
@@ -60,6 +61,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    parser.add_argument(
+        "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
+    )
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
@@ -114,20 +118,25 @@ def _run(options: argparse.Namespace) -> int:
     check_output_folder(folder, replace=options.force)  # before any work
     with _lines_held_back():
         stacks = _load(options)
+        from g3r.memory import plan_for_stacks
         from g3r.reconstruct import GaussianReconstructor
 
         _use_threads(options.threads)
         settings = _settings(options)
         reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+        plan = plan_for_stacks(stacks, settings, options.max_memory)
+        reconstructor.settings = plan.settings
     with _bars(quiet=options.quiet) as progress:
         reconstructor.progress = progress
         if options.dry_run:
-            return _dry_run(stacks, settings, folder)
+            return _dry_run(stacks, plan, folder)
         result = reconstructor.reconstruct(stacks)
     result.record["command"] = {
         "stacks": [stack.name for stack in stacks], "preset": options.preset, "seed": options.seed,
         "threads": options.threads, "space": options.space,
     }  # fmt: skip
+    result.record["memory"] = plan.record()
+    result.record["notes"] += plan.changes
     result.save(folder, replace=options.force)
     if options.tensorboard:
         _write_tensorboard(Path(options.tensorboard), result)
@@ -193,14 +202,24 @@ def _use_threads(n: int | None) -> None:
     torch.set_num_threads(wanted)
 
 
-def _dry_run(stacks: list[Stack], settings: ReconstructionSettings, folder: Path) -> int:
+def _size(text: str) -> int:
+    from g3r.memory_size import parsed_size
+
+    try:
+        return parsed_size(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _dry_run(stacks: list[Stack], plan: MemoryPlan, folder: Path) -> int:
     for stack in stacks:
         spacing = " x ".join(f"{x:.2f}" for x in stack.spacing_mm)
         print(
             f"{stack.name}: {'x'.join(map(str, stack.image.shape))} voxels of {spacing} mm, "
             f"thickness {stack.thickness_mm:g} mm, {int(stack.mask.sum())} masked"
         )
-    print(f"would write a volume of {settings.resolution_mm:g} mm to {folder}")
+    print(plan.estimate.line())
+    print(f"would write a volume of {plan.settings.resolution_mm:g} mm to {folder}")
     return 0
 
 

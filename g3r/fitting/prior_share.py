@@ -18,6 +18,7 @@ from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.scatter import confidence
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render, solve_peaks
+from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
 from g3r.geometry import VolumeGrid
 
 N_PROBES = 2
@@ -39,6 +40,7 @@ def estimate_prior_share(
     grid: VolumeGrid,
     rng: np.random.Generator,
     n_probes: int = N_PROBES,
+    record_bytes: int = RECORD_BYTES_AT_MOST,
 ) -> NDArray[np.float32]:
     """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
 
@@ -55,18 +57,23 @@ def estimate_prior_share(
         grid: of the answer.
         rng: draws the changes.
         n_probes: number of random changes; their answers are averaged.
+        record_bytes: see `solve_peaks`.
 
     Returns:
         [I, J, K] float32 in [0, 1].
     """
     unseen = 1 - on_grid(confidence(density), density_grid, grid, outside=0.0)
-    left = on_grid(remaining_share(fit, grid, rng, n_probes), _coarse(grid), grid, outside=1.0)
+    left = on_grid(remaining_share(fit, grid, rng, n_probes, record_bytes), _coarse(grid), grid, outside=1.0)
     share = np.maximum(np.clip(left, 0, 1), np.clip(unseen, 0, 1) ** 2)
     return np.where(mask, share, 1.0).astype(np.float32)
 
 
 def remaining_share(
-    fit: SliceFit, grid: VolumeGrid, rng: np.random.Generator, n_probes: int = N_PROBES
+    fit: SliceFit,
+    grid: VolumeGrid,
+    rng: np.random.Generator,
+    n_probes: int = N_PROBES,
+    record_bytes: int = RECORD_BYTES_AT_MOST,
 ) -> NDArray[np.float32]:
     """r: how much of a random change of the peaks the slices leave standing, on a coarse grid over `grid`.
 
@@ -88,7 +95,7 @@ def remaining_share(
         probe = fit.cloud.with_peak(change)
         answer = solve_peaks(
             probe, planes, nothing, trust.astype(np.float32), gain=fit.gain,
-            n_iterations=ANSWER_ITERATIONS, damping=ANSWER_DAMPING,
+            n_iterations=ANSWER_ITERATIONS, damping=ANSWER_DAMPING, record_bytes=record_bytes,
         )  # fmt: skip
         put_in, left = volume(probe), volume(answer)
         together += gaussian_filter(left * put_in, sigma)

@@ -13,6 +13,7 @@ from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_peaks
+from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.pace import Deadline, paced
@@ -31,6 +32,7 @@ class PriorStageSettings:
         scale_weight: weight of the scale regulariser.
         steps_per_draw: steps between two draws of the planes.
         cutoff_sigma: where a Gaussian ends.
+        record_bytes: see `solve_peaks`; less memory, more seconds, the same result.
     """
 
     n_steps: int = 30
@@ -39,6 +41,7 @@ class PriorStageSettings:
     scale_weight: float = 0.01
     steps_per_draw: int = 10
     cutoff_sigma: float = CUTOFF_SIGMA
+    record_bytes: int = RECORD_BYTES_AT_MOST
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,9 @@ def fit_prior(
         The fitted cloud, and the image loss of each step.
     """
     every_second = target.take(np.arange(0, len(target.planes), 2))
-    cloud = solve_peaks_on(cloud, every_second, settings.peak_iterations, settings.cutoff_sigma)
+    cloud = solve_peaks_on(
+        cloud, every_second, settings.peak_iterations, settings.cutoff_sigma, settings.record_bytes
+    )
     parameters = FitParameters(cloud, LearningRates())
     term = ImageTerm(
         target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
@@ -118,10 +123,14 @@ def fit_prior(
 
 
 def solve_peaks_on(
-    cloud: GaussianCloud, target: VolumeTarget, n_iterations: int, cutoff_sigma: float = CUTOFF_SIGMA
+    cloud: GaussianCloud,
+    target: VolumeTarget,
+    n_iterations: int,
+    cutoff_sigma: float = CUTOFF_SIGMA,
+    record_bytes: int = RECORD_BYTES_AT_MOST,
 ) -> GaussianCloud:
     """Peaks of a cloud by least squares on the planes of a volume."""
     return solve_peaks(
         cloud, target.planes, target.value, target.weight, n_iterations=n_iterations,
-        cutoff_sigma=cutoff_sigma,
+        cutoff_sigma=cutoff_sigma, record_bytes=record_bytes,
     )  # fmt: skip

@@ -17,6 +17,7 @@ from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, solve_peaks
+from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.pace import Deadline, paced
 
@@ -47,6 +48,7 @@ class SliceStageSettings:
         shading_ridge: weight of the mean squared coefficient of the fields.
         amplitude: "exact", or "printed" for comparison.
         cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
+        record_bytes: see `solve_peaks`; less memory, more seconds, the same result.
         rates: step sizes.
     """
 
@@ -65,6 +67,7 @@ class SliceStageSettings:
     shading_ridge: float = 0.005
     amplitude: str = "exact"
     cutoff_sigma: float = CUTOFF_SIGMA
+    record_bytes: int = RECORD_BYTES_AT_MOST
     rates: LearningRates = field(default_factory=LearningRates)
 
 
@@ -121,6 +124,7 @@ def fit_slices(
             cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
             n_iterations=settings.peak_iterations, damping=settings.peak_damping,
             amplitude=settings.amplitude, cutoff_sigma=settings.cutoff_sigma,
+            record_bytes=settings.record_bytes,
         )  # fmt: skip
     several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
     shading = StackShading(slices) if settings.optimise_shading and several else None

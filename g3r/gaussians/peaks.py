@@ -29,6 +29,7 @@ class PeakSystem:
         pairs: PairList,
         cutoff_sigma: float,
         exact: bool,
+        record_bytes: int = RECORD_BYTES_AT_MOST,
     ) -> None:
         self.n_gaussians, self.n_pixels = len(cloud), planes.n_pixels
         self.cut, self.exact = cutoff_sigma**2, exact
@@ -36,7 +37,7 @@ class PeakSystem:
         self.shapes = CloudArrays.of(cloud).shapes
         self.described = plane_arguments(planes, planes.center_mm - cloud.origin_mm, factor, pairs)
         self.layout = (planes.shape, planes.offset, pairs.start)
-        self.parts = _parts(pairs.start, RECORD_BYTES_AT_MOST // kernels.PAIR.itemsize)
+        self.parts = _parts(pairs.start, record_bytes // kernels.PAIR.itemsize)
         longest = max((int(pairs.start[b] - pairs.start[a]) for a, b in self.parts), default=0)
         self.records = np.zeros(longest, kernels.PAIR)
         self.count = np.zeros(len(planes), np.int64)
@@ -52,11 +53,12 @@ class PeakSystem:
         pairs: PairList | None = None,
         cutoff_sigma: float = CUTOFF_SIGMA,
         amplitude: str = "exact",
+        record_bytes: int = RECORD_BYTES_AT_MOST,
     ) -> PeakSystem:
         """The system for the shapes of a cloud (its peaks are not read)."""
         if pairs is None:
             pairs = find_pairs(cloud, planes, cutoff_sigma)
-        return cls(cloud, planes, gain, pairs, cutoff_sigma, amplitude == "exact")
+        return cls(cloud, planes, gain, pairs, cutoff_sigma, amplitude == "exact", record_bytes)
 
     def _set_up_parts(self) -> Iterator[tuple[int, int]]:
         """Ranges of planes, each with its records in place; one range of all where they can be kept."""
@@ -112,6 +114,7 @@ def solve_peaks(
     pairs: PairList | None = None,
     cutoff_sigma: float = CUTOFF_SIGMA,
     amplitude: str = "exact",
+    record_bytes: int = RECORD_BYTES_AT_MOST,
 ) -> GaussianCloud:
     """The cloud with the peaks that minimise sum_p weight_p (A c - target)_p^2 + damping d ||c - c_0||^2.
 
@@ -129,10 +132,11 @@ def solve_peaks(
         pairs: list from `find_pairs`.
         cutoff_sigma: as in `render`.
         amplitude: as in `render`.
+        record_bytes: pairs are set up once if that takes no more memory, else again in every product.
 
     Source: Hestenes and Stiefel (1952), in the CGLS order of operations (Bjoerck 1996, 7.4.1).
     """
-    system = PeakSystem.of(cloud, planes, gain, pairs, cutoff_sigma, amplitude)
+    system = PeakSystem.of(cloud, planes, gain, pairs, cutoff_sigma, amplitude, record_bytes)
     start = cloud.peak.detach().double().numpy()
     residual = target.astype(np.float64) - system.forward(start)
     row_sum = system.adjoint(weight * system.forward(np.ones(len(cloud), np.float32)))

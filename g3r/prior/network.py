@@ -22,6 +22,10 @@ _BLOCK: dict[str, Any] = {
 }
 
 
+SLAB_ROWS = 16
+"""Rows at half resolution of which the layers at full resolution are computed at a time."""
+
+
 class ResidualRefiner(nn.Module):
     """A 3D residual network F(V_coarse, M_rho) that is cheap on a CPU.
 
@@ -160,9 +164,32 @@ class ResidualRefiner(nn.Module):
         features = self.encoder[-1](features)
         for up, decode in zip(reversed(self.up), reversed(self.decoder), strict=True):
             features = decode(_channels_last(up(features)) + skips.pop())
-        features = torch.cat([self.to_full(features), inputs], 1)
-        residual = self.head(self.tail(_channels_last(features)))
+        residual = self._in_slabs(features, inputs)
         return residual[:, :, : size[0], : size[1], : size[2]]
+
+    def _at_full_resolution(self, features: Tensor, inputs: Tensor) -> Tensor:
+        """The last layers: features at half resolution and the inputs to F."""
+        features = torch.cat([self.to_full(features), inputs], 1)
+        return self.head(self.tail(_channels_last(features)))
+
+    def _in_slabs(self, features: Tensor, inputs: Tensor) -> Tensor:
+        """`_at_full_resolution`, where no gradient is wanted a slab after the other.
+
+        These layers hold most of the memory. A slab sees the two voxels beyond it that its layers reach, so
+        that the result is that of the whole, up to rounding.
+        """
+        n_rows = features.shape[2]
+        if torch.is_grad_enabled() or n_rows <= SLAB_ROWS + 2:
+            return self._at_full_resolution(features, inputs)
+        out = torch.empty_like(inputs[:, :1])
+        for begin in range(0, n_rows, SLAB_ROWS):
+            # all slabs but have one shape, the last overlapping: kernels are set up, and kept, for each shape
+            low = min(max(begin - 1, 0), n_rows - SLAB_ROWS - 2)
+            high = low + SLAB_ROWS + 2
+            seen = self._at_full_resolution(features[:, :, low:high], inputs[:, :, 2 * low : 2 * high])
+            end = min(begin + SLAB_ROWS, n_rows)
+            out[:, :, 2 * begin : 2 * end] = seen[:, :, 2 * (begin - low) : 2 * (end - low)]
+        return out
 
 
 def _residual_units(width: int, count: int) -> nn.Sequential:

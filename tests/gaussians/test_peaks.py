@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, peaks, render, solve_peaks
+from g3r.gaussians import GaussianCloud, render, solve_peaks
 from g3r.gaussians.peaks import PeakSystem
 
 
@@ -55,11 +55,10 @@ def test_the_system_is_the_renderer():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_records_that_may_not_be_kept_are_made_again(monkeypatch: pytest.MonkeyPatch):
+def test_records_that_may_not_be_kept_are_made_again():
     cloud, planes = scene()
     whole = PeakSystem.of(cloud, planes)
-    monkeypatch.setattr(peaks, "RECORD_BYTES_AT_MOST", 5000)
-    parted = PeakSystem.of(cloud, planes)
+    parted = PeakSystem.of(cloud, planes, record_bytes=5000)
     assert len(whole.parts) == 1
     assert len(parted.parts) > 3
     assert parted.parts[0][0] == 0
