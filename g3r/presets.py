@@ -66,7 +66,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
             pixels_at_most=200_000,
         ),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=15),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=45),
     ),
     "fast": replace(
         _BALANCED,
@@ -75,7 +75,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         prior_views=1,
         motion=replace(_BALANCED.motion, n_candidates=2500, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=30),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),
     "balanced": _BALANCED,
     "accurate": replace(

@@ -32,6 +32,8 @@ ALLOWED = {
     "presets": BELOW_FITTING | {"fitting"},
 }
 OPEN_TO_ALL = {"errors", "_version", "pace"}
+ALLOWED["start"] = BELOW_FITTING
+ALLOWED["budget"] = BELOW_FITTING | {"fitting", "presets", "start"}
 ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "presets"}
 ROOMS = {*ALLOWED, "result", "reconstruct", "bench", "cli"}
 ALLOWED["result"] = ROOMS - {"reconstruct", "bench", "cli", "result"}
