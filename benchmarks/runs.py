@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
-from g3r.acquisition.planes import slices_from_stacks
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import compare
@@ -20,7 +19,7 @@ from g3r.evaluation.pose_error import PoseError
 from g3r.geometry import RigidPose
 from g3r.motion.confidence import pose_warnings, stack_confidences
 from g3r.presets import PRESETS, ReconstructionSettings
-from g3r.reconstruct import GaussianReconstructor, _percentile_scale
+from g3r.reconstruct import GaussianReconstructor
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
@@ -72,8 +71,7 @@ def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint
     """Registration alone, as the reconstruction begins with it."""
     reconstructor = GaussianReconstructor(checkpoint, settings)
     wall, cpu = time.perf_counter(), time.process_time()
-    slices = slices_from_stacks(case.stacks)
-    motion = reconstructor.register(slices.scaled(1 / _percentile_scale(slices)))
+    motion = reconstructor.register_stacks(case.stacks)
     seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
     confidences = stack_confidences(motion, len(case.stacks))
     warnings = tuple(pose_warnings(motion, confidences, case.stacks))

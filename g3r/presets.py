@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from g3r.acquisition.voxel_operator import MOST_SCATTER_BUFFERS
 from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
@@ -34,7 +33,6 @@ class ReconstructionSettings:
         prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
-        scatter_buffers: at most so many threads scatter at once; fewer take less memory.
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
@@ -51,7 +49,6 @@ class ReconstructionSettings:
     prior_whole_voxels: int = MAX_WHOLE_VOXELS
     prior_tile_voxels: int = TILE_VOXELS
     prior_halo_voxels: int = HALO_VOXELS
-    scatter_buffers: int = MOST_SCATTER_BUFFERS
     use_prior: bool = True
     distillation: bool = True
     seed: int = 0
@@ -75,7 +72,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
             pixels_at_most=200_000,
         ),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=15),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=45),
     ),
     "fast": replace(
         _BALANCED,
@@ -84,7 +81,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         prior_views=1,
         motion=replace(_BALANCED.motion, n_candidates=2500, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=30),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),
     "balanced": _BALANCED,
     "accurate": replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground_mask
-from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import (
     Slices,
-    slices_from_stacks,
     volume_from_pixels,
     volume_planes,
 )
-from g3r.acquisition.scatter import coarse_and_density, confidence, normalisation_scale
+from g3r.acquisition.scatter import confidence
 from g3r.acquisition.stacks import Stack
-from g3r.acquisition.voxel_operator import use_scatter_buffers
+from g3r.budget import TimeBudget
 from g3r.errors import InputError, NumericalError
 from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.observer import FitObserver
@@ -40,7 +39,6 @@ from g3r.motion.confidence import (
 )
 from g3r.motion.prior_registration import register_to_prior
 from g3r.motion.template_registration import head_volume_mm3
-from g3r.motion.volume import grid_around
 from g3r.pace import Deadline
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
@@ -49,6 +47,7 @@ from g3r.prior.pose_checkpoint import PoseCheckpoint
 from g3r.prior.pose_network import PoseNetwork
 from g3r.result import ReconstructionResult
 from g3r.run_record import Clock, left_out_notes, left_out_terms, run_record
+from g3r.start import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
 from g3r.trust import estimate_uncertainty
 
 logger = logging.getLogger(__name__)
@@ -63,19 +62,6 @@ LEAST_DISTILLATION = 1e-3
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
-
-
-@dataclass(frozen=True)
-class _Start:
-    """Slices, V_coarse and V_sharp in normalised intensities (given ones over `scale`), M_rho, mask."""
-
-    slices: Slices
-    coarse: NDArray[np.float32]
-    density: NDArray[np.float32]
-    sharp: NDArray[np.float32]
-    mask: NDArray[np.bool_]
-    grid: VolumeGrid
-    scale: float
 
 
 @dataclass
@@ -121,7 +107,10 @@ class GaussianReconstructor:
             self.pose_network, self.pose_meta = load_pose_network(path)
 
     def reconstruct(
-        self, stacks: Sequence[Stack], motion: MotionEstimate | None = None
+        self,
+        stacks: Sequence[Stack],
+        motion: MotionEstimate | None = None,
+        budget: TimeBudget | None = None,
     ) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
 
@@ -130,6 +119,7 @@ class GaussianReconstructor:
             motion: what `register_stacks` (here or elsewhere) found for the same stacks, to fit
                 several times to one registration; found here when None. Slices of a single stack still move
                 to the prior volume afterwards, where there is one.
+            budget: chooses registration, views of the prior, Gaussians and steps in place of the settings.
 
         Raises:
             InputError: stacks that cannot be used, or a motion of other slices.
@@ -138,8 +128,7 @@ class GaussianReconstructor:
         assert isinstance(self.settings, ReconstructionSettings)
         settings, clock, notes, warnings = self.settings, Clock(), [], []
         rng = np.random.default_rng(settings.seed)
-        use_scatter_buffers(settings.scatter_buffers)
-        slices, first_scale = _normalised_slices(stacks)
+        slices, first_scale = normalised_slices(stacks)
         notes += left_out_notes(stacks, slices)
         single = len(np.unique(slices.stack_id)) == 1
         held = settings.use_prior and settings.distillation and settings.motion.runs
@@ -156,9 +145,12 @@ class GaussianReconstructor:
 
         with clock("motion"):
             if motion is None:
-                motion = self.register(slices, settings)
+                by_then = None
+                if budget:
+                    settings, by_then = budget.for_motion(settings)
+                motion = self.register(slices, settings, by_then)
             else:
-                motion = _motion_of(slices, motion)
+                motion = with_pixels_of(slices, motion)
                 notes.append("motion was given, not estimated here")
         confidences = stack_confidences(motion, len(stacks))
         warnings += pose_warnings(motion, confidences, stacks)
@@ -167,20 +159,23 @@ class GaussianReconstructor:
                 "standard orientation unknown, the volume stays in scanner space: no mean head fits the "
                 f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
             )
+        voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
         with clock("coarse"):
-            start = self._start(motion.slices, motion.gain, motion.weight)
+            start = FitStart.of(motion.slices, motion.gain, motion.weight, voxel_mm)
+        if budget:
+            settings = budget.for_prior(settings, clock.seconds["coarse"])
         with clock("prior"):
             self.progress("prior", 0, 1)
-            prior = self._prior(start)
+            prior = self._prior(start, settings)
             self.progress("prior", 1, 1)
         gain, scale = motion.gain, start.scale
         if single and settings.use_prior and settings.motion.runs:
             with clock("slices to prior"):
                 nudged, gain, believed = register_to_prior(start.slices, gain, prior, start.grid)
                 if believed:
-                    start = self._start(nudged, gain, motion.weight)
+                    start = FitStart.of(nudged, gain, motion.weight, voxel_mm)
                     scale *= start.scale
-                    prior = self._prior(start)
+                    prior = self._prior(start, settings)
             notes.append(
                 "slices of the single stack were registered to the prior volume" if believed else
                 "slices of the single stack stay in line up to the fit: the prior gave no reason to move"
@@ -189,10 +184,14 @@ class GaussianReconstructor:
             notes.append("slices of the single stack stay where the mean head or the header has them")
         slices, prior_mask, prior_grid = start.slices, start.mask, start.grid
         coarse, density = start.coarse, start.density
-        with clock("fit to prior"):
-            cloud, prior_history, counts = self._prior_cloud(
-                prior, prior_mask, prior_grid, settings.gaussian_spacing_pixels * slices.pixel_edge_mm, rng
+        grid = _output_grid(prior_grid, settings.resolution_mm)
+        first_by, second_by = None, None
+        if budget:
+            settings, first_by, second_by = budget.for_fit(
+                settings, start, prior, clock.seconds["coarse"], math.prod(grid.shape), rng
             )
+        with clock("fit to prior"):
+            cloud, prior_history, counts = self._prior_cloud(prior, start, settings, rng, first_by)
         with clock("fit to slices"):
             distil_to = None
             if settings.use_prior and settings.distillation:
@@ -203,10 +202,9 @@ class GaussianReconstructor:
                 distil_to = VolumeTarget.of(prior, unmeasured.astype(np.float32), prior_grid)
             fit = fit_slices(
                 cloud, slices, gain, motion.weight, distil_to, settings.slice_stage, rng,
-                self._report("fit to slices"), observer=self.observer,
+                self._report("fit to slices"), second_by, self.observer,
             )  # fmt: skip
         with clock("volume"):
-            grid = _output_grid(prior_grid, settings.resolution_mm)
             mask = prior_mask
             if grid is not prior_grid:
                 mask = foreground_mask(fit.slices, grid, fit.weight)
@@ -232,6 +230,7 @@ class GaussianReconstructor:
             settings, self.prior_meta, self.pose_meta, stacks, slices, motion, confidences, fit, clock, notes,
             warnings,
         )  # fmt: skip
+        record["time_budget"] = budget.record() if budget else None
         record["gaussians"] = counts | {"n_final": len(fit.cloud)}
         record["left_out"] = left_out_terms(slices, settings, counts)
         record["uncertainty"] = uncertainty.record
@@ -250,7 +249,7 @@ class GaussianReconstructor:
         Raises:
             InputError: stacks that cannot be used.
         """
-        return self.register(_normalised_slices(stacks)[0])
+        return self.register(normalised_slices(stacks)[0])
 
     def register(
         self,
@@ -277,25 +276,9 @@ class GaussianReconstructor:
             deadline=deadline,
         )  # fmt: skip
 
-    def _start(self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]) -> _Start:
-        assert isinstance(self.settings, ReconstructionSettings)
-        voxel = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
-        grid = grid_around(slices, voxel, margin_mm=5.0)
-        trust = weight[slices.pixel_plane]
-        coarse, density = coarse_and_density(slices, grid, gain, trust)
-        sharp = sharpened_volume(slices, grid, coarse, gain, trust)
-        scale = normalisation_scale(coarse, density)
-        slices = slices.scaled(1 / scale)
-        mask = foreground_mask(slices, grid, weight)
-        return _Start(
-            slices, coarse / np.float32(scale), density, sharp / np.float32(scale), mask, grid, scale
-        )
-
-    def _prior(self, start: _Start) -> NDArray[np.float32]:
+    def _prior(self, start: FitStart, settings: ReconstructionSettings) -> NDArray[np.float32]:
         if self.network is None:
             return start.sharp
-        assert isinstance(self.settings, ReconstructionSettings)
-        settings = self.settings
         return estimate_prior(
             self.network, start.coarse, start.density, start.sharp, n_views=settings.prior_views,
             max_whole_voxels=settings.prior_whole_voxels, tile_voxels=settings.prior_tile_voxels,
@@ -305,60 +288,28 @@ class GaussianReconstructor:
     def _prior_cloud(
         self,
         prior: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        grid: VolumeGrid,
-        spacing_mm: float,
+        start: FitStart,
+        settings: ReconstructionSettings,
         rng: np.random.Generator,
+        deadline: Deadline | None,
     ) -> tuple[GaussianCloud, list[float], dict[str, Any]]:
         """Stage 1: the cloud, its losses, and how its number of Gaussians came about."""
-        assert isinstance(self.settings, ReconstructionSettings)
-        settings, report = self.settings, self._report("fit to prior")
+        report, stage = self._report("fit to prior"), settings.prior_stage
+        spacing_mm = gaussian_spacing_mm(start.slices, settings.gaussian_spacing_pixels)
         if settings.adaptive is not None:
             cloud, found = fit_adaptive(
-                prior, mask, grid, spacing_mm, settings.adaptive, settings.prior_stage, rng, report
+                prior, start.mask, start.grid, spacing_mm, settings.adaptive, stage, rng, report, deadline
             )
             counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
             return cloud, found.loss, counts
-        cloud = seed_cloud(prior, mask, grid, spacing_mm)
+        cloud = seed_cloud(prior, start.mask, start.grid, spacing_mm)
         counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-        target = VolumeTarget.of(prior, mask.astype(np.float32), grid)
-        cloud, history = fit_prior(cloud, target, settings.prior_stage, rng, report)
+        target = VolumeTarget.of(prior, start.mask.astype(np.float32), start.grid)
+        cloud, history = fit_prior(cloud, target, stage, rng, report, deadline)
         return cloud, history, counts
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(stage, done, total)
-
-
-def _normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
-    """Slices of order one at their header poses, and what they were divided by."""
-    slices = slices_from_stacks(stacks)
-    scale = _percentile_scale(slices)
-    return slices.scaled(1 / scale), scale
-
-
-def _motion_of(slices: Slices, motion: MotionEstimate) -> MotionEstimate:
-    """A motion estimate with the pixels of the slices to be fitted.
-
-    Raises:
-        InputError: the two are not about the same slices.
-    """
-    found = motion.slices
-    if not (
-        np.array_equal(found.stack_id, slices.stack_id)
-        and np.array_equal(found.slice_index, slices.slice_index)
-    ):
-        raise InputError(
-            f"motion of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
-            "register the same stacks with the same masks"
-        )
-    return replace(motion, slices=slices.with_pose(found.planes.pose))
-
-
-def _percentile_scale(slices: Slices) -> float:
-    scale = float(np.percentile(slices.masked_value, 99))
-    if not scale > 0:
-        raise InputError(f"99th percentile inside the masks is {scale:g}; expected a positive intensity")
-    return scale
 
 
 def _output_grid(prior_grid: VolumeGrid, resolution_mm: float) -> VolumeGrid:

@@ -32,8 +32,9 @@ ALLOWED = {
     "presets": BELOW_FITTING | {"fitting"},
 }
 OPEN_TO_ALL = {"errors", "_version", "pace"}
-ALLOWED["memory_size"] = set()
-ALLOWED["memory"] = {"memory_size"} | BELOW_FITTING | {"fitting", "presets"}
+ALLOWED["start"] = BELOW_FITTING
+ALLOWED["memory"] = BELOW_FITTING | {"fitting", "presets", "start"}
+ALLOWED["budget"] = BELOW_FITTING | {"fitting", "presets", "start"}
 ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "presets"}
 ROOMS = {*ALLOWED, "result", "reconstruct", "bench", "cli"}
 ALLOWED["result"] = ROOMS - {"reconstruct", "bench", "cli", "result"}

@@ -171,11 +171,6 @@ class Slices:
         """Values of the pixels inside the mask [P']."""
         return self.value[self.pixel_index]
 
-    @property
-    def pixel_edge_mm(self) -> float:
-        """Edge of the cube as large as what a (typical) pixel covers: its area times the thickness."""
-        return float(np.median(self.planes.spacing_mm.prod(1) * self.thickness_mm)) ** (1 / 3)
-
     def take(self, index: Selection) -> Slices:
         """The slices at an index array or mask, with their pixels."""
         chosen = np.arange(len(self))[index]

@@ -18,20 +18,6 @@ from g3r.geometry import VolumeGrid
 MOST_SCATTER_BUFFERS = 4
 """Each thread that scatters needs its own volume; more than four cost more memory than they save time."""
 
-_most_buffers = MOST_SCATTER_BUFFERS
-
-
-def use_scatter_buffers(most: int) -> None:
-    """Let at most so many threads of this process scatter at once, from now on.
-
-    Raises:
-        ValueError: fewer than one.
-    """
-    global _most_buffers
-    if most < 1:
-        raise ValueError(f"{most} scatter buffers; expected at least 1")
-    _most_buffers = most
-
 
 def psf_nodes(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Equidistant nodes (in sigmas) and weights for a Gaussian of unit variance.
@@ -109,16 +95,13 @@ class VoxelOperator:
         """
         if pixels.shape != (self.n_pixels,):
             raise ValueError(f"pixels have shape {pixels.shape}; expected ({self.n_pixels},)")
-        n_buffers = min(numba.get_num_threads(), _most_buffers)
+        n_buffers = min(numba.get_num_threads(), MOST_SCATTER_BUFFERS)
         buffers = np.zeros((n_buffers, *self.grid.shape), pixels.dtype)
         _scatter(
             pixels, self.plane, self.uv_mm, self.index_from_plane, self.index_center,
             self.node_index, self.node_weight, buffers,
         )  # fmt: skip
-        volume = buffers[0]
-        for other in buffers[1:]:
-            volume += other
-        return volume.copy() if n_buffers > 1 else volume  # lets go of the others
+        return buffers[0] if n_buffers == 1 else buffers.sum(0)
 
 
 @numba.njit(inline="always")

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from logging.handlers import MemoryHandler
@@ -16,10 +17,14 @@ from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
+    from g3r.budget import TimeBudget
     from g3r.memory import MemoryPlan
     from g3r.presets import ReconstructionSettings
     from g3r.reconstruct import Progress
     from g3r.result import ReconstructionResult
+
+STARTED_S = time.monotonic()
+"""When the command began; what Python itself needs before is a few hundredths of a second."""
 
 PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
 
@@ -57,7 +62,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
     )
-    parser.add_argument("--preset", choices=PRESET_NAMES, default="balanced", help="speed against accuracy")
+    parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
+    parser.add_argument(
+        "--time-budget", type=float, metavar="SECONDS",
+        help="in place of --preset: the best that can be done from the start of the command to its files",
+    )  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
@@ -86,6 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if options.threads is not None and options.threads < 1:
         parser.error(f"--threads {options.threads}; expected at least 1")
+    if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
+        parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
+    if options.time_budget is not None and options.preset:
+        parser.error("--preset and --time-budget exclude each other")
+    options.preset = options.preset or "balanced"
     if options.ckpt and options.no_prior:
         parser.error("--ckpt and --no-prior exclude each other")
     logging.basicConfig(
@@ -130,9 +144,10 @@ def _run(options: argparse.Namespace) -> int:
         reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, plan, folder)
-        result = reconstructor.reconstruct(stacks)
+        result = reconstructor.reconstruct(stacks, budget=_budget(options.time_budget))
     result.record["command"] = {
-        "stacks": [stack.name for stack in stacks], "preset": options.preset, "seed": options.seed,
+        "stacks": [stack.name for stack in stacks],
+        "preset": None if options.time_budget else options.preset, "seed": options.seed,
         "threads": options.threads, "space": options.space,
     }  # fmt: skip
     result.record["memory"] = plan.record()
@@ -179,6 +194,8 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     from g3r.presets import PRESETS
 
     preset = PRESETS[options.preset]
+    if options.time_budget is not None:
+        preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
     return replace(
         preset,
         motion=replace(preset.motion, standard_orientation=options.space == "standard", seed=options.seed),
@@ -187,6 +204,13 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         seed=options.seed,
         use_prior=not options.no_prior,
     )
+
+
+def _budget(seconds: float | None) -> TimeBudget | None:
+    """What is left of a time budget that began with the command."""
+    from g3r.budget import TimeBudget
+
+    return None if seconds is None else TimeBudget.of(seconds, time.monotonic() - STARTED_S)
 
 
 def _use_threads(n: int | None) -> None:
@@ -203,7 +227,7 @@ def _use_threads(n: int | None) -> None:
 
 
 def _size(text: str) -> int:
-    from g3r.memory_size import parsed_size
+    from g3r.memory import parsed_size
 
     try:
         return parsed_size(text)

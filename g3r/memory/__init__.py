@@ -1,0 +1,15 @@
+"""Memory: stated before it is taken, planned to stay below a limit."""
+
+from g3r.memory.estimate import MemoryEstimate, estimate_memory
+from g3r.memory.plan import MemoryPlan, plan_for_stacks, plan_memory
+from g3r.memory.size import gigabytes, parsed_size
+
+__all__ = [
+    "MemoryEstimate",
+    "MemoryPlan",
+    "estimate_memory",
+    "gigabytes",
+    "parsed_size",
+    "plan_for_stacks",
+    "plan_memory",
+]
