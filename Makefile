@@ -25,7 +25,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench bench-phantom clean
+.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench bench-phantom clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -57,6 +57,12 @@ test: install ## lint, types and all quick tests
 
 test-slow: install ## the tests that take minutes
 	$(BIN)/pytest -m slow
+
+test-numerics: install ## numbers at the extremes: the tables of docs/numerics.md, checked
+	$(BIN)/pytest -m "numerics or not slow" tests/numerics
+
+test-faults: install ## bad input by the hundred, fuzzed headers, kills, full disks, limits
+	$(BIN)/pytest -m "faults or not slow" tests/faults
 
 lint: install ## ruff: style, imports, docstrings
 	$(BIN)/ruff check .
