@@ -172,7 +172,7 @@ def fit_adaptive(
         done.n_added += len(blobs)
         done.n_rounds += 1
     cloud = _thinned(fitted(cloud, last_steps), spare, done)
-    cloud = solve_peaks_on(cloud, target, settings.peak_iterations, record_bytes=stage.record_bytes)
+    cloud = solve_peaks_on(cloud, target, settings.peak_iterations, stage.cutoff_sigma, stage.record_bytes)
     residual = left(cloud)
     done.rms = float(np.sqrt((residual[mask] ** 2).mean()))
     done.share_over_bound = float((local_rms(residual, mask, grid, window_mm)[mask] > settings.bound).mean())
