@@ -25,7 +25,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench bench-phantom clean
+.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench bench-phantom clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -107,6 +107,9 @@ bench-uncertainty: install ## stated uncertainty against error, on subjects left
 bench-gaussians: install ## PSNR against number of Gaussians, by bound and on a lattice (G3R_TEST_DATA for the atlas)
 	$(BIN)/python -m benchmarks.gaussian_count --docs docs/tradeoff.md \
 		--figure docs/images/gaussian-count.png
+
+bench-convergence: install ## optimiser steps to within 0.1 dB of the end (G3R_TEST_DATA): docs/tradeoff.md
+	$(BIN)/python -m benchmarks.fit_convergence "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --docs docs/tradeoff.md $(BENCH_ARGS)
 
 bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
 	$(BIN)/python -m benchmarks.lesions --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)

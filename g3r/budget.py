@@ -86,6 +86,11 @@ class TimeBudget:
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
         return cls(Deadline.after(seconds - spent_s), seconds)
 
+    @property
+    def missed(self) -> bool:
+        """Whether more was taken than promised: a tenth and two seconds over the budget."""
+        return self.deadline.remaining_s < -(0.1 * self.given_s + 2.0)
+
     def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
         """Settings with the registration of the preset that the budget allows, and its deadline."""
         left = self.deadline.remaining_s

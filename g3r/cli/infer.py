@@ -144,7 +144,8 @@ def _run(options: argparse.Namespace) -> int:
         reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, plan, folder)
-        result = reconstructor.reconstruct(stacks, budget=_budget(options.time_budget))
+        budget = _budget(options.time_budget)
+        result = reconstructor.reconstruct(stacks, budget=budget)
     result.record["command"] = {
         "stacks": [stack.name for stack in stacks],
         "preset": None if options.time_budget else options.preset, "seed": options.seed,
@@ -155,6 +156,11 @@ def _run(options: argparse.Namespace) -> int:
     result.save(folder, replace=options.force)
     if options.tensorboard:
         _write_tensorboard(Path(options.tensorboard), result)
+    if budget is not None and budget.missed:
+        logging.getLogger(__name__).warning(
+            "time budget of %g s: took %.0f s; registration, volume and files need at least that here",
+            budget.given_s, time.monotonic() - STARTED_S,
+        )  # fmt: skip
     seconds = sum(result.record["seconds"].values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")

@@ -48,6 +48,14 @@ def test_what_was_spent_before_counts():
     assert 6.5 < TimeBudget.of(10.0, spent_s=3.0).deadline.remaining_s <= 7.0
 
 
+@pytest.mark.parametrize(("late_s", "missed"), [(-1.0, False), (2.9, False), (3.1, True)])
+def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool):
+    clock = Clock()
+    one = TimeBudget(Deadline.after(10.0, clock), 10.0)
+    clock.now += 10.0 + late_s
+    assert one.missed is missed
+
+
 def test_more_time_never_means_a_shorter_registration():
     order = list(MOTION_FROM_S)
     chosen = []
