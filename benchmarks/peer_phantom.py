@@ -22,7 +22,9 @@ from data_synth.export import check_output, save_simulation
 from data_synth.phantom import fetal_brain_phantom
 from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
 
-WEEKS = 26.0
+WEEKS = 18.0
+"""The youngest that there is: heads of this size are as young, and as smooth."""
+
 VOXELS, VOXEL_MM = 64, 0.8
 STACK_SHAPE, PIXEL_MM, THICKNESS_MM = (58, 58, 18), 0.8, 2.4
 LENGTH_MM = 42.0

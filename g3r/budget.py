@@ -52,8 +52,8 @@ output of as many voxels; the picture and the files take `WRITING_S` besides."""
 
 WRITING_S = 1.5
 
-SHARE_STEPS = 35
-"""The map of the prior's share costs as much as so many optimiser steps."""
+SHARE_STEPS = 18
+"""A probe for the map of the prior's share costs as much as so many optimiser steps."""
 
 PROBE_EVERY = 8
 """Every so many slices are rendered to time a step."""
@@ -139,13 +139,17 @@ class TimeBudget:
         probed = PRESETS["fast"].gaussian_spacing_pixels
         cloud = seed_cloud(prior, start.mask, start.grid, gaussian_spacing_mm(start.slices, probed))
         step_s = timed_step(cloud, start.slices, rng)
-        reserve_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
-        if settings.use_prior:
-            reserve_s += SHARE_STEPS * step_s
-        left = max(0.0, self.deadline.remaining_s - reserve_s)
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
-        fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left)
-        chosen = next(fitting, "draft")
+        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
+        for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
+            reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
+            left = max(0.0, self.deadline.remaining_s - reserve_s)
+            fitting = (
+                n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left
+            )
+            chosen = next(fitting, "draft")
+            if chosen != "draft":
+                break
         self.choices |= {
             "fit": chosen, "step_s": round(step_s, 4), "n_gaussians_timed": len(cloud),
             "reserve_s": round(reserve_s, 2), "left_s": round(left, 2),
@@ -154,6 +158,7 @@ class TimeBudget:
         preset = PRESETS[chosen]
         settings = replace(
             settings, gaussian_spacing_pixels=preset.gaussian_spacing_pixels, adaptive=preset.adaptive,
+            share_probes=probes,
             prior_stage=replace(preset.prior_stage, record_bytes=settings.prior_stage.record_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
         )  # fmt: skip

@@ -33,6 +33,7 @@ class ReconstructionSettings:
         prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
+        share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         seed: of every random choice.
@@ -49,6 +50,7 @@ class ReconstructionSettings:
     prior_whole_voxels: int = MAX_WHOLE_VOXELS
     prior_tile_voxels: int = TILE_VOXELS
     prior_halo_voxels: int = HALO_VOXELS
+    share_probes: int = 2
     use_prior: bool = True
     distillation: bool = True
     seed: int = 0
@@ -62,11 +64,13 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=2.85,
         adaptive=None,
         prior_views=1,
+        share_probes=1,
         motion=replace(
             _BALANCED.motion,
             n_candidates=1500,
+            network_as_reserve=True,
             stacks=False,
-            attempts=2,
+            attempts=1,
             n_rounds=6,
             finest_voxel_mm=1.6,
             pixels_at_most=200_000,
@@ -79,7 +83,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=2.5,
         adaptive=None,
         prior_views=1,
-        motion=replace(_BALANCED.motion, n_candidates=2500, n_rounds=9, finest_voxel_mm=1.4),
+        motion=replace(_BALANCED.motion, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),

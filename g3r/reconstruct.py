@@ -38,7 +38,7 @@ from g3r.motion.confidence import (
     stack_confidences,
 )
 from g3r.motion.prior_registration import register_to_prior
-from g3r.motion.template_registration import head_volume_mm3
+from g3r.motion.template_registration import head_volume_mm3, template_fits
 from g3r.pace import Deadline
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
@@ -218,8 +218,9 @@ class GaussianReconstructor:
         if settings.use_prior:
             with clock("prior share"):
                 prior_share = estimate_prior_share(
-                    fit, density, prior_grid, mask, grid, rng, record_bytes=settings.slice_stage.record_bytes
-                )
+                    fit, density, prior_grid, mask, grid, rng, settings.share_probes,
+                    record_bytes=settings.slice_stage.record_bytes,
+                )  # fmt: skip
         with clock("uncertainty"):
             uncertainty = estimate_uncertainty(
                 volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,
@@ -266,11 +267,14 @@ class GaussianReconstructor:
         """
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
+        template = self.pose_meta.template if self.pose_meta else None
         proposals = {}
-        if self.pose_network is not None and self.pose_meta is not None and chosen.motion.network:
+        wanted = chosen.motion.network
+        if chosen.motion.network_as_reserve:
+            wanted &= template is None or not template_fits(slices, template)
+        if self.pose_network is not None and self.pose_meta is not None and wanted:
             pose = predict_poses(self.pose_network, self.pose_meta, slices)
             proposals["network"] = pose @ slices.header_pose.inverse()
-        template = self.pose_meta.template if self.pose_meta else None
         return estimate_motion(
             slices, chosen.motion, self._report("motion"), template=template, proposals=proposals,
             deadline=deadline,

@@ -13,6 +13,7 @@ class MotionSettings:
         flatten: divide slow trends of intensity out of each stack before it is registered.
         template: place runs of slices in mean heads (needs a template); gives the standard orientation.
         network: consider the pose network's proposal.
+        network_as_reserve: ... only where no mean head is of the subject's size.
         stacks: consider stacks registered to each other from many starts.
         runs: place runs of slices again in the volume of the other stacks.
         n_candidates: random motions tried for a stack in one go of the search.
@@ -28,6 +29,7 @@ class MotionSettings:
     flatten: bool = True
     template: bool = True
     network: bool = True
+    network_as_reserve: bool = False
     stacks: bool = True
     runs: bool = True
     n_candidates: int = 4000
