@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,15 +112,22 @@ class ReconstructionResult:
                 shutil.rmtree(beside, ignore_errors=True)
 
     def _write(self, folder: Path) -> None:
+        volumes = {name: (getattr(self, name), self.grid) for name in ("volume", "mask", "uncertainty")}
+        if self.prior_share is not None:
+            volumes["prior_share"] = self.prior_share, self.grid
+        volumes |= {name: (getattr(self, name), self.prior_grid) for name in ("prior", "coarse", "density")}
+        with ThreadPoolExecutor() as pool:  # compression runs beside the drawing of sections
+            saved = [
+                pool.submit(save_volume, folder / f"{name}.nii.gz", data, grid.affine)
+                for name, (data, grid) in volumes.items()
+            ]
+            self._write_others(folder)
+        for one in saved:
+            one.result()
+
+    def _write_others(self, folder: Path) -> None:
         from g3r.report.sections import save_sections
 
-        save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
-        save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
-        save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
-        if self.prior_share is not None:
-            save_volume(folder / "prior_share.nii.gz", self.prior_share, self.grid.affine)
-        for name in ("prior", "coarse", "density"):
-            save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import logging
 import os
 import sys
@@ -109,6 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     try:
         return _run(options)
     except G3RError as error:
