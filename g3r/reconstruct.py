@@ -31,6 +31,7 @@ from g3r.fitting.slice_stage import fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
+from g3r.memory import give_back
 from g3r.motion import MotionEstimate, estimate_motion
 from g3r.motion.confidence import (
     pose_warnings,
@@ -279,11 +280,13 @@ class GaussianReconstructor:
     def _prior(self, start: FitStart, settings: ReconstructionSettings) -> NDArray[np.float32]:
         if self.network is None:
             return start.sharp
-        return estimate_prior(
+        prior = estimate_prior(
             self.network, start.coarse, start.density, start.sharp, n_views=settings.prior_views,
             max_whole_voxels=settings.prior_whole_voxels, tile_voxels=settings.prior_tile_voxels,
             halo_voxels=settings.prior_halo_voxels,
         )  # fmt: skip
+        give_back()  # the most that is ever freed at a time
+        return prior
 
     def _prior_cloud(
         self,

@@ -70,6 +70,8 @@ def estimate_memory(
     settings: ReconstructionSettings,
     n_threads: int = 1,
     process_bytes: int | None = None,
+    *,
+    at_once: bool = False,
 ) -> MemoryEstimate:
     """Memory of every stage, from sizes alone.
 
@@ -78,6 +80,7 @@ def estimate_memory(
         settings: of the reconstruction.
         n_threads: of the kernels.
         process_bytes: what the process holds before; as it is now when None.
+        at_once: with `give_back_at_once`.
     """
     sizes = sizes_of(slices, settings)
     start = held_bytes() if process_bytes is None else process_bytes
@@ -96,7 +99,8 @@ def estimate_memory(
     }
     if settings.use_prior:
         seen = _seen_voxels(sizes.prior_shape, settings)
-        stages["prior network"] = volumes + NETWORK_START + NETWORK_PER_VOXEL * seen + 16 * voxels
+        begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
+        stages["prior network"] = volumes + begin + per_voxel * seen + 16 * voxels
     stages |= {
         "fit to prior": volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
         "fit to slices": volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
@@ -115,7 +119,7 @@ SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 MOTION_PER_PIXEL = 150
 COARSE_PER_PIXEL, COARSE_VOLUMES = 130, 5
-NETWORK_START, NETWORK_PER_VOXEL = 60_000_000, 150
+NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with, and per voxel
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
