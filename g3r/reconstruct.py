@@ -221,6 +221,7 @@ class GaussianReconstructor:
                 prior_share = estimate_prior_share(
                     fit, density, prior_grid, mask, grid, rng, record_bytes=settings.slice_stage.record_bytes
                 )
+                give_back()
         with clock("uncertainty"):
             uncertainty = estimate_uncertainty(
                 volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,

@@ -107,7 +107,7 @@ def estimate_memory(
         "volume": outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
     if settings.use_prior:
-        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + 12 * output
+        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + EVIDENCE_PER_VOXEL * output
     stages["writing"] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
@@ -123,7 +123,7 @@ NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
-SHARE_PER_PIXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 40, 16
+SHARE_PER_PIXEL, SHARE_PER_VOXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 46, 26
 
 
 def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
