@@ -50,8 +50,8 @@ CONFIGURATIONS = (
 """Small and large heads, few and many stacks, coarse and fine voxels; draft where nothing else is asked."""
 
 LIMITED = (
-    Configuration(30, 3, "draft", 0.8),
-    Configuration(37, 3, "draft", 0.5),
+    Configuration(30, 3, "balanced", 0.8),
+    Configuration(30, 1, "draft", 0.5),
 )
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
 
