@@ -86,7 +86,7 @@ def estimate_memory(
     start = held_bytes() if process_bytes is None else process_bytes
     buffers = min(n_threads, MOST_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
-    resting = LIBRARIES_LATER + SLICES_PER_PIXEL * n_pixels
+    resting = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
     volumes = resting + VOLUMES_PER_VOXEL * voxels
     records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
@@ -114,7 +114,7 @@ def estimate_memory(
 
 
 # Bytes, measured; see the module's docstring.
-LIBRARIES_LATER = 110_000_000
+LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 110_000_000, 70_000_000
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 MOTION_PER_PIXEL = 150
