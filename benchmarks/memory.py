@@ -43,14 +43,12 @@ CONFIGURATIONS = (
     Configuration(30, 6, "draft", 1.2),
     Configuration(37, 1, "draft", 0.8),
     Configuration(37, 3, "draft", 1.2, 1, ("--no-prior",)),
-    Configuration(37, 3, "draft", 0.5),
-    Configuration(37, 6, "draft", 0.5, 2),
-    Configuration(37, 3, "balanced", 0.8, 2),
+    Configuration(37, 3, "draft", 0.5, 2),
 )
 """Small and large heads, few and many stacks, coarse and fine voxels; draft where nothing else is asked."""
 
 LIMITED = (
-    Configuration(30, 3, "balanced", 0.8),
+    Configuration(30, 3, "draft", 0.8),
     Configuration(30, 1, "draft", 0.5),
 )
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
