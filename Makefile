@@ -25,7 +25,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench bench-phantom clean
+.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench bench-phantom bench-memory clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -132,6 +132,9 @@ bench: install ## kernels, scaling and speed against accuracy, on phantoms or on
 bench-phantom: install ## a small phantom of the size that other methods were timed on: seconds of `fast`
 	$(BIN)/python -m benchmarks.peer_phantom --force --output $(PHANTOM_CASES)/small
 	$(BIN)/g3r-bench trade $(PHANTOM_CASES)/small --presets fast --output runs/bench/phantom $(BENCH_ARGS)
+
+bench-memory: install ## memory as stated and as held, runs below limits, on phantoms, about 20 min: docs/tradeoff.md
+	$(BIN)/python -m benchmarks.memory --docs docs/tradeoff.md $(BENCH_ARGS)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -46,16 +46,19 @@ COARSE_PER_VIEW = 1.2
 VIEWS_SHARE = 0.2
 """Of the time left, the most that views of the prior beyond the first may take."""
 
-COARSE_AT_END = 2.5
+COARSE_AT_END = 0.9
 """Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
 output of as many voxels; the picture and the files take `WRITING_S` besides."""
 
 WRITING_S = 1.5
 
+TOO_LITTLE = 4.0
+"""With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first."""
+
 SHARE_STEPS = 18
 """A probe for the map of the prior's share costs as much as so many optimiser steps."""
 
-PROBE_EVERY = 8
+PROBE_EVERY = 4
 """Every so many slices are rendered to time a step."""
 
 COST_EXPONENT = 0.6
@@ -136,11 +139,13 @@ class TimeBudget:
             n_output_voxels: of the volume to be written.
             rng: for the steps that are timed.
         """
+        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
+        if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
+            return self._hurried(settings, after_s + (coarse_s if settings.use_prior else 0.0))
         probed = PRESETS["fast"].gaussian_spacing_pixels
         cloud = seed_cloud(prior, start.mask, start.grid, gaussian_spacing_mm(start.slices, probed))
         step_s = timed_step(cloud, start.slices, rng)
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
-        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
             left = max(0.0, self.deadline.remaining_s - reserve_s)
@@ -155,7 +160,20 @@ class TimeBudget:
             "reserve_s": round(reserve_s, 2), "left_s": round(left, 2),
         }  # fmt: skip
         logger.info("time budget: %.0f s left for the fit, Gaussians as in %s", left, chosen)
-        preset = PRESETS[chosen]
+        return self._chosen(settings, chosen, probes, reserve_s)
+
+    def _hurried(
+        self, settings: ReconstructionSettings, reserve_s: float
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        """For when timing a step would take the time of the steps themselves."""
+        self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
+        logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
+        return self._chosen(settings, "draft", PRESETS["draft"].share_probes, reserve_s)
+
+    def _chosen(
+        self, settings: ReconstructionSettings, name: str, probes: int, reserve_s: float
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        preset = PRESETS[name]
         settings = replace(
             settings, gaussian_spacing_pixels=preset.gaussian_spacing_pixels, adaptive=preset.adaptive,
             share_probes=probes,

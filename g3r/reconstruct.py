@@ -31,6 +31,7 @@ from g3r.fitting.slice_stage import fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
+from g3r.memory import give_back
 from g3r.motion import MotionEstimate, estimate_motion
 from g3r.motion.confidence import (
     pose_warnings,
@@ -221,6 +222,7 @@ class GaussianReconstructor:
                     fit, density, prior_grid, mask, grid, rng, settings.share_probes,
                     record_bytes=settings.slice_stage.record_bytes,
                 )  # fmt: skip
+                give_back()
         with clock("uncertainty"):
             uncertainty = estimate_uncertainty(
                 volume, mask, grid, fit, prior=prior, density=density, prior_grid=prior_grid,
@@ -283,11 +285,13 @@ class GaussianReconstructor:
     def _prior(self, start: FitStart, settings: ReconstructionSettings) -> NDArray[np.float32]:
         if self.network is None:
             return start.sharp
-        return estimate_prior(
+        prior = estimate_prior(
             self.network, start.coarse, start.density, start.sharp, n_views=settings.prior_views,
             max_whole_voxels=settings.prior_whole_voxels, tile_voxels=settings.prior_tile_voxels,
             halo_voxels=settings.prior_halo_voxels,
         )  # fmt: skip
+        give_back()  # the most that is ever freed at a time
+        return prior
 
     def _prior_cloud(
         self,

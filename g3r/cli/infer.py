@@ -252,6 +252,8 @@ def _dry_run(stacks: list[Stack], plan: MemoryPlan, folder: Path) -> int:
             f"thickness {stack.thickness_mm:g} mm, {int(stack.mask.sum())} masked"
         )
     print(plan.estimate.line())
+    for change in plan.changes:
+        print(change)
     print(f"would write a volume of {plan.settings.resolution_mm:g} mm to {folder}")
     return 0
 

@@ -1,5 +1,6 @@
 """Memory: stated before it is taken, planned to stay below a limit."""
 
+from g3r.memory.allocator import give_back
 from g3r.memory.estimate import MemoryEstimate, estimate_memory
 from g3r.memory.plan import MemoryPlan, plan_for_stacks, plan_memory
 from g3r.memory.size import gigabytes, parsed_size
@@ -9,6 +10,7 @@ __all__ = [
     "MemoryPlan",
     "estimate_memory",
     "gigabytes",
+    "give_back",
     "parsed_size",
     "plan_for_stacks",
     "plan_memory",

@@ -70,6 +70,8 @@ def estimate_memory(
     settings: ReconstructionSettings,
     n_threads: int = 1,
     process_bytes: int | None = None,
+    *,
+    at_once: bool = False,
 ) -> MemoryEstimate:
     """Memory of every stage, from sizes alone.
 
@@ -78,12 +80,13 @@ def estimate_memory(
         settings: of the reconstruction.
         n_threads: of the kernels.
         process_bytes: what the process holds before; as it is now when None.
+        at_once: with `give_back_at_once`.
     """
     sizes = sizes_of(slices, settings)
     start = held_bytes() if process_bytes is None else process_bytes
     buffers = min(n_threads, MOST_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
-    resting = LIBRARIES_LATER + SLICES_PER_PIXEL * n_pixels
+    resting = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
     volumes = resting + VOLUMES_PER_VOXEL * voxels
     records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
@@ -96,30 +99,31 @@ def estimate_memory(
     }
     if settings.use_prior:
         seen = _seen_voxels(sizes.prior_shape, settings)
-        stages["prior network"] = volumes + NETWORK_START + NETWORK_PER_VOXEL * seen + 16 * voxels
+        begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
+        stages["prior network"] = volumes + begin + per_voxel * seen + 16 * voxels
     stages |= {
         "fit to prior": volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
         "fit to slices": volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
         "volume": outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
     if settings.use_prior:
-        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + 12 * output
+        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + EVIDENCE_PER_VOXEL * output
     stages["writing"] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
 
 
 # Bytes, measured; see the module's docstring.
-LIBRARIES_LATER = 110_000_000
+LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 110_000_000, 70_000_000
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 MOTION_PER_PIXEL = 150
 COARSE_PER_PIXEL, COARSE_VOLUMES = 130, 5
-NETWORK_START, NETWORK_PER_VOXEL = 60_000_000, 150
+NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with, and per voxel
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
-SHARE_PER_PIXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 40, 16
+SHARE_PER_PIXEL, SHARE_PER_VOXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
 
 
 def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
+from g3r.memory.allocator import can_give_back_at_once, give_back_at_once
 from g3r.memory.estimate import (
     PAIR_BYTES,
     MemoryEstimate,
@@ -25,6 +26,7 @@ from g3r.presets import ReconstructionSettings
 logger = logging.getLogger(__name__)
 
 LEAST_RECORD_BYTES = 20_000_000
+STAGES_WITH_RECORDS = ("fit to prior", "fit to slices", "prior share")
 PLANNED_HALO_VOXELS = 48
 PLANNED_TILES = (128, 96, 64, 48, 32, 16)
 """Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""
@@ -34,13 +36,15 @@ PLANNED_TILES = (128, 96, 64, 48, 32, 16)
 class MemoryPlan:
     """Settings that stay below a limit.
 
-    settings; their estimate; limit_bytes (None: no limit); what was changed, as sentences for run.json.
+    settings; their estimate; limit_bytes (None: no limit); what was changed, as sentences for run.json;
+    whether freed memory has to be given back at once (`give_back_at_once`).
     """
 
     settings: ReconstructionSettings
     estimate: MemoryEstimate
     limit_bytes: int | None
     changes: list[str]
+    at_once: bool = False
 
     def record(self) -> dict[str, Any]:
         """What run.json says."""
@@ -73,31 +77,28 @@ def plan_memory(
     """
     start = held_bytes() if process_bytes is None else process_bytes
 
-    def estimate(of: ReconstructionSettings) -> MemoryEstimate:
-        return estimate_memory(slices, of, n_threads, start)
+    def estimate(of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
+        return estimate_memory(slices, of, n_threads, start, at_once=at_once)
 
-    found, changes = estimate(settings), list[str]()
-    if limit_bytes is None:
-        return MemoryPlan(settings, found, None, changes)
-    sizes = sizes_of(slices, settings)
-    for change in (_fewer_records, _smaller_tiles):
-        if found.peak <= limit_bytes:
-            break
-        settings, said = change(settings, sizes, estimate, limit_bytes)
-        changes += said
-        found = estimate(settings)
-    if found.peak > limit_bytes:
+    plan = _lowered(slices, settings, limit_bytes, estimate)
+    needed = plan.estimate
+    if limit_bytes is not None and needed.peak > limit_bytes:
+        remedy = "choose a coarser --resolution, crop the masks, or raise --max-memory"
+        if settings.use_prior:
+            without = _lowered(slices, replace(settings, use_prior=False), limit_bytes, estimate).estimate
+            if without.peak <= limit_bytes:
+                remedy = f"raise --max-memory, or take --no-prior ({gigabytes(without.peak)})"
         raise InputError(
-            f"--max-memory: needs at least {gigabytes(found.peak)} ({found.stage}), the limit is "
-            f"{gigabytes(limit_bytes)}; choose a coarser --resolution, crop the masks, or raise --max-memory"
+            f"--max-memory: needs at least {gigabytes(needed.peak)} ({needed.stage}), the limit is "
+            f"{gigabytes(limit_bytes)}; {remedy}"
         )
-    return MemoryPlan(settings, found, limit_bytes, changes)
+    return plan
 
 
 def plan_for_stacks(
     stacks: Sequence[Stack], settings: ReconstructionSettings, limit_bytes: int | None
 ) -> MemoryPlan:
-    """`plan_memory` for this process as it is; says in the log what it found.
+    """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
 
     Raises:
         InputError: it does not fit, or the stacks cannot be used.
@@ -105,6 +106,8 @@ def plan_for_stacks(
     import numba
 
     plan = plan_memory(slices_from_stacks(stacks), settings, limit_bytes, numba.get_num_threads())
+    if plan.at_once:
+        give_back_at_once()
     logger.info(plan.estimate.line())
     for change in plan.changes:
         logger.info(change)
@@ -117,40 +120,63 @@ def plan_for_stacks(
     return plan
 
 
-Estimator = Callable[[ReconstructionSettings], MemoryEstimate]
-Change = tuple[ReconstructionSettings, list[str]]
+class Estimator(Protocol):
+    """`estimate_memory` of one problem."""
+
+    def __call__(self, of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
+        """What settings need."""
+        ...
+
+
+def _lowered(
+    slices: Slices, settings: ReconstructionSettings, limit: int | None, estimate: Estimator
+) -> MemoryPlan:
+    """Settings changed until they need no more than the limit, or nothing is left to change."""
+    found = estimate(settings)
+    if limit is None or found.peak <= limit:
+        return MemoryPlan(settings, found, limit, [])
+    changes = []
+    at_once = can_give_back_at_once()
+    if at_once:
+        changes.append("memory limit: freed memory is given back at once (slower)")
+    stages = estimate(settings, at_once).stages
+    with_records = max(stages.get(name, 0) for name in STAGES_WITH_RECORDS)
+    less = _fewer_records(settings, sizes_of(slices, settings), with_records - limit)
+    if less is not settings:
+        kept = less.slice_stage.record_bytes
+        changes.append(f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)")
+    tiled = _smaller_tiles(less, lambda of: estimate(of, at_once).peak, limit)
+    if tiled is not less:
+        edge = tiled.prior_tile_voxels
+        changes.append(f"memory limit: prior network in tiles of {edge} voxels (slower; within 1e-3)")
+    return MemoryPlan(tiled, estimate(tiled, at_once), limit, changes, at_once)
 
 
 def _fewer_records(
-    settings: ReconstructionSettings, sizes: ProblemSizes, estimate: Estimator, limit: int
-) -> Change:
-    needed = estimate(settings)
+    settings: ReconstructionSettings, sizes: ProblemSizes, excess_bytes: int
+) -> ReconstructionSettings:
+    """Settings whose records of pairs take so many bytes less."""
     own = round(min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes))
-    kept = max(own - (needed.peak - limit), LEAST_RECORD_BYTES)
-    less = replace(
+    kept = max(own - max(excess_bytes, 0), LEAST_RECORD_BYTES)
+    if kept >= own:
+        return settings
+    return replace(
         settings,
         prior_stage=replace(settings.prior_stage, record_bytes=kept),
         slice_stage=replace(settings.slice_stage, record_bytes=kept),
     )
-    if kept >= own or estimate(less).peak >= needed.peak:
-        return settings, []
-    return less, [f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)"]
 
 
 def _smaller_tiles(
-    settings: ReconstructionSettings, sizes: ProblemSizes, estimate: Estimator, limit: int
-) -> Change:
+    settings: ReconstructionSettings, peak: Callable[[ReconstructionSettings], int], limit: int
+) -> ReconstructionSettings:
     best = settings
     for edge in PLANNED_TILES:
+        if peak(best) <= limit:
+            break
         tiled = replace(
             settings, prior_whole_voxels=0, prior_tile_voxels=edge, prior_halo_voxels=PLANNED_HALO_VOXELS
         )
-        if estimate(tiled).peak < estimate(best).peak:
+        if peak(tiled) < peak(best):
             best = tiled
-        if estimate(best).peak <= limit:
-            break
-    if best is settings:
-        return settings, []
-    return best, [
-        f"memory limit: prior network in tiles of {best.prior_tile_voxels} voxels (slower; within 1e-3)"
-    ]
+    return best

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
@@ -21,5 +22,5 @@ def parsed_size(text: str) -> int:
 
 
 def gigabytes(n_bytes: float) -> str:
-    """For people: 1.1 GB."""
-    return f"{n_bytes / 1e9:.2g} GB" if n_bytes < 1e10 else f"{n_bytes / 1e9:.0f} GB"
+    """For people, rounded up: 1.15 GB."""
+    return f"{math.ceil(n_bytes / 1e7) / 100:.2f} GB"

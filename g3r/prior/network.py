@@ -17,7 +17,7 @@ from g3r.prior.gate import confidence_from_density
 _LEAKY_SLOPE = 0.1
 _BLOCK: dict[str, Any] = {
     "adn_ordering": "A",
-    "act": ("LEAKYRELU", {"negative_slope": _LEAKY_SLOPE}),
+    "act": ("LEAKYRELU", {"negative_slope": _LEAKY_SLOPE, "inplace": True}),
     "norm": None,
 }
 
