@@ -85,6 +85,22 @@ class FitParameters:
         """Number of Gaussians."""
         return len(self.value["peak"])
 
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """All values in one flat array (a view)."""
+        return np.asarray(self._buffers[0])
+
+    @property
+    def gradients(self) -> NDArray[np.float32]:
+        """All gradients in one flat array (a view)."""
+        return np.asarray(self._buffers[1])
+
+    def restart(self, values: NDArray[np.float32]) -> None:
+        """Take other values, and begin Adam anew there."""
+        self._buffers[0] = values
+        self._buffers[2:] = 0.0
+        self.n_steps = 0
+
     def cloud(self) -> GaussianCloud:
         """A copy of the present cloud."""
         names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
