@@ -14,12 +14,12 @@ from g3r.fitting.parameters import FitParameters
 logger = logging.getLogger(__name__)
 
 RISE = 1.5
-"""A loss is too high when it is over so many times the best. Fits that go well never come near: random planes
-and new weights move the loss by a tenth."""
+"""A loss is too high when it is over so many times the best ..."""
 
-LEVEL_SHARE = 0.02
-"""Nor is it too high before it has risen by this share of the mean absolute pixel: a fit that begins at a
-perfect match can only get worse by a little."""
+LEVEL_SHARE = 0.15
+"""... and has risen by so much of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (the
+peaks that they begin with are a least-squares optimum, and the loss is L1), with ten times the step sizes by
+0.4 (docs/numerics.md)."""
 
 SHORTER = 0.3
 """What a step back makes of all step sizes, from there to the end."""
@@ -31,9 +31,9 @@ KEEP_EVERY = 5
 class Safeguard:
     """Takes the steps of a fit, and takes them back if they lead up or out of the numbers.
 
-    The parameters with the lowest loss are kept, in one copy that is looked after every few steps. A loss that
-    has risen too far, or that is not finite, or a gradient that is not, brings them back; step sizes go down and Adam
-    begins anew. A fit in which that does not happen takes the steps that it would take without.
+    The parameters with the lowest loss are kept, in one copy that is renewed every few steps at most. A loss
+    that has risen too far, or a loss or gradient that is not finite, brings them back; step sizes go down and
+    Adam begins anew. A fit in which that does not happen takes the steps that it would take without.
 
     Args:
         parameters: of the fit.
