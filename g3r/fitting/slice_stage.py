@@ -197,8 +197,8 @@ class SliceLoss:
                 prior.planes, prior.value, prior.weight, parameters.origin_mm,
                 cutoff_sigma=settings.cutoff_sigma,
             )  # fmt: skip
-            # with the distance being a mean over the prior's trust, this makes the term the mean over the head
-            # of trust times difference: well-measured heads feel little of it, sparsely measured ones much
+            # the distance is a mean over the prior's trust, so this makes the term the mean over the head of
+            # trust times difference: well-measured heads feel little of it, sparsely measured ones much
             self.prior_share = float(prior.weight[prior.weight > 0].mean())
             terms.append(self.distilled)
         self.objective = CloudObjective(parameters, terms, settings.scale_weight)

@@ -24,7 +24,7 @@ SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
 
 MOST_PIXELS = 1e9
-"""Ellipses of more pixels than that, from the centre to the border, are not drawn: 32 bits number the pixels."""
+"""Ellipses that reach further than that are not drawn: 32 bits number the pixels. `render` refuses them."""
 
 # Gradient columns of a Gaussian in the buffers: peak, mean (3), covariance xx xy xz yy yz zz, log-volume.
 N_GRADIENTS = 11
@@ -95,7 +95,7 @@ def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut,
         half_x, half_y = math.sqrt(c2 * cxx) * over_x, math.sqrt(c2 * cyy) * over_y
         if not (px + half_x >= 0.0 and py + half_y >= 0.0 and px - half_x < n_x and py - half_y < n_y):
             continue
-        if not (half_x < MOST_PIXELS and half_y < MOST_PIXELS):  # beyond integers; see `render`
+        if not (half_x < MOST_PIXELS and half_y < MOST_PIXELS):
             continue
         unit = gain
         if exact:

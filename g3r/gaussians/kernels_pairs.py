@@ -13,12 +13,12 @@ SLACK_MM = 1e-4
 """What float32 may be wrong by in the distance of a Gaussian from a plane of the same scene."""
 
 VARIANCE_SLACK = 1e-6
-"""What float32 may be wrong by in a variance along an axis, over the trace: all of it, where a Gaussian is flat."""
+"""What float32 may be wrong by in a variance along an axis, over the trace: all of it, in a flat Gaussian."""
 
 
 @numba.njit(parallel=True, cache=True)
 def columns_of(shapes, middle, columns):
-    """Mean from `middle` and covariance [9, N] in float32, each a row of its own: the search runs in vectors."""
+    """Mean from `middle` and covariance [9, N] in float32, a row each, so that the search runs in vectors."""
     for j in numba.prange(len(shapes)):
         for n in range(3):
             columns[n, j] = shapes[j, n] - middle[n]

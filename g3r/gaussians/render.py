@@ -57,8 +57,8 @@ def render(
         [P] pixels, plane after plane, in C order inside a plane.
 
     Raises:
-        ValueError: an unknown backend or amplitude, parameters in half precision, a cut-off outside (0, 6], a twist or gain that is not
-            finite, or a sigma of more than 1e8 pixels (numba only).
+        ValueError: an unknown backend or amplitude, parameters in half precision, a cut-off outside (0, 6], a
+            twist or gain that is not finite, or a sigma of more than 1e8 pixels (numba only).
 
     Source: G3R Eq. 3 and 5 with the amplitude factor (docs/method.md); gradients derived there.
     """
