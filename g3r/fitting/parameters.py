@@ -102,9 +102,17 @@ class FitParameters:
         self.n_steps = 0
 
     def cloud(self) -> GaussianCloud:
-        """A copy of the present cloud."""
+        """A copy of the present cloud.
+
+        Raises:
+            NumericalError: it has left the numbers that a cloud may have.
+        """
         names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
-        return GaussianCloud.of([torch.from_numpy(self.value[name].copy()) for name in names], self.origin_mm)
+        copies = [torch.from_numpy(self.value[name].copy()) for name in names]
+        try:
+            return GaussianCloud.of(copies, self.origin_mm)
+        except ValueError as error:
+            raise NumericalError(f"the fit broke down ({error}); lower the step sizes") from None
 
     def step(self, loss: float, factor: float) -> None:
         """One step of Adam down the gradient, with all step sizes scaled by a factor.

@@ -79,7 +79,7 @@ def test_a_ball_needs_few():
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     assert len(cloud) < BALL_MOST
     psnr = psnr_db(cloud, target)
-    assert psnr > 27.5  # 27.9 with one thread, 28.4 or so with two: sums in another order
+    assert psnr > 27.5  # sums of gradients depend on the number of threads: 27.9 with one
     uniform = lattice_cloud((volume, mask, grid), 7.0, done.steps, 24, 0)
     assert len(uniform) > 1.6 * len(cloud)
     assert psnr > psnr_db(uniform, target)
