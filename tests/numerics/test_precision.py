@@ -90,7 +90,7 @@ def moved_points_plainly(rotation: torch.Tensor, shift: torch.Tensor, points: to
 
 @pytest.mark.parametrize("density", [0.0, 1.0, 1e6])
 def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally):
-    """Rounding reaches the residual alone; where slices are dense, the gate lets a twentieth of it through."""
+    """Rounding reaches the residual alone; where slices are dense the gate passes a twentieth of it."""
     torch.manual_seed(0)
     network = DensityGatedPriorNetwork((4, 8), (1, 1), 2).eval()
     torch.nn.init.normal_(network.refiner.head.weight, std=0.1)
