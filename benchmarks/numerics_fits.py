@@ -116,7 +116,9 @@ def _points(result: ReconstructionResult) -> Planes:
     world = result.grid.world(np.argwhere(result.mask))
     world = world[np.linalg.norm(world - ORIGIN_MM, axis=1) < HEAD_RADIUS_MM - 2][::7]
     n = len(world)
-    return Planes(np.tile(np.eye(3), (n, 1, 1)), world, np.ones((n, 2)), np.ones((n, 2)), np.zeros((n, 3)))
+    return Planes(
+        np.tile(np.eye(3), (n, 1, 1)), world, np.ones((n, 2)), np.ones((n, 2), np.int64), np.zeros((n, 3))
+    )
 
 
 def _values(result: ReconstructionResult, points: Planes, motion: RigidPose | None) -> NDArray[np.float64]:
