@@ -23,8 +23,8 @@ def render_reference(
 ) -> Tensor:
     """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without any cut-off; see `g3r.gaussians.render`.
 
-    Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it;
-    differentiable by autograd in everything.
+    Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it, but
+    for poses, which are float64; differentiable by autograd in everything.
 
     Numerics: the triangular factor of S = M M^T, M = [R^T R_g diag(s), D^(1/2)], comes from M itself by QR. A
     Cholesky factor of S would lose twice the digits and fail in float32 at axis ratios of a few thousand.
@@ -38,19 +38,21 @@ def _render(
 ) -> Tensor:
     mean, log_scale, quaternion, peak = cloud.parameters
     like: dict[str, Any] = {"dtype": mean.dtype, "device": mean.device}
+    exact: dict[str, Any] = {"dtype": torch.float64, "device": mean.device}
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None, :]
     pixels = []
     uv = planes.pixel_uv_mm()
     for k in range(len(planes)):
-        rotation = torch.as_tensor(planes.rotation[k], **like)
-        center = torch.as_tensor(planes.center_mm[k] - cloud.origin_mm, **like)
+        rotation = torch.as_tensor(planes.rotation[k], **exact)
+        center = torch.as_tensor(planes.center_mm[k] - cloud.origin_mm, **exact)
         if twist is not None:
-            rotation = rotation @ torch.linalg.matrix_exp(_skew(twist[k, :3].to(**like)))
-            center = center + twist[k, 3:].to(**like)
+            rotation = rotation @ torch.linalg.matrix_exp(_skew(twist[k, :3].to(**exact)))
+            center = center + twist[k, 3:].to(**exact)
+        local_mean = ((mean.to(**exact) - center) @ rotation).to(**like)
+        rotation = rotation.to(**like)
         psf_sigma = torch.as_tensor(np.sqrt(planes.psf_var_mm2[k]), **like)
         wide = torch.cat([rotation.T @ root, torch.diag(psf_sigma).expand(len(mean), 3, 3)], 2)
         upper = torch.linalg.qr(wide.transpose(1, 2))[1]
-        local_mean = (mean - center) @ rotation
         if amplitude == "exact":
             factor = (log_scale.sum(1) - upper.diagonal(dim1=1, dim2=2).abs().log().sum(1)).exp()
         else:
