@@ -50,7 +50,7 @@ def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
 
 @given(scenes(), st.sampled_from(["numba", "objective", "peaks", "reference32"]))
 @QUICK
-def test_random_scenes_agree_with_the_reference(scene_and_ratio, backend: str, tally):
+def test_random_scenes_agree_with_the_reference(tally, scene_and_ratio, backend: str):
     scene, ratio = scene_and_ratio
     weight = torch.tensor(np.random.default_rng(0).normal(size=scene.planes.n_pixels))
     expected, exact_gradient = BACKENDS["reference64"](scene.cloud, scene.planes, weight)
@@ -69,7 +69,7 @@ def test_random_scenes_agree_with_the_reference(scene_and_ratio, backend: str, t
 
 @given(scenes(), st.floats(-3, 3), st.integers(0, 2**32 - 1))
 @QUICK
-def test_images_are_linear_in_the_peaks(scene_and_ratio, factor: float, seed: int, tally):
+def test_images_are_linear_in_the_peaks(tally, scene_and_ratio, factor: float, seed: int):
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     other = cloud.with_peak(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
@@ -85,7 +85,7 @@ def test_images_are_linear_in_the_peaks(scene_and_ratio, factor: float, seed: in
 
 @given(scenes())
 @QUICK
-def test_least_squares_never_leaves_the_numbers_nor_fits_worse(scene_and_ratio, tally):
+def test_least_squares_never_leaves_the_numbers_nor_fits_worse(tally, scene_and_ratio):
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     target = np.random.default_rng(1).normal(size=scene.planes.n_pixels).astype(np.float32)
@@ -124,7 +124,7 @@ def size_mm(*all_poses: RigidPose) -> float:
 
 @given(poses())
 @QUICK
-def test_a_pose_and_its_inverse_are_nothing(pose: RigidPose, tally):
+def test_a_pose_and_its_inverse_are_nothing(tally, pose: RigidPose):
     with tally.case():
         nothing = RigidPose.identity(len(pose))
         assert_near(pose @ pose.inverse(), nothing, size_mm(pose))
@@ -135,7 +135,7 @@ def test_a_pose_and_its_inverse_are_nothing(pose: RigidPose, tally):
 
 @given(poses(), poses(), poses(), st.integers(0, 2**32 - 1))
 @QUICK
-def test_composition_is_associative_and_is_applying_one_after_the_other(a, b, c, seed: int, tally):
+def test_composition_is_associative_and_is_applying_one_after_the_other(tally, a, b, c, seed: int):
     a, b, c = (pose.take([0]) for pose in (a, b, c))
     points = np.random.default_rng(seed).normal(0, 100, (1, 7, 3))
     with tally.case():
@@ -148,7 +148,7 @@ def test_composition_is_associative_and_is_applying_one_after_the_other(a, b, c,
 
 @given(poses())
 @QUICK
-def test_rotation_vectors_come_back(pose: RigidPose, tally):
+def test_rotation_vectors_come_back(tally, pose: RigidPose):
     with tally.case():
         vector = pose.rotvec_rad()
         assert (np.linalg.norm(vector, axis=1) <= np.pi + 1e-12).all()
@@ -159,7 +159,7 @@ def test_rotation_vectors_come_back(pose: RigidPose, tally):
 
 @given(poses(), st.integers(0, 2**32 - 1))
 @QUICK
-def test_the_motion_of_points_is_found_again(pose: RigidPose, seed: int, tally):
+def test_the_motion_of_points_is_found_again(tally, pose: RigidPose, seed: int):
     pose = pose.take([0])
     points = np.random.default_rng(seed).normal(0, 40, (30, 3))
     with tally.case():
@@ -170,7 +170,7 @@ def test_the_motion_of_points_is_found_again(pose: RigidPose, seed: int, tally):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300))
 @QUICK
-def test_long_chains_stay_rotations(seed: int, length: int, tally):
+def test_long_chains_stay_rotations(tally, seed: int, length: int):
     rng = np.random.default_rng(seed)
     with tally.case():
         pose = RigidPose.identity(1)
@@ -181,7 +181,7 @@ def test_long_chains_stay_rotations(seed: int, length: int, tally):
 
 @given(st.sampled_from(["scale", "shear", "mirror", "nan", "shape"]), st.floats(1e-4, 10))
 @QUICK
-def test_what_is_no_pose_is_refused(kind: str, size: float, tally):
+def test_what_is_no_pose_is_refused(tally, kind: str, size: float):
     rotation = np.eye(3)[None].copy()
     if kind == "scale":
         rotation *= 1 + size
