@@ -23,8 +23,8 @@ def render_reference(
 ) -> Tensor:
     """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without any cut-off; see `g3r.gaussians.render`.
 
-    Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it, but
-    for poses, which are float64; differentiable by autograd in everything.
+    Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it;
+    poses are float64 in any case. Differentiable by autograd in everything.
 
     Numerics: the triangular factor of S = M M^T, M = [R^T R_g diag(s), D^(1/2)], comes from M itself by QR. A
     Cholesky factor of S would lose twice the digits and fail in float32 at axis ratios of a few thousand.

@@ -1,4 +1,4 @@
-"""Registration of slices that say little about their poses: it ends near where it began, in finite numbers."""
+"""Registration of slices that say little about their poses: it ends near where it began, in numbers."""
 
 from __future__ import annotations
 

@@ -82,7 +82,8 @@ def test_what_samples_show_of_gaussians_below_a_pixel(tally):
         for name in ("volume", "slices"):
             with tally.case():
                 low, high = row[f"{name} lower bound"], row[f"{name} upper bound"]
-                assert row[f"{name} least"] >= low * (1 - 1e-4) - 1e-6
+                # the exponential is good to 2e-7 of a peak, and a peak shows `high` times the mass
+                assert row[f"{name} least"] >= low * (1 - 1e-6) - 3e-6 * max(1.0, high)
                 assert row[f"{name} most"] <= high * (1 + 1e-4)
                 # and the bounds are reached: on a sample, and between samples
                 assert row[f"{name} most"] == pytest.approx(high, rel=1e-4)
@@ -107,7 +108,7 @@ def test_values_by_distance_from_the_origin(tally):
             assert row["reference float64"] <= 1e-13 + 1e-15 * 1e3 * row["distance_m"]
             for name in FLOAT32:
                 assert row[name] <= shape_tolerance(3.0), (name, row)
-    assert rows[-1]["naive float32"] > 1e-3  # 100 m in float32 are good to 4 um; slopes add up
+    assert rows[-1]["naive float32"] > 3e-4  # 60 m along an axis are good to 2 um in float32
     assert_written("distance", numerics.distance_table(rows))
 
 
