@@ -61,20 +61,20 @@ def identical() -> Scene:
     return Scene(scene.cloud.take(torch.zeros(50, dtype=torch.long)), scene.planes)
 
 
-def flat(psf: bool) -> Scene:
-    """Discs of 100 mm that are 0.02 mm thick, in planes nearly parallel to them."""
+def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) -> Scene:
+    """Discs of 100 mm that are 0.02 mm thick, each in a plane nearly parallel to it and a little aside."""
     rng = np.random.default_rng(5)
-    turns = Rotation.random(6, rng=rng)
+    turns = Rotation.random(n, rng=rng)
     cloud = cloud_of(
-        rng.normal(0, 2, (6, 3)), np.tile([100.0, 100.0, 0.02], (6, 1)), np.roll(turns.as_quat(), 1, axis=1),
-        rng.uniform(0.2, 1, 6),
+        rng.normal(0, 2, (n, 3)), np.tile([100.0, 100.0, 0.02], (n, 1)), np.roll(turns.as_quat(), 1, axis=1),
+        rng.uniform(0.2, 1, n),
     )  # fmt: skip
-    tilted = turns * Rotation.from_rotvec(rng.normal(0, 3e-4, (6, 3)))
-    spacing = np.full((6, 2), 4.0)
+    tilted = turns * Rotation.from_rotvec(rng.normal(0, tilt_rad, (n, 3)))
+    spacing = np.full((n, 2), 4.0)
+    aside = turns.apply(np.array([0, 0, aside_mm]) * rng.choice([-1, 1], (n, 1)))
     planes = Planes(
-        tilted.as_matrix(),
-        ORIGIN_MM + cloud.mean_mm.numpy() + turns.apply(rng.normal(0, 0.01, (6, 1)) * [0.0, 0, 1]),
-        spacing, np.full((6, 2), 40), psf_variance_mm2(spacing, np.full(6, 0.1)) * (1.0 if psf else 0.0),
+        tilted.as_matrix(), ORIGIN_MM + cloud.mean_mm.numpy() + aside, spacing, np.full((n, 2), 40),
+        psf_variance_mm2(spacing, np.full(n, 0.1)) * (1.0 if psf else 0.0),
     )  # fmt: skip
     return Scene(cloud, planes)
 
@@ -221,16 +221,12 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
 
 def test_pairs_of_flat_gaussians_are_not_missed():
     """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
-    scene = flat(False)
-    exact = render(scene.cloud, scene.planes, backend="reference")
+    scene = flat(False, 40, 1e-5, 0.03)
     pairs = find_pairs(single(scene.cloud), scene.planes, 3.2)
     for k in range(len(scene.planes)):
-        own = scene.planes.take([k])
-        for j in range(len(scene.cloud)):
-            seen = render(scene.cloud.take([j]), own, backend="reference").max() > 0.02
-            if seen:
-                assert j in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
-    assert exact.max() > 0.1
+        shown = render(scene.cloud.take([k]), scene.planes.take([k]), backend="reference")
+        assert shown.max() > 0.3 * scene.cloud.peak[k]
+        assert k in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
 
 
 def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair():
