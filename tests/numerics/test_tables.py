@@ -83,7 +83,7 @@ def test_what_samples_show_of_gaussians_below_a_pixel(tally):
             with tally.case():
                 low, high = row[f"{name} lower bound"], row[f"{name} upper bound"]
                 # the exponential is good to 2e-7 of a peak, and a peak shows `high` times the mass
-                assert row[f"{name} least"] >= low * (1 - 1e-6) - 3e-6 * max(1.0, high)
+                assert row[f"{name} least"] >= low * (1 - 1e-5) - 3e-6 * max(1.0, high)
                 assert row[f"{name} most"] <= high * (1 + 1e-4)
                 # and the bounds are reached: on a sample, and between samples
                 assert row[f"{name} most"] == pytest.approx(high, rel=1e-4)
