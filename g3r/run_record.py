@@ -71,6 +71,7 @@ def run_record(
         ],
         "shading": fit.shading,
         "n_gaussians": len(fit.cloud),
+        "n_steps_back": sum("step_back" in entry for entry in fit.history),
         "registration": {
             "trusted": registration_trusted(confidences),
             "summary": registration_summary(confidences),

@@ -85,10 +85,34 @@ class FitParameters:
         """Number of Gaussians."""
         return len(self.value["peak"])
 
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """All values in one flat array (a view)."""
+        return np.asarray(self._buffers[0])
+
+    @property
+    def gradients(self) -> NDArray[np.float32]:
+        """All gradients in one flat array (a view)."""
+        return np.asarray(self._buffers[1])
+
+    def restart(self, values: NDArray[np.float32]) -> None:
+        """Take other values, and begin Adam anew there."""
+        self._buffers[0] = values
+        self._buffers[2:] = 0.0
+        self.n_steps = 0
+
     def cloud(self) -> GaussianCloud:
-        """A copy of the present cloud."""
+        """A copy of the present cloud.
+
+        Raises:
+            NumericalError: it has left the numbers that a cloud may have.
+        """
         names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
-        return GaussianCloud.of([torch.from_numpy(self.value[name].copy()) for name in names], self.origin_mm)
+        copies = [torch.from_numpy(self.value[name].copy()) for name in names]
+        try:
+            return GaussianCloud.of(copies, self.origin_mm)
+        except ValueError as error:
+            raise NumericalError(f"the fit broke down ({error}); lower the step sizes") from None
 
     def step(self, loss: float, factor: float) -> None:
         """One step of Adam down the gradient, with all step sizes scaled by a factor.

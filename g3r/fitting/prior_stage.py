@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.safeguard import Safeguard
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_peaks
 from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
@@ -94,7 +95,8 @@ def fit_prior(
     """Fit a seeded cloud to the prior volume.
 
     Peaks first, by least squares on every second plane; then Adam on everything with the L1 loss on random
-    planes and the scale regulariser; fewer steps if they would end after the deadline.
+    planes and the scale regulariser; fewer steps if they would end after the deadline. A loss that rises is
+    answered by going back to the best state with shorter steps (`Safeguard`).
 
     Returns:
         The fitted cloud, and the image loss of each step.
@@ -108,6 +110,7 @@ def fit_prior(
         target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
     )
     objective = CloudObjective(parameters, [term], settings.scale_weight)
+    guard = Safeguard(parameters, float(np.average(np.abs(target.value), weights=target.weight)))
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
     for step, fraction in paced(settings.n_steps, deadline):
@@ -116,9 +119,10 @@ def fit_prior(
             term.choose(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
         objective.begin()
         image = objective.add(term, 1.0)
-        parameters.step(image + objective.finish(), cosine_decay(fraction))
+        guard.step(image + objective.finish(), cosine_decay(fraction))
         history.append(image)
     progress(settings.n_steps, settings.n_steps)
+    guard.finish()
     return parameters.cloud(), history
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from g3r.errors import InputError
+
 
 @dataclass(frozen=True)
 class AnnealedWeight:
@@ -15,7 +17,7 @@ class AnnealedWeight:
         tau_1, tau_2: fractions of the fit in [0, 1], tau_1 <= tau_2; equal makes a step.
 
     Raises:
-        ValueError: a negative weight, or fractions reversed or outside [0, 1].
+        InputError: a negative weight, or fractions reversed or outside [0, 1].
     """
 
     start: float
@@ -25,9 +27,13 @@ class AnnealedWeight:
 
     def __post_init__(self) -> None:
         if not (self.start >= 0 and self.end >= 0 and math.isfinite(self.start) and math.isfinite(self.end)):
-            raise ValueError(f"weights {self.start}, {self.end}; expected finite and not negative")
+            raise InputError(
+                f"distillation weights {self.start}, {self.end}; expected finite and not negative"
+            )
         if not 0 <= self.tau_1 <= self.tau_2 <= 1:
-            raise ValueError(f"tau_1 {self.tau_1}, tau_2 {self.tau_2}; expected 0 <= tau_1 <= tau_2 <= 1")
+            raise InputError(
+                f"distillation tau_1 {self.tau_1}, tau_2 {self.tau_2}; expected 0 <= tau_1 <= tau_2 <= 1"
+            )
 
     def at(self, fraction: float) -> float:
         """The weight at a fraction of the fit."""

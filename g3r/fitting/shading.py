@@ -40,12 +40,14 @@ class StackShading:
             pixels = np.flatnonzero(stack_of_pixel == stack)
             start, end = int(pixels[0]), int(pixels[-1]) + 1  # slices of a stack stand together
             inside = slices.mask[start:end]
+            self.ranges.append((start, end))
+            if not inside.any():  # nothing tells its field: no terms
+                continue
             axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
             center = world[start:end][inside].mean(0)
             x, y = ((world[start:end] - center) @ axes / LENGTH_MM).T
             terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
             basis[start:end] = terms - terms[inside].mean(0)
-            self.ranges.append((start, end))
         self.basis = np.ascontiguousarray(basis.T)
 
     def log_field(self, coefficients: NDArray[np.floating]) -> NDArray[np.float32]:

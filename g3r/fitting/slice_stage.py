@@ -13,6 +13,7 @@ from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
+from g3r.fitting.safeguard import Safeguard
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.slice_term import SliceTerm
@@ -75,8 +76,9 @@ class SliceStageSettings:
 class SliceFit:
     """Result of stage 2.
 
-    cloud; slices in their last poses; gain [K], weight [K]; loss of each step; coefficients of each stack's
-    shading (see `StackShading`; empty where it was not estimated).
+    cloud; slices in their last poses; gain [K], weight [K]; loss of each step, marked `step_back` where the
+    loss had risen and the step was back to the best state (`Safeguard`); coefficients of each stack's shading
+    (see `StackShading`; empty where it was not estimated).
     """
 
     cloud: GaussianCloud
@@ -115,10 +117,9 @@ def fit_slices(
         observer: sees the cloud as the fit goes on; None for nobody.
 
     Raises:
-        NumericalError: a loss that is not finite.
+        NumericalError: a loss that is not finite from the start.
     """
     trust = weight.astype(np.float32)
-    exact = settings.amplitude == "exact"
     if settings.peak_iterations:
         cloud = solve_peaks(
             cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
@@ -129,43 +130,25 @@ def fit_slices(
     several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
     shading = StackShading(slices) if settings.optimise_shading and several else None
     parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, shading, settings))
-    term = SliceTerm(
-        slices, gain, trust.astype(np.float64), parameters, shading, exact, settings.cutoff_sigma
-    )
-    terms: list[ImageTerm] = [term]
-    if prior is not None:
-        distilled = ImageTerm(
-            prior.planes, prior.value, prior.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
-        )
-        n_planes = max(1, round(settings.distillation_planes * len(prior.planes)))
-        # with the distance being a mean over the prior's trust, this makes the term the mean over the head of
-        # trust times difference: well-measured heads feel little of it, sparsely measured ones much
-        prior_share = float(prior.weight[prior.weight > 0].mean())
-        terms.append(distilled)
-    objective = CloudObjective(parameters, terms, settings.scale_weight)
+    loss = SliceLoss(parameters, slices, gain, trust.astype(np.float64), shading, prior, settings)
+    guard = Safeguard(parameters, loss.level)
     history: list[dict[str, float]] = []
     for step, fraction in paced(settings.n_steps, deadline):
         progress(step, settings.n_steps)
-        if prior is not None and step % settings.steps_per_draw == 0:
-            distilled.choose(np.sort(rng.choice(len(prior.planes), n_planes, replace=False)))
-        term.update()
-        objective.begin()
-        image = objective.add(term, 1.0)
-        loss, entry = image, {"image": image}
-        strength = prior_strength(settings, fraction, image)
-        if prior is not None and strength > 0:
-            distance = objective.add(distilled, strength * prior_share)
-            loss += strength * prior_share * distance
-            entry |= {"distillation": distance, "distillation_weight": strength}
-        loss += objective.finish() + term.finish(image, settings.pose_prior_mm, settings.shading_ridge)
-        parameters.step(loss, cosine_decay(fraction))
+        if step % settings.steps_per_draw == 0:
+            loss.draw(rng)
+        value, entry = loss.evaluate(fraction)
+        if not guard.step(value, cosine_decay(fraction)):
+            entry |= {"step_back": 1.0}
         history.append(entry)
         if step and step % settings.reweight_every == 0:
-            term.reweight()
+            guard.rescale(loss.reweight())
         if observer and ((step + 1) % observer.every == 0 or step + 1 == settings.n_steps):
-            term.update()
-            observer(step + 1, parameters.cloud(), term.moved_planes().pose)
+            loss.term.update()
+            observer(step + 1, parameters.cloud(), loss.term.moved_planes().pose)
     progress(settings.n_steps, settings.n_steps)
+    guard.finish()
+    term = loss.term
     term.update()
     return SliceFit(
         parameters.cloud(),
@@ -175,6 +158,79 @@ def fit_slices(
         history,
         parameters.value["shading"].astype(float).tolist() if shading else [],
     )
+
+
+class SliceLoss:
+    """The loss of stage 2 with all its terms; its gradient is written into the parameters.
+
+    L = L1(slices) + lambda R_scale + w(i) L1(prior), and the terms that hold poses and fields (`SliceTerm`).
+
+    Args:
+        parameters: with the blocks that are fitted along.
+        slices: K slices.
+        gain: [K] where no block holds it.
+        trust: [K] in each slice.
+        shading: fields of the stacks, or None.
+        prior: distillation target, or None.
+        settings: weights of the terms.
+    """
+
+    def __init__(
+        self,
+        parameters: FitParameters,
+        slices: Slices,
+        gain: NDArray[np.float64],
+        trust: NDArray[np.float64],
+        shading: StackShading | None,
+        prior: VolumeTarget | None,
+        settings: SliceStageSettings,
+    ) -> None:
+        self.settings = settings
+        self.term = SliceTerm(
+            slices, gain, trust, parameters, shading, settings.amplitude == "exact", settings.cutoff_sigma
+        )
+        self.level = float(np.abs(slices.masked_value).mean()) if len(slices.masked_value) else 0.0
+        self.distilled: ImageTerm | None = None
+        terms: list[ImageTerm] = [self.term]
+        if prior is not None:
+            self.distilled = ImageTerm(
+                prior.planes, prior.value, prior.weight, parameters.origin_mm,
+                cutoff_sigma=settings.cutoff_sigma,
+            )  # fmt: skip
+            # the distance is a mean over the prior's trust, so this makes the term the mean over the head of
+            # trust times difference: well-measured heads feel little of it, sparsely measured ones much
+            self.prior_share = float(prior.weight[prior.weight > 0].mean())
+            terms.append(self.distilled)
+        self.objective = CloudObjective(parameters, terms, settings.scale_weight)
+
+    def draw(self, rng: np.random.Generator) -> None:
+        """Let other planes of the prior count, at random."""
+        if self.distilled is not None:
+            n = len(self.distilled.every)
+            n_planes = max(1, round(self.settings.distillation_planes * n))
+            self.distilled.choose(np.sort(rng.choice(n, n_planes, replace=False)))
+
+    def evaluate(self, fraction: float) -> tuple[float, dict[str, float]]:
+        """The loss at the present parameters and a fraction of the fit, and its terms by name."""
+        settings = self.settings
+        self.term.update()
+        self.objective.begin()
+        image = self.objective.add(self.term, 1.0)
+        loss, entry = image, {"image": image}
+        strength = prior_strength(settings, fraction, image)
+        if self.distilled is not None and strength > 0:
+            distance = self.objective.add(self.distilled, strength * self.prior_share)
+            loss += strength * self.prior_share * distance
+            entry |= {"distillation": distance, "distillation_weight": strength}
+        loss += self.objective.finish()
+        loss += self.term.finish(image, settings.pose_prior_mm, settings.shading_ridge)
+        return loss, entry
+
+    def reweight(self) -> float:
+        """Trust the slices by how they fitted last; returns what the image term is, over what it was."""
+        before = self.term.mean_residual
+        self.term.reweight()
+        return self.term.mean_residual / before if before > 0 else 1.0
 
 
 def _blocks(

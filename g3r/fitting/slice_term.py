@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
-from g3r.fitting.objective import ImageTerm
+from g3r.fitting.objective import TINY, ImageTerm
 from g3r.fitting.parameters import FitParameters
 from g3r.fitting.shading import StackShading
 from g3r.gaussians.render import CUTOFF_SIGMA, right_jacobian
@@ -113,6 +113,11 @@ class SliceTerm(ImageTerm):
             loss += shading_ridge * float(np.mean(c**2))
             gradient["shading"][...] = total + 2 * shading_ridge / c.size * c
         return loss
+
+    @property
+    def mean_residual(self) -> float:
+        """Mean absolute residual at the last `add` under the present trust."""
+        return float(self.trust @ self.residual) / max(float(self.trust @ self.total), TINY)
 
     def reweight(self) -> None:
         """Trust in each slice from its mean absolute residual at the last `add`."""

@@ -17,6 +17,15 @@ from torch import Tensor
 
 from g3r.errors import InputError
 
+SIGMA_RANGE_MM = (1e-6, 1e6)
+"""Beyond it nothing of a head is described, and the kernels' integers and float32 would end."""
+
+LARGEST_LOG_SCALE = 13.816
+"""Logarithm of the largest sigma, and of one over the least."""
+
+LEAST_QUATERNION = 1e-15
+"""Shorter ones have no direction, and gradients that go with one over their length."""
+
 
 @dataclass(frozen=True)
 class GaussianCloud:
@@ -25,13 +34,14 @@ class GaussianCloud:
     Args:
         mean_mm: [N, 3] centres relative to the origin.
         log_scale: [N, 3] natural logarithm of the standard deviations in mm.
-        quaternion_wxyz: [N, 4] orientation; normalised on use, must not be zero.
+        quaternion_wxyz: [N, 4] orientation; normalised on use, must not be near zero.
         peak: [N] c_j, height without any PSF; may be negative.
         origin_mm: [3] float64 world position of the local origin. Centres are kept relative to it so that
             float32 loses no digits when the scanner's origin is far away.
 
     Raises:
-        ValueError: shapes that do not belong together.
+        ValueError: shapes that do not belong together, values that are not finite, a sigma outside
+            `SIGMA_RANGE_MM`, or a quaternion of (nearly) no length.
     """
 
     mean_mm: Tensor
@@ -51,7 +61,16 @@ class GaussianCloud:
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"{name} has shape {found}; expected {shape}")
+            if not bool(torch.isfinite(getattr(self, name)).all()):
+                raise ValueError(f"{name} holds values that are not finite")
         object.__setattr__(self, "origin_mm", np.array(self.origin_mm, dtype=np.float64).reshape(3))
+        if not np.isfinite(self.origin_mm).all():
+            raise ValueError("origin_mm holds values that are not finite")
+        if n and float(self.log_scale.detach().abs().max()) > LARGEST_LOG_SCALE:
+            low, high = SIGMA_RANGE_MM
+            raise ValueError(f"a sigma is out of range; expected {low:g} to {high:g} mm")
+        if n and float(self.quaternion_wxyz.detach().double().norm(dim=1).min()) < LEAST_QUATERNION:
+            raise ValueError(f"a quaternion is shorter than {LEAST_QUATERNION:g}; expected about one")
 
     @classmethod
     def of(cls, parameters: Sequence[Tensor], origin_mm: NDArray[np.float64]) -> GaussianCloud:
@@ -113,7 +132,10 @@ class GaussianCloud:
 
 def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions [N, 4] of any length but zero."""
-    w, x, y, z = torch.nn.functional.normalize(quaternion_wxyz, dim=1).unbind(1)
+    # by the largest entry first: squares of 1e-30 are zero in float32, and no epsilon knows their size
+    largest = quaternion_wxyz.detach().abs().amax(1, keepdim=True)
+    scaled = quaternion_wxyz / largest
+    w, x, y, z = (scaled / scaled.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

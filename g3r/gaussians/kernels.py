@@ -23,6 +23,9 @@ LOOSE = {"contract", "arcp", "nsz"}
 SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
 
+MOST_PIXELS = 1e9
+"""Ellipses that reach further than that are not drawn: 32 bits number the pixels. `render` refuses them."""
+
 # Gradient columns of a Gaussian in the buffers: peak, mean (3), covariance xx xy xz yy yz zz, log-volume.
 N_GRADIENTS = 11
 # Gradient columns of a plane: body-frame rotation (3), world translation (3), log-gain.
@@ -91,6 +94,8 @@ def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut,
         px, py = (mx - kx * mz) * over_x + middle_x, (my - ky * mz) * over_y + middle_y
         half_x, half_y = math.sqrt(c2 * cxx) * over_x, math.sqrt(c2 * cyy) * over_y
         if not (px + half_x >= 0.0 and py + half_y >= 0.0 and px - half_x < n_x and py - half_y < n_y):
+            continue
+        if not (half_x < MOST_PIXELS and half_y < MOST_PIXELS):
             continue
         unit = gain
         if exact:

@@ -12,12 +12,17 @@ f32 = np.float32
 SLACK_MM = 1e-4
 """What float32 may be wrong by in the distance of a Gaussian from a plane of the same scene."""
 
+VARIANCE_SLACK = 1e-6
+"""What float32 may be wrong by in a variance along an axis, over the trace: all of it, in a flat Gaussian."""
+
 
 @numba.njit(parallel=True, cache=True)
-def columns_of(shapes, columns):
-    """Mean and covariance [9, N] in float32, each a row of its own, so that the search runs in vectors."""
+def columns_of(shapes, middle, columns):
+    """Mean from `middle` and covariance [9, N] in float32, a row each, so that the search runs in vectors."""
     for j in numba.prange(len(shapes)):
-        for n in range(9):
+        for n in range(3):
+            columns[n, j] = shapes[j, n] - middle[n]
+        for n in range(3, 9):
             columns[n, j] = shapes[j, n]
 
 
@@ -27,13 +32,14 @@ def _mark(x, y, z, xx, xy, xz, yy, yz, zz, r, t, psf, half, cut, marks):
     for j in range(len(x)):
         dx, dy, dz = x[j] - t[0], y[j] - t[1], z[j] - t[2]
         slack = f32(SLACK_MM) + f32(1e-6) * (abs(dx) + abs(dy) + abs(dz))
+        spare = f32(VARIANCE_SLACK) * (xx[j] + yy[j] + zz[j])
         touches = True
         for axis in range(3):
             a, b, c = r[0, axis], r[1, axis], r[2, axis]
             m = dx * a + dy * b + dz * c
             s = (
                 xx[j] * a * a + yy[j] * b * b + zz[j] * c * c
-                + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c) + psf[axis]
+                + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c) + psf[axis] + spare
             )  # fmt: skip
             reach = max(abs(m) - slack - half[axis], f32(0.0))
             touches &= reach * reach <= cut * s

@@ -68,10 +68,12 @@ class PairFinder:
         """
         half = np.zeros((len(planes), 3), np.float32)
         half[:, :2] = (planes.shape - 1) / 2 * planes.spacing_mm
-        single = [array.astype(np.float32) for array in (rotation, center_mm, planes.psf_var_mm2)]
+        # float32 is enough from the middle of the planes, wherever the cloud's origin is
+        middle = center_mm.mean(0) if len(center_mm) else np.zeros(3)
+        single = [array.astype(np.float32) for array in (rotation, center_mm - middle, planes.psf_var_mm2)]
         start = np.zeros(len(planes) + 1, np.int64)
         cut = np.float32(cutoff_sigma**2 * (1 + 1e-5))
-        kernels_pairs.columns_of(shapes, self.columns)
+        kernels_pairs.columns_of(shapes, middle, self.columns)
         arguments = (self.columns, *single, half, cut, self.marks, start)
         kernels_pairs.find(*arguments, self.order[:0])  # type: ignore[call-arg]
         n_pairs = int(start[-1])

@@ -152,7 +152,10 @@ def solve_peaks(
         if norm <= 1e-10 * first or norm == 0:
             break
         image = system.forward(direction).astype(np.float64)
-        length = norm / (float(weight @ image**2) + shift * float(direction @ direction))
+        curvature = float(weight @ image**2) + shift * float(direction @ direction)
+        if not curvature > 0:  # what is left of the gradient is rounding, in a direction that changes nothing
+            break
+        length = norm / curvature
         step += length * direction
         residual -= length * image
         gradient = system.adjoint((weight * residual).astype(np.float32)) - shift * step

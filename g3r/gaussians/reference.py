@@ -23,27 +23,38 @@ def render_reference(
 ) -> Tensor:
     """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without any cut-off; see `g3r.gaussians.render`.
 
-    Works in the dtype and on the device of the cloud; differentiable by autograd in everything.
+    Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it;
+    poses are float64 in any case. Differentiable by autograd in everything.
+
+    Numerics: the triangular factor of S = M M^T, M = [R^T R_g diag(s), D^(1/2)], comes from M itself by QR. A
+    Cholesky factor of S would lose twice the digits and fail in float32 at axis ratios of a few thousand.
     """
+    with torch.autocast(cloud.mean_mm.device.type, enabled=False):
+        return _render(cloud, planes, twist, log_gain, amplitude)
+
+
+def _render(
+    cloud: GaussianCloud, planes: Planes, twist: Tensor | None, log_gain: Tensor | None, amplitude: str
+) -> Tensor:
     mean, log_scale, quaternion, peak = cloud.parameters
     like: dict[str, Any] = {"dtype": mean.dtype, "device": mean.device}
+    exact: dict[str, Any] = {"dtype": torch.float64, "device": mean.device}
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None, :]
-    covariance = root @ root.transpose(1, 2)
     pixels = []
     uv = planes.pixel_uv_mm()
     for k in range(len(planes)):
-        rotation = torch.as_tensor(planes.rotation[k], **like)
-        center = torch.as_tensor(planes.center_mm[k] - cloud.origin_mm, **like)
+        rotation = torch.as_tensor(planes.rotation[k], **exact)
+        center = torch.as_tensor(planes.center_mm[k] - cloud.origin_mm, **exact)
         if twist is not None:
-            rotation = rotation @ torch.linalg.matrix_exp(_skew(twist[k, :3].to(**like)))
-            center = center + twist[k, 3:].to(**like)
-        observed = rotation.T @ covariance @ rotation + torch.diag(
-            torch.as_tensor(planes.psf_var_mm2[k], **like)
-        )
-        chol = torch.linalg.cholesky(observed)
-        local_mean = (mean - center) @ rotation
+            rotation = rotation @ torch.linalg.matrix_exp(_skew(twist[k, :3].to(**exact)))
+            center = center + twist[k, 3:].to(**exact)
+        local_mean = ((mean.to(**exact) - center) @ rotation).to(**like)
+        rotation = rotation.to(**like)
+        psf_sigma = torch.as_tensor(np.sqrt(planes.psf_var_mm2[k]), **like)
+        wide = torch.cat([rotation.T @ root, torch.diag(psf_sigma).expand(len(mean), 3, 3)], 2)
+        upper = torch.linalg.qr(wide.transpose(1, 2))[1]
         if amplitude == "exact":
-            factor = (log_scale.sum(1) - chol.diagonal(dim1=1, dim2=2).log().sum(1)).exp()
+            factor = (log_scale.sum(1) - upper.diagonal(dim1=1, dim2=2).abs().log().sum(1)).exp()
         else:
             factor = torch.ones_like(peak)
         gain = 1.0 if log_gain is None else log_gain[k].to(**like).exp()
@@ -52,7 +63,7 @@ def render_reference(
         for start in range(0, len(block), step):
             u = torch.as_tensor(np.pad(block[start : start + step], ((0, 0), (0, 1))), **like)
             d = u[None] - local_mean[:, None]  # [N, p, 3]
-            white = torch.linalg.solve_triangular(chol, d.transpose(1, 2), upper=False)
+            white = torch.linalg.solve_triangular(upper.mT, d.transpose(1, 2), upper=False)
             value = torch.exp(-0.5 * (white * white).sum(1))
             pixels.append(gain * ((peak * factor) @ value))
     return torch.cat(pixels) if pixels else mean.new_zeros(0)

@@ -57,18 +57,32 @@ def render(
         [P] pixels, plane after plane, in C order inside a plane.
 
     Raises:
-        ValueError: an unknown backend or amplitude, or a cut-off outside (0, 6].
+        ValueError: an unknown backend or amplitude, parameters in half precision, a cut-off outside (0, 6], a
+            twist or gain that is not finite, or a sigma of more than 1e8 pixels (numba only).
 
     Source: G3R Eq. 3 and 5 with the amplitude factor (docs/method.md); gradients derived there.
     """
     if amplitude not in AMPLITUDES:
         raise ValueError(f"amplitude {amplitude!r}; expected one of {AMPLITUDES}")
+    if cloud.mean_mm.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"Gaussians in {cloud.mean_mm.dtype}; expected float32 or float64: no geometry in less"
+        )
+    for name, change in (("twist", twist), ("log_gain", log_gain)):
+        if change is not None and not bool(torch.isfinite(change.detach()).all()):
+            raise ValueError(f"{name} holds values that are not finite")
     if backend == "reference":
         return render_reference(cloud, planes, twist, log_gain, amplitude)
     if backend != "numba":
         raise ValueError(f"backend {backend!r}; expected 'numba' or 'reference'")
     if not 0 < cutoff_sigma <= LARGEST_CUTOFF_SIGMA:
         raise ValueError(f"cutoff_sigma {cutoff_sigma}; expected above 0 and at most {LARGEST_CUTOFF_SIGMA}")
+    if len(cloud) and len(planes):
+        widest = float(cloud.log_scale.detach().max().double().exp() / planes.spacing_mm.min())
+        if widest > kernels.MOST_PIXELS / 10:
+            raise ValueError(
+                f"a sigma is {widest:.2g} pixels wide; expected at most {kernels.MOST_PIXELS / 10:g}"
+            )
     if pairs is None:
         pairs = find_pairs(cloud, moved_planes(planes, twist), cutoff_sigma)
     pixels = _Render.apply(

@@ -18,10 +18,11 @@ class _NearestRotation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor) -> Tensor:
-        left, singular, right = torch.linalg.svd(matrix)
-        sign = torch.ones_like(singular)
-        sign[:, 2] = torch.sign(torch.linalg.det(left @ right))
-        rotation = (left * sign[:, None]) @ right
+        with torch.autocast(matrix.device.type, enabled=False):
+            left, singular, right = torch.linalg.svd(matrix)
+            sign = torch.ones_like(singular)
+            sign[:, 2] = torch.sign(torch.linalg.det(left @ right))
+            rotation = (left * sign[:, None]) @ right
         ctx.save_for_backward(rotation, singular * sign, right)
         return rotation
 
@@ -73,8 +74,9 @@ def pixel_points_mm(size: int, pixel_mm: float, like: Tensor) -> Tensor:
 
 
 def moved_points(rotation: Tensor, translation_mm: Tensor, points_mm: Tensor) -> Tensor:
-    """Points [P, 3] after each of S motions, [S, P, 3]."""
-    return points_mm @ rotation.transpose(1, 2) + translation_mm[:, None]
+    """Points [P, 3] after each of S motions, [S, P, 3], whatever autocast is around it."""
+    with torch.autocast(points_mm.device.type, enabled=False):
+        return points_mm @ rotation.transpose(1, 2) + translation_mm[:, None]
 
 
 def sample_rows(volume: Tensor, points_mm: Tensor, spacing_mm: float, offset: Tensor | int = 0) -> Tensor:

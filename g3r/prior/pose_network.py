@@ -218,6 +218,13 @@ class PoseNetwork(nn.Module):
             n_refinements: None takes the constructor's.
             disturb: changes the poses that a refinement starts from, in training.
         """
+        # mixed precision is the encoder's own affair: around it, poses and points keep float32
+        with torch.autocast(batch["image"].device.type, enabled=False):
+            return self._steps(batch, n_refinements, disturb)
+
+    def _steps(
+        self, batch: SliceBatch, n_refinements: int | None, disturb: Disturbance | None
+    ) -> list[PoseStep]:
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
         n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
         same_stack = stack[:, None] == stack

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from g3r.errors import InputError
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 
 
@@ -45,7 +46,7 @@ def test_annealed_weight_may_grow_and_may_be_zero():
     ],
 )  # fmt: skip
 def test_annealed_weight_refuses(arguments):
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(InputError, match="expected"):
         AnnealedWeight(*arguments)
 
 

@@ -1,0 +1,107 @@
+"""Steps of a fit that are taken back when the loss rises: shorter steps, from the best state so far."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.errors import NumericalError
+from g3r.fitting.parameters import FitParameters
+
+logger = logging.getLogger(__name__)
+
+RISE = 1.5
+"""A loss is too high when it is over so many times the best ..."""
+
+LEVEL_SHARE = 0.15
+"""... and has risen by so much of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (the
+peaks that they begin with are a least-squares optimum, and the loss is L1), with ten times the step sizes by
+0.4 (docs/numerics.md)."""
+
+SHORTER = 0.3
+"""What a step back makes of all step sizes, from there to the end."""
+
+KEEP_EVERY = 5
+"""Steps between two copies of the parameters, if the loss is the lowest by then."""
+
+
+class Safeguard:
+    """Takes the steps of a fit, and takes them back if they lead up or out of the numbers.
+
+    The parameters with the lowest loss are kept, in one copy that is renewed every few steps at most. A loss
+    that has risen too far, or a loss or gradient that is not finite, brings them back; step sizes go down and
+    Adam begins anew. A fit in which that does not happen takes the steps that it would take without.
+
+    Args:
+        parameters: of the fit.
+        level: mean absolute value of the pixels, in the units of the loss.
+    """
+
+    def __init__(self, parameters: FitParameters, level: float) -> None:
+        self.parameters, self.level = parameters, level
+        self.step_factor = 1.0
+        self.n_back = 0
+        self._best_loss = math.inf
+        self._last_loss = math.inf
+        self._best: NDArray[np.float32] | None = None
+        self._age = KEEP_EVERY
+
+    def step(self, loss: float, factor: float) -> bool:
+        """A step down the gradient of a loss, or back to the best state; returns whether it went forward.
+
+        Args:
+            loss: at the present parameters, whose gradient they hold.
+            factor: of the step sizes, by the fit's schedule.
+
+        Raises:
+            NumericalError: a loss or gradient that is not finite before there was a finite one.
+        """
+        too_high = max(RISE * self._best_loss, self._best_loss + LEVEL_SHARE * self.level)
+        if self._best is not None and not loss <= too_high:
+            return self._back(loss)
+        self._keep(loss)
+        try:
+            self.parameters.step(loss, factor * self.step_factor)
+        except NumericalError:
+            if self._best is None:
+                raise
+            return self._back(loss)
+        self._last_loss = loss
+        return True
+
+    def rescale(self, ratio: float) -> None:
+        """Tell that the loss has been defined anew and is now so many times what it was."""
+        if math.isfinite(ratio) and ratio > 0:
+            self._best_loss *= ratio
+            self._last_loss *= ratio
+
+    def finish(self) -> None:
+        """Leave the parameters at the best state if the fit had to step back and did not make up for it."""
+        values = self.parameters.values
+        risen = self.n_back > 0 and not self._last_loss <= self._best_loss
+        if self._best is not None and (risen or not np.isfinite(values).all()):
+            values[:] = self._best
+
+    def _keep(self, loss: float) -> None:
+        due = self._age >= KEEP_EVERY and loss < self._best_loss
+        self._age += 1
+        if due and np.isfinite(self.parameters.gradients).all():
+            if self._best is None:
+                self._best = np.empty_like(self.parameters.values)
+            self._best[:] = self.parameters.values
+            self._best_loss, self._age = loss, 1
+
+    def _back(self, loss: float) -> bool:
+        assert self._best is not None
+        self.parameters.restart(self._best)
+        self.step_factor *= SHORTER
+        self.n_back += 1
+        self._last_loss = math.inf
+        logger.warning(
+            "loss rose from %.4g to %.4g: back to the best state, steps at %.3g of their size",
+            self._best_loss, loss, self.step_factor,
+        )  # fmt: skip
+        return False

@@ -1,0 +1,176 @@
+"""The gradient of the complete slice-fitting loss against finite differences of the same loss in float64.
+
+The loss is written down here a second time, in float64 and without a gradient: pixels by the dense reference
+renderer, the terms of Eq. 9 one after the other. No pixel lies near the kink of |residual|: targets are moved
+away from what is rendered, so that central differences of 1e-5 stay on one side and are good to 1e-8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from benchmarks.numerics_scenes import head_scene, single
+from g3r.acquisition.planes import Planes, Slices
+from g3r.fitting.parameters import FitParameters
+from g3r.fitting.prior_stage import VolumeTarget
+from g3r.fitting.schedules import AnnealedWeight
+from g3r.fitting.shading import StackShading
+from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings, _blocks
+from g3r.gaussians import GaussianCloud, render
+
+CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+STEP = 1e-5
+SETTINGS = SliceStageSettings(
+    scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0, cutoff_sigma=6.0, prior_error=0.05,
+    distillation=AnnealedWeight(0.4, 0.1), distillation_planes=0.4,
+)  # fmt: skip
+FRACTION = 0.5
+
+
+class CompleteLoss:
+    """Six Gaussians, six slices of three stacks, a prior; everything is fitted, nothing is at zero."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        scene = head_scene(np.zeros(3), 6, seed)
+        cloud = single(scene.cloud)
+        planes = scene.planes.take([4, 6, 14, 16, 24, 26])
+        planes = replace(planes, shape=np.full((6, 2), 16), spacing_mm=np.full((6, 2), 1.4))
+        mask = rng.uniform(size=planes.n_pixels) < 0.8
+        slices = Slices(
+            planes, np.zeros(planes.n_pixels, np.float32), mask, np.repeat(np.arange(3), 2),
+            np.tile([0, 1], 3), np.full(6, 2.2), planes.pose,
+        )  # fmt: skip
+        self.gain, self.trust = np.exp(rng.normal(0, 0.1, 6)), rng.uniform(0.2, 1, 6)
+        self.shading = StackShading(slices)
+        self.parameters = FitParameters(
+            cloud, SETTINGS.rates, _blocks(slices, self.gain, self.shading, SETTINGS)
+        )
+        self.seed = self.parameters.value["log_scale"].astype(float).copy()
+        for name, size in {
+            "mean_mm": 0.3, "log_scale": 0.2, "quaternion_wxyz": 0.2, "turn": 0.1, "shift": 0.4,
+            "log_gain": 0.2, "shading": 0.2,
+        }.items():  # fmt: skip
+            value = self.parameters.value[name]
+            value += rng.normal(0, size, value.shape).astype(np.float32)
+        self.prior = self._prior(rng)
+        self.slices = slices
+        away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.4, planes.n_pixels)
+        self.slices = replace(slices, value=(self._shown(self._values()) + away).astype(np.float32))
+        self.loss = SliceLoss(
+            self.parameters, self.slices, self.gain, self.trust, self.shading, self.prior, SETTINGS
+        )
+        self.loss.objective.seed_log_scale[...] = self.seed  # the fit is under way
+        self.loss.draw(np.random.default_rng(seed))
+
+    def _values(self) -> dict[str, np.ndarray]:
+        return {name: value.astype(float) for name, value in self.parameters.value.items()}
+
+    def _cloud(self, value: dict[str, np.ndarray]) -> GaussianCloud:
+        return GaussianCloud.of([torch.from_numpy(value[name]) for name in CLOUD], np.zeros(3))
+
+    def _prior(self, rng: np.random.Generator) -> VolumeTarget:
+        n = 6
+        spacing = np.full((n, 2), 1.9)
+        planes = Planes(
+            np.tile(np.eye(3), (n, 1, 1)), np.array([[0, 0, z] for z in np.linspace(-6, 6, n)]), spacing,
+            np.full((n, 2), 11), np.zeros((n, 3)),
+        )  # fmt: skip
+        shown = render(self._cloud(self._values()), planes, backend="reference").numpy()
+        away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.3, planes.n_pixels)
+        weight = rng.uniform(0, 1, planes.n_pixels) * (rng.uniform(size=planes.n_pixels) < 0.7)
+        return VolumeTarget(planes, (shown + away).astype(np.float32), weight.astype(np.float32))
+
+    def _shown(self, value: dict[str, np.ndarray]) -> np.ndarray:
+        planes = self.slices.planes
+        turn = planes.rotation @ Rotation.from_rotvec(value["turn"]).as_matrix()
+        moved = replace(planes, rotation=turn, center_mm=planes.center_mm + value["shift"])
+        pixels = render(self._cloud(value), moved, backend="reference").numpy()
+        plane = planes.plane_id()
+        gain = np.exp(value["log_gain"] - value["log_gain"].mean())[plane]
+        field = (value["shading"][self.slices.stack_id[plane]] * self.shading.basis.T.astype(float)).sum(1)
+        return pixels * gain * np.exp(field)
+
+    def float64(self, value: dict[str, np.ndarray], frozen: float | None = None) -> float:
+        """The loss; `frozen` is the image term where it stands as a weight and has no gradient."""
+        weight = self.slices.mask * self.trust[self.slices.planes.plane_id()]
+        image = (weight * np.abs(self._shown(value) - self.slices.value)).sum() / weight.sum()
+        frozen = image if frozen is None else frozen
+        self.image = image
+        chosen = self.prior.take(np.flatnonzero(self._is_chosen()))
+        near = np.abs(render(self._cloud(value), chosen.planes, backend="reference").numpy() - chosen.value)
+        distance = (chosen.weight * near).sum(dtype=float) / chosen.weight.sum(dtype=float)
+        annealed = 0.4 + 0.5 * (0.1 - 0.4)  # half way between tau_1 = 0.2 and tau_2 = 0.8
+        strength = max(annealed, min(frozen / SETTINGS.prior_error, 1.0))
+        share = self.prior.weight[self.prior.weight > 0].mean(dtype=float)
+        loss = image + strength * share * distance
+        loss += SETTINGS.scale_weight * ((value["log_scale"] - self.seed) ** 2).mean()
+        half = self.slices.planes.shape * self.slices.planes.spacing_mm / 2
+        radius = np.sqrt((half**2).sum(1)).mean() / 2
+        moved = (value["shift"] ** 2).sum(1) + radius**2 * (value["turn"] ** 2).sum(1)
+        loss += frozen * moved.mean() / SETTINGS.pose_prior_mm**2
+        return float(loss + SETTINGS.shading_ridge * (value["shading"] ** 2).mean())
+
+    def _is_chosen(self) -> np.ndarray:
+        drawn = self.loss.distilled.planes.center_mm[:, 2]
+        return np.isin(self.prior.planes.center_mm[:, 2], drawn)
+
+    def finite_differences(self) -> dict[str, np.ndarray]:
+        value = self._values()
+        self.float64(value)
+        frozen, found = self.image, {}
+        for name, array in value.items():
+            slope = np.zeros(array.size)
+            flat = array.reshape(-1)
+            for i in range(array.size):
+                start, ends = flat[i], []
+                for sign in (1, -1):
+                    flat[i] = start + sign * STEP
+                    ends.append(self.float64(value, frozen))
+                flat[i] = start
+                slope[i] = (ends[0] - ends[1]) / (2 * STEP)
+            found[name] = slope.reshape(array.shape)
+        return found
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.numerics)])
+def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int, tally):
+    complete = CompleteLoss(seed)
+    value, entry = complete.loss.evaluate(FRACTION)
+    assert {"image", "distillation", "distillation_weight"} <= set(entry)
+    assert value == pytest.approx(complete.float64(complete._values()), rel=1e-5)
+    expected = complete.finite_differences()
+    assert set(expected) == {*CLOUD, "turn", "shift", "log_gain", "shading"}
+    for name, exact in expected.items():
+        with tally.case():
+            found = complete.parameters.gradient[name].astype(float)
+            assert np.linalg.norm(exact) > 1e-3, f"{name}: nothing to check"
+            assert np.linalg.norm(found - exact) <= 1e-4 * np.linalg.norm(exact), name
+            assert np.abs(found - exact).max() <= 1e-4 * np.abs(exact).max(), name
+
+
+def test_a_wrong_term_would_be_seen(tally):
+    """Each term, left out of the float64 loss, changes some gradient by far more than the tolerance."""
+    complete = CompleteLoss(0)
+    complete.loss.evaluate(FRACTION)
+    for name, change in {
+        "scale": {"scale_weight": 0.0}, "poses": {"pose_prior_mm": 1e9}, "shading": {"shading_ridge": 0.0},
+        "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
+    }.items():  # fmt: skip
+        before = {n: g.copy() for n, g in complete.parameters.gradient.items()}
+        complete.loss.settings = replace(SETTINGS, **change)
+        complete.loss.objective.scale_weight = complete.loss.settings.scale_weight
+        complete.loss.evaluate(FRACTION)
+        moved = [
+            np.linalg.norm(g - before[n]) / np.linalg.norm(before[n])
+            for n, g in complete.parameters.gradient.items()
+        ]
+        assert max(moved) > 1e-2, name
+        complete.loss.settings = SETTINGS
+        complete.loss.objective.scale_weight = SETTINGS.scale_weight
+        complete.loss.evaluate(FRACTION)

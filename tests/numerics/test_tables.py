@@ -1,0 +1,134 @@
+"""The tables of docs/numerics.md: what they are made of keeps its bounds, and the document says the same."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import numerics
+from benchmarks.numerics_errors import (
+    comb,
+    distance_rows,
+    gradient_rows,
+    gradient_tolerance,
+    pixel_rows,
+    shape_rows,
+    shape_tolerance,
+    size_rows,
+)
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "numerics.md"
+FLOAT32 = ("reference float32", "numba")
+
+
+def written(name: str) -> str:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    return text.split(f"<!-- numerics-{name}:begin -->")[1].split(f"<!-- numerics-{name}:end -->")[0].strip()
+
+
+def assert_written(name: str, table: str, factor: float = 4.0) -> None:
+    """The document has the same words, and numbers within a factor (other machines round otherwise)."""
+    number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
+    found, expected = written(name), table.strip()
+    # the width of numbers does not count, nor whether one is there at all
+    assert number.sub("#", found) == number.sub("#", expected), name
+    for a, b in zip(number.findall(found), number.findall(expected), strict=True):
+        a, b = abs(float(a)), abs(float(b))
+        assert a == b or max(a, b) <= factor * min(a, b) or max(a, b) < 1e-9, (name, a, b)
+
+
+def test_values_by_axis_ratio(tally):
+    rows = shape_rows()
+    for row in rows:
+        with tally.case():
+            for name in FLOAT32:
+                assert row[name] <= shape_tolerance(row["ratio"]), (name, row)
+            # quadrature out to 6.5 sigma; V(x) loses eps times the ratio, as any dtype does
+            assert row["float64"] <= 2e-10 if row["psf"] else row["float64"] <= 1e-14 + 1e-15 * row["ratio"]
+        if row["ratio"] >= 1000:  # here the naive formulas fail
+            assert not row["naive float32"] < 0.1
+            assert not row["naive float32, epsilon"] < 0.1
+    assert_written("shape", numerics.shape_table(rows))
+
+
+@pytest.mark.numerics
+def test_gradients_by_axis_ratio(tally):
+    rows = gradient_rows()
+    for row in rows:
+        for name in ("centre", "shape", "peak", "turn", "shift", "gain"):
+            with tally.case():
+                assert row[name] <= gradient_tolerance(row["ratio"]), (name, row)
+    assert_written("gradient", numerics.gradient_table(rows), 8.0)
+
+
+def test_values_by_size_and_thickness(tally):
+    rows = size_rows()
+    for row in rows:
+        for name, error in row.items():
+            if name not in ("sigma_mm", "epsilon"):
+                with tally.case():
+                    assert error <= shape_tolerance(1.5), (name, row)
+    assert rows[0]["epsilon"] > 1  # the naive value at 0.02 mm is no value
+    assert rows[-1]["epsilon"] < 1e-9
+    assert_written("size", numerics.size_table(rows))
+
+
+def test_what_samples_show_of_gaussians_below_a_pixel(tally):
+    rows = pixel_rows()
+    for row in rows:
+        for name in ("volume", "slices"):
+            with tally.case():
+                low, high = row[f"{name} lower bound"], row[f"{name} upper bound"]
+                # the exponential is good to 2e-7 of a peak, and a peak shows `high` times the mass
+                assert row[f"{name} least"] >= low * (1 - 1e-5) - 3e-6 * max(1.0, high)
+                assert row[f"{name} most"] <= high * (1 + 1e-4)
+                # and the bounds are reached: on a sample, and between samples
+                assert row[f"{name} most"] == pytest.approx(high, rel=1e-4)
+    slices = [row for row in rows if row["ratio"] <= 0.1]
+    assert all(row["slices least"] > 0.92 and row["slices most"] < 1.085 for row in slices)
+    assert_written("pixel", numerics.pixel_table(rows), 1.01)
+
+
+def test_a_comb_of_samples_by_poissons_formula():
+    for sigma in (0.2, 0.5, 1.0):
+        for phase in (0.0, 0.2, 0.5):
+            m = np.arange(1, 30)
+            poisson = 1 + 2 * (np.exp(-2 * (np.pi * sigma * m) ** 2) * np.cos(2 * np.pi * m * phase)).sum()
+            assert comb(sigma, phase) == pytest.approx(poisson, rel=1e-12)
+
+
+def test_values_by_distance_from_the_origin(tally):
+    rows = distance_rows()
+    for row in rows:
+        with tally.case():
+            # positions of planes are float64: eps of the distance, over sigma of 1 mm
+            assert row["reference float64"] <= 1e-13 + 1e-15 * 1e3 * row["distance_m"]
+            for name in FLOAT32:
+                assert row[name] <= shape_tolerance(3.0), (name, row)
+    assert rows[-1]["naive float32"] > 3e-4  # 60 m along an axis are good to 2 um in float32
+    assert_written("distance", numerics.distance_table(rows))
+
+
+@pytest.mark.parametrize("name", numerics.TABLES)
+def test_the_document_has_every_table(name: str):
+    lines = written(name).splitlines()
+    assert len(lines) >= 4
+    assert all(line.startswith("|") for line in lines)
+
+
+def test_the_command_writes_a_table_between_its_markers(tmp_path: Path, capsys):
+    document = tmp_path / "numerics.md"
+    document.write_text(
+        "before\n<!-- numerics-distance:begin -->\nold\n<!-- numerics-distance:end -->\nafter\n"
+    )
+    options = ["--only", "distance", "--docs", str(document), "--output", str(tmp_path / "out")]
+    assert numerics.main(options) == 0
+    text = document.read_text()
+    assert "old" not in text
+    assert text.startswith("before")
+    assert text.endswith("after\n")
+    assert "| distance, m |" in text
+    assert (tmp_path / "out" / "numerics.json").is_file()
