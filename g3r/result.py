@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +13,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
-from g3r.errors import InputError
+from g3r.errors import cannot_be_written
 from g3r.geometry import VolumeGrid
+from g3r.unfinished import UnfinishedRun, check_output_folder
 
 if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
     from g3r.gaussians import GaussianCloud
@@ -57,7 +56,8 @@ class ReconstructionResult:
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
         gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
-        uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask.
+        uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask. None,
+            and not written, where the run was interrupted (`record["partial"]`).
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
@@ -76,46 +76,49 @@ class ReconstructionResult:
     gain: NDArray[np.float64]
     weight: NDArray[np.float64]
     ncc: NDArray[np.float64]
-    uncertainty: NDArray[np.float32]
+    uncertainty: NDArray[np.float32] | None
     prior_share: NDArray[np.float32] | None = None
     record: dict[str, Any] = field(default_factory=dict)
 
-    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+    def save(
+        self, folder: str | os.PathLike[str], *, replace: bool = False, run: UnfinishedRun | None = None
+    ) -> None:
         """Write every output into a folder; it appears whole or not at all.
+
+        Args:
+            folder: to write.
+            replace: whether an earlier result in it may be replaced; other files there are kept.
+            run: that holds this folder already; one for this call alone when None.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
         """
         folder = Path(folder)
+        if run is None:
+            check_output_folder(folder, replace=replace)
+            with UnfinishedRun(folder, OUTPUT_NAMES) as run:
+                self.save(folder, replace=replace, run=run)
+            return
         check_output_folder(folder, replace=replace)
-        beside: Path | None = None
         try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            beside.chmod(0o755)  # mkdtemp makes it private
-            self._write(beside)
-            if folder.exists():
-                for name in OUTPUT_NAMES:
-                    if (beside / name).exists():
-                        os.replace(beside / name, folder / name)
-                    else:  # of an earlier result with a prior
-                        (folder / name).unlink(missing_ok=True)
-            else:
-                os.replace(beside, folder)
+            with run.result() as beside:
+                self._write(beside)
         except OSError as error:
-            raise InputError(
-                f"{folder}: cannot be written ({error.strerror}); choose another --output"
-            ) from None
-        finally:
-            if beside is not None:
-                shutil.rmtree(beside, ignore_errors=True)
+            raise cannot_be_written(folder, error, self._most_bytes()) from None
+
+    def _most_bytes(self) -> int:
+        """What the files take together if nothing could be compressed, but for the picture and tables."""
+        arrays = [getattr(self, one.name) for one in fields(self)]
+        arrays += [tensor.numpy() for tensor in self.cloud.parameters]
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def _write(self, folder: Path) -> None:
         from g3r.report.sections import save_sections
 
         save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
         save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
-        save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
+        if self.uncertainty is not None:
+            save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
         if self.prior_share is not None:
             save_volume(folder / "prior_share.nii.gz", self.prior_share, self.grid.affine)
         for name in ("prior", "coarse", "density"):
@@ -123,20 +126,31 @@ class ReconstructionResult:
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
-        rows = {"volume": self.volume, "uncertainty": self.uncertainty}
+        rows, ranges = {"volume": self.volume}, dict(RANGES)
+        if self.uncertainty is not None:
+            rows["uncertainty"] = self.uncertainty
+            # the rim is far more uncertain than the rest; it may saturate, so that the rest is seen
+            bright = float(np.percentile(self.uncertainty[self.mask], 97)) if self.mask.any() else 1.0
+            ranges["uncertainty"] = (0.0, bright or 1.0)
         if self.prior_share is not None:
             rows["prior share"] = self.prior_share * self.mask
         if self.grid is self.prior_grid:
             on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
             rows = {**on_mask, **rows}
-        doubted = self.record.get("registration", {}).get("trusted") is False
-        title = "REGISTRATION DOUBTFUL: do not trust this volume (see run.json)" if doubted else ""
-        # the rim is far more uncertain than the rest; it may saturate, so that the rest is seen
-        bright = float(np.percentile(self.uncertainty[self.mask], 97)) if self.mask.any() else 1.0
         save_sections(
             folder / "sections.png", rows, self.grid.affine, self.mask, maps=CAPTIONS, captions=CAPTIONS,
-            ranges={**RANGES, "uncertainty": (0.0, bright or 1.0)}, title=title,
+            ranges=ranges, title=self._title(),
         )  # fmt: skip
+
+    def _title(self) -> str:
+        """Of the picture: what must be known before it is believed."""
+        said = []
+        if self.record.get("partial"):
+            cut = self.record["interrupted"]
+            said.append(f"PARTIAL: interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}")
+        if self.record.get("registration", {}).get("trusted") is False:
+            said.append("REGISTRATION DOUBTFUL: do not trust this volume (see run.json)")
+        return "; ".join(said)
 
     def slice_table(self) -> str:
         """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, mm)."""
@@ -160,20 +174,3 @@ class ReconstructionResult:
         if n_pixels[k] < SMALL_SHARE * typical:
             return "does not fit, small slice"
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
-
-
-def check_output_folder(folder: Path, *, replace: bool) -> None:
-    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
-
-    Raises:
-        InputError: see above, or a parent that cannot be written.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-    if folder.exists() and any(folder.iterdir()) and not replace:
-        raise InputError(
-            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
-        )
-    parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if not os.access(parent, os.W_OK):
-        raise InputError(f"{folder}: cannot be written; choose another --output")

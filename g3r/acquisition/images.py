@@ -12,7 +12,7 @@ import numpy as np
 from nibabel.filebasedimages import ImageFileError
 from numpy.typing import NDArray
 
-from g3r.errors import InputError
+from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
 
 LARGEST_VOXEL_COUNT = 2**30
@@ -139,9 +139,7 @@ def save_volume(path: str | os.PathLike[str], data: NDArray[np.generic], affine:
         nib.save(image, beside)
         os.replace(beside, path)
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}); choose another output folder"
-        ) from None
+        raise cannot_be_written(path, error, array.nbytes) from None
     finally:
         beside.unlink(missing_ok=True)
 
