@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,8 +111,8 @@ class GaussianReconstructor:
                 to the prior volume afterwards, where there is one.
             budget: chooses registration, views of the prior, Gaussians and steps in place of the settings.
             stages: keeps what each stage gives, or has it from an earlier run; nothing is kept when None.
-            interruption: a signal during the fit gives the volume so far (`record["partial"]`); before it, and
-                without this, `KeyboardInterrupt` passes through.
+            interruption: a signal during the fit gives the volume so far (`record["partial"]`); before it,
+                and without this, `KeyboardInterrupt` passes through.
 
         Raises:
             InputError: stacks that cannot be used, or a motion of other slices.
@@ -129,7 +128,8 @@ class GaussianReconstructor:
         if single:
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
         if motion is not None:
-            motion = with_pixels_of(slices, motion)
+            with clock("motion"):
+                motion = with_pixels_of(slices, motion)
             notes.append("motion was given, not estimated here")
         else:
             if budget:

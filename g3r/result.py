@@ -174,3 +174,12 @@ class ReconstructionResult:
         if n_pixels[k] < SMALL_SHARE * typical:
             return "does not fit, small slice"
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
+
+
+def is_partial(folder: str | os.PathLike[str]) -> bool:
+    """Whether a folder holds the result of an interrupted run."""
+    try:
+        record = json.loads((Path(folder) / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(record, dict) and record.get("partial") is True

@@ -37,8 +37,8 @@ class PriorVolume:
     """What the fit starts from and is drawn to.
 
     start: slices as they are fitted, and the volumes that they give; prior [I, J, K] on its grid, V_sharp
-    without a network; gain [K]; scale, what intensities were divided by since motion; believed, whether slices
-    of a single stack moved to the prior (None where that was not tried).
+    without a network; gain [K]; scale, what intensities were divided by since motion; believed, whether
+    slices of a single stack moved to the prior (None where that was not tried).
     """
 
     start: FitStart

@@ -70,7 +70,7 @@ class UnfinishedRun:
 
     @contextmanager
     def result(self) -> Iterator[Path]:
-        """A folder to write a result into; it becomes the output when the block ends, and is gone if it fails.
+        """A folder to write a result into; it becomes the output at the end, or is gone if writing fails.
 
         An earlier result steps aside first and is removed afterwards.
 

@@ -13,20 +13,25 @@ from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g3r.errors import G3RError, InputError
+from g3r.errors import G3RError, InputError, cannot_be_written
+from g3r.interruption import Interruption
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
     from g3r.budget import TimeBudget
     from g3r.memory import MemoryPlan
     from g3r.presets import ReconstructionSettings
-    from g3r.reconstruct import Progress
+    from g3r.reconstruct import GaussianReconstructor, Progress
+    from g3r.rerun import EarlierRun, Inputs
     from g3r.result import ReconstructionResult
 
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
 
 PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+
+DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
+"""Of the options that --config takes the place of, --no-prior and --time-budget besides."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -35,7 +40,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog="g3r-infer",
         description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
         "For research only, not for diagnosis.",
-        epilog="exit codes: 0 done, 2 usage, 3 bad input, 4 numerical failure",
+        epilog="exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out of memory, "
+        "130 interrupted",
     )
     parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
     parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
@@ -51,24 +57,26 @@ def build_parser() -> argparse.ArgumentParser:
         help="pose network and mean heads from g3r-export (default: shipped)",
     )
     parser.add_argument(
-        "--space", choices=("standard", "scanner"), default="standard",
-        help="volume in standard orientation (RAS, mid-sagittal plane in the middle) or in scanner space",
+        "--space", choices=("standard", "scanner"),
+        help="volume in standard orientation (default; RAS, mid-sagittal plane in the middle) or in scanner space",
     )  # fmt: skip
     parser.add_argument(
-        "--prior-voxel", type=float, default=0.8, metavar="MM",
+        "--prior-voxel", type=float, metavar="MM",
         help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
     )  # fmt: skip
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
-    parser.add_argument(
-        "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
-    )
+    parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")
     parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
     parser.add_argument(
         "--time-budget", type=float, metavar="SECONDS",
         help="in place of --preset: the best that can be done from the start of the command to its files",
     )  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
-    parser.add_argument("--seed", type=int, default=0, help="of every random choice")
+    parser.add_argument(
+        "--config", metavar="RUN.json",
+        help="settings and threads of an earlier result, in place of the options that decide them",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
     parser.add_argument(
         "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
@@ -76,6 +84,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
     return parser
 
@@ -99,7 +110,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
     if options.time_budget is not None and options.preset:
         parser.error("--preset and --time-budget exclude each other")
-    options.preset = options.preset or "balanced"
+    if options.resume and options.time_budget is not None:
+        parser.error("--resume and --time-budget exclude each other: such a run keeps no stages")
+    if options.config:
+        decided = [name for name in (*DEFAULTS, "time_budget") if getattr(options, name) is not None]
+        decided += ["no_prior"] if options.no_prior else []
+        if decided:
+            named = ", ".join(f"--{name.replace('_', '-')}" for name in decided)
+            parser.error(f"--config and {named} exclude each other: the file decides that")
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
     if options.ckpt and options.no_prior:
         parser.error("--ckpt and --no-prior exclude each other")
     logging.basicConfig(
@@ -109,58 +130,120 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    interruption = Interruption()
     try:
-        return _run(options)
+        with interruption:
+            return _run(options, interruption)
     except G3RError as error:
-        print(f"g3r-infer: {error}", file=sys.stderr)
-        return error.exit_code
-    except MemoryError:
-        print(
-            "g3r-infer: out of memory; choose a coarser --resolution or --preset draft, or crop the stacks",
-            file=sys.stderr,
-        )
-        return 4
+        return _failed(str(error), error.exit_code)
     except KeyboardInterrupt:
-        print("g3r-infer: interrupted; nothing was written", file=sys.stderr)
-        return 130
+        line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
+        return _failed(line, interruption.exit_code)
+    except (MemoryError, RuntimeError, ImportError, OSError) as error:
+        if _is_out_of_memory(error):
+            return _failed(
+                "out of memory; choose a coarser --resolution or --preset draft, or crop the stacks", 4
+            )
+        if isinstance(error, OSError):
+            refused = cannot_be_written(error.filename or options.output, error)
+            return _failed(str(refused), refused.exit_code)
+        raise
 
 
-def _run(options: argparse.Namespace) -> int:
-    from g3r.result import check_output_folder
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-infer: {line}", file=sys.stderr)
+    return exit_code
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Whether numpy, torch, the loader of libraries or the system could not get what they asked for."""
+    said = str(error).lower()
+    known = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
+    return isinstance(error, MemoryError) or any(words in said for words in known)
+
+
+def _way_on(folder: Path) -> str:
+    from g3r.unfinished import UnfinishedRun
+
+    kept = UnfinishedRun(folder).stages.is_dir()
+    return "; --resume goes on from the last finished stage" if kept else ""
+
+
+def _run(options: argparse.Namespace, interruption: Interruption) -> int:
+    from g3r.result import OUTPUT_NAMES, is_partial
+    from g3r.unfinished import UnfinishedRun, check_output_folder
 
     folder = Path(options.output)
-    check_output_folder(folder, replace=options.force)  # before any work
+    replaces = options.force or (options.resume and is_partial(folder))
+    check_output_folder(folder, replace=replaces)  # before any work
     with _lines_held_back():
-        stacks = _load(options)
+        earlier = _earlier(options)
+        stacks = _load(options, earlier)
         from g3r.memory import plan_for_stacks
         from g3r.reconstruct import GaussianReconstructor
+        from g3r.rerun import made_of
+        from g3r.stages import Stages
 
-        _use_threads(options.threads)
-        settings = _settings(options)
+        n_threads = _use_threads(options.threads or (earlier and earlier.n_threads))
+        settings = earlier.settings if earlier else _settings(options)
         reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+        inputs = _inputs(options, reconstructor)
         plan = plan_for_stacks(stacks, settings, options.max_memory)
         reconstructor.settings = plan.settings
+        budget = _budget(options, earlier)
+        if budget and options.resume:
+            raise InputError(
+                f"{options.config}: --resume: a run with a time budget keeps no stages; leave it out"
+            )
+        differences = earlier.differences(inputs) if earlier else []
+    for difference in differences:
+        logging.getLogger("g3r").warning(difference)
     with _bars(quiet=options.quiet) as progress:
         reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, plan, folder)
-        result = reconstructor.reconstruct(stacks, budget=_budget(options.time_budget))
-    result.record["command"] = {
-        "stacks": [stack.name for stack in stacks],
-        "preset": None if options.time_budget else options.preset, "seed": options.seed,
-        "threads": options.threads, "space": options.space,
-    }  # fmt: skip
-    result.record["memory"] = plan.record()
-    result.record["notes"] += plan.changes
-    result.save(folder, replace=options.force)
+        with UnfinishedRun(folder, OUTPUT_NAMES) as unfinished:
+            check_output_folder(folder, replace=replaces)  # an earlier result may have come back
+            thickness = [stack.thickness_mm for stack in stacks]
+            told = made_of(
+                settings, inputs, threads=n_threads, thickness=thickness, memory=options.max_memory
+            )
+            stages = Stages(None, None if budget else unfinished.stages, told, resume=options.resume)
+            result = reconstructor.reconstruct(
+                stacks, budget=budget, stages=stages, interruption=interruption
+            )
+            result.record["command"] = {
+                "stacks": [stack.name for stack in stacks],
+                "preset": None if options.time_budget or options.config else options.preset,
+                "seed": settings.seed, "threads": n_threads, "space": options.space,
+            }  # fmt: skip
+            result.record["inputs"] = inputs.record()
+            result.record["memory"] = plan.record()
+            result.record["notes"] += plan.changes
+            result.record["warnings"] += differences
+            result.save(folder, replace=replaces, run=unfinished)
+            if not result.record["partial"]:
+                unfinished.forget_stages()
     if options.tensorboard:
         _write_tensorboard(Path(options.tensorboard), result)
+    _say_what_was_done(result, folder)
+    if not interruption.asked():
+        return 0
+    if result.record["partial"]:
+        cut = result.record["interrupted"]
+        where = f"interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}"
+        line = f"{where}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
+    else:
+        line = f"interrupted when the fit had ended: the result in {folder} is whole"
+    return _failed(line, interruption.exit_code)
+
+
+def _say_what_was_done(result: ReconstructionResult, folder: Path) -> None:
     seconds = sum(result.record["seconds"].values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
     print(f"poses:   {result.record['registration']['summary']}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
-    return 0
 
 
 @contextmanager
@@ -178,12 +261,26 @@ def _lines_held_back() -> Iterator[None]:
         root.handlers = streams
 
 
-def _load(options: argparse.Namespace) -> list[Stack]:
+def _earlier(options: argparse.Namespace) -> EarlierRun | None:
+    if not options.config:
+        return None
+    from g3r.rerun import read_run
+
+    earlier = read_run(options.config)
+    n_then, n_now = len(earlier.thickness_mm), len(options.stacks)
+    if n_then != n_now and not options.thickness:
+        raise InputError(
+            f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use its settings"
+        )
+    return earlier
+
+
+def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack]:
     from g3r.acquisition.stacks import load_stack
 
     n = len(options.stacks)
     masks = options.masks or [None] * n
-    thickness = options.thickness or [None]
+    thickness = options.thickness or (list(earlier.thickness_mm) if earlier else [None])
     thickness = thickness * n if len(thickness) == 1 else thickness
     return [load_stack(*one) for one in zip(options.stacks, masks, thickness, strict=True)]
 
@@ -206,15 +303,30 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     )
 
 
-def _budget(seconds: float | None) -> TimeBudget | None:
-    """What is left of a time budget that began with the command."""
-    from g3r.budget import TimeBudget
+def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
+    from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
+    from g3r.rerun import FileMark, Inputs
 
+    return Inputs(
+        tuple(map(FileMark.of, options.stacks)),
+        tuple(map(FileMark.of, options.masks or [])),
+        FileMark.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
+        FileMark.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+    )
+
+
+def _budget(options: argparse.Namespace, earlier: EarlierRun | None) -> TimeBudget | None:
+    """What is left of a time budget that began with the command, or the earlier run's once more."""
+    from g3r.budget import RepeatedBudget, TimeBudget
+
+    if earlier and earlier.time_budget:
+        return RepeatedBudget(earlier.time_budget)
+    seconds = options.time_budget
     return None if seconds is None else TimeBudget.of(seconds, time.monotonic() - STARTED_S)
 
 
-def _use_threads(n: int | None) -> None:
-    """Give both thread pools the same number; they take turns, stage by stage."""
+def _use_threads(n: int | None) -> int:
+    """Give both thread pools the same number, which is returned; they take turns, stage by stage."""
     import numba
     import torch
 
@@ -224,6 +336,7 @@ def _use_threads(n: int | None) -> None:
         raise InputError(f"--threads {wanted}: this machine offers {most}; choose at most that")
     numba.set_num_threads(wanted)
     torch.set_num_threads(wanted)
+    return wanted
 
 
 def _size(text: str) -> int:

@@ -12,7 +12,7 @@ import nibabel as nib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g3r.errors import InputError, cannot_be_written
+from g3r.errors import cannot_be_written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
