@@ -65,9 +65,14 @@ class Inputs:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Inputs:
         """What `record` gave."""
-        lists = [tuple(FileMark(**mark) for mark in record[name]) for name in ("stacks", "masks")]
-        files = [FileMark(**record[name]) if record[name] else None for name in ("prior", "pose_network")]
-        return cls(*lists, *files)
+
+        def marks(name: str) -> tuple[FileMark, ...]:
+            return tuple(FileMark(**mark) for mark in record[name])
+
+        def mark(name: str) -> FileMark | None:
+            return FileMark(**record[name]) if record[name] else None
+
+        return cls(marks("stacks"), marks("masks"), mark("prior"), mark("pose_network"))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ def write_stage(path: Path, value: Any) -> None:
     arrays: Arrays = {}
     tree = json.dumps(_packed(value, arrays)).encode()
     buffer = io.BytesIO()
-    np.savez(buffer, **{TREE: np.frombuffer(tree, np.uint8)}, **arrays)
+    arrays[TREE] = np.frombuffer(tree, np.uint8)
+    np.savez(buffer, **arrays)
     beside = path.with_name(f".{path.name}")  # the run's lock keeps others out
     try:
         beside.write_bytes(buffer.getbuffer())

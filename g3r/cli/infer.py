@@ -13,6 +13,7 @@ from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r.cli.infer_options import parsed_options
 from g3r.errors import G3RError, InputError, cannot_be_written
 from g3r.interruption import Interruption
 
@@ -28,101 +29,10 @@ if TYPE_CHECKING:
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
 
-PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
-
-DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
-"""Of the options that --config takes the place of, --no-prior and --time-budget besides."""
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = argparse.ArgumentParser(
-        prog="g3r-infer",
-        description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
-        "For research only, not for diagnosis.",
-        epilog="exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out of memory, "
-        "130 interrupted",
-    )
-    parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
-    parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
-    parser.add_argument(
-        "--thickness", nargs="+", type=float, metavar="MM",
-        help="slice thickness, one for all or one per stack (default: the distance of slices)",
-    )  # fmt: skip
-    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
-    parser.add_argument(
-        "--pose-ckpt",
-        metavar="POSE.pt",
-        help="pose network and mean heads from g3r-export (default: shipped)",
-    )
-    parser.add_argument(
-        "--space", choices=("standard", "scanner"),
-        help="volume in standard orientation (default; RAS, mid-sagittal plane in the middle) or in scanner space",
-    )  # fmt: skip
-    parser.add_argument(
-        "--prior-voxel", type=float, metavar="MM",
-        help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
-    )  # fmt: skip
-    parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
-    parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")
-    parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
-    parser.add_argument(
-        "--time-budget", type=float, metavar="SECONDS",
-        help="in place of --preset: the best that can be done from the start of the command to its files",
-    )  # fmt: skip
-    parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
-    parser.add_argument(
-        "--config", metavar="RUN.json",
-        help="settings and threads of an earlier result, in place of the options that decide them",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
-    parser.add_argument(
-        "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
-    )
-    parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
-    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
-    parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
-    parser.add_argument(
-        "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
-    return parser
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    parser = build_parser()
-    options = parser.parse_args(argv)
-    n_stacks = len(options.stacks)
-    if options.masks is not None and len(options.masks) != n_stacks:
-        parser.error(
-            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order"
-        )
-    if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
-        parser.error(
-            f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
-        )
-    if options.threads is not None and options.threads < 1:
-        parser.error(f"--threads {options.threads}; expected at least 1")
-    if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
-        parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
-    if options.time_budget is not None and options.preset:
-        parser.error("--preset and --time-budget exclude each other")
-    if options.resume and options.time_budget is not None:
-        parser.error("--resume and --time-budget exclude each other: such a run keeps no stages")
-    if options.config:
-        decided = [name for name in (*DEFAULTS, "time_budget") if getattr(options, name) is not None]
-        decided += ["no_prior"] if options.no_prior else []
-        if decided:
-            named = ", ".join(f"--{name.replace('_', '-')}" for name in decided)
-            parser.error(f"--config and {named} exclude each other: the file decides that")
-    for name, value in DEFAULTS.items():
-        if getattr(options, name) is None:
-            setattr(options, name, value)
-    if options.ckpt and options.no_prior:
-        parser.error("--ckpt and --no-prior exclude each other")
+    options = parsed_options(argv)
     logging.basicConfig(
         level=logging.WARNING if options.quiet else logging.INFO,
         format="g3r-infer: %(message)s",
@@ -184,7 +94,7 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
         from g3r.rerun import made_of
         from g3r.stages import Stages
 
-        n_threads = _use_threads(options.threads or (earlier and earlier.n_threads))
+        n_threads = _use_threads(options.threads or (earlier.n_threads if earlier else None))
         settings = earlier.settings if earlier else _settings(options)
         reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
         inputs = _inputs(options, reconstructor)
@@ -270,7 +180,7 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
     n_then, n_now = len(earlier.thickness_mm), len(options.stacks)
     if n_then != n_now and not options.thickness:
         raise InputError(
-            f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use its settings"
+            f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it"
         )
     return earlier
 
@@ -337,15 +247,6 @@ def _use_threads(n: int | None) -> int:
     numba.set_num_threads(wanted)
     torch.set_num_threads(wanted)
     return wanted
-
-
-def _size(text: str) -> int:
-    from g3r.memory import parsed_size
-
-    try:
-        return parsed_size(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _dry_run(stacks: list[Stack], plan: MemoryPlan, folder: Path) -> int:
