@@ -98,7 +98,7 @@ class EarlierRun:
             for name, mark in now.items()
             if name not in then or then[name].sha256 != mark.sha256
         ]
-        said += [f"{name} ({then[name].name}) is not given" for name in then if name not in now]
+        said += [f"{name} ({then[name].name}) is not used now" for name in then if name not in now]
         if self.version != __version__:
             said.append(f"g3r is {__version__}, the configuration is of {self.version}")
         return [f"{sentence}: the volume will be another" for sentence in said]

@@ -45,6 +45,9 @@ CAPTIONS = {
 
 RANGES = {"prior share": (0.0, 1.0)}
 
+PICTURE_BYTES = 3_000_000
+"""More than the picture, the tables and the record ever took."""
+
 
 @dataclass(frozen=True)
 class ReconstructionResult:
@@ -101,6 +104,7 @@ class ReconstructionResult:
             return
         check_output_folder(folder, replace=replace)
         try:
+            run.make_room(self._most_bytes() + PICTURE_BYTES)
             with run.result() as beside:
                 self._write(beside)
         except OSError as error:

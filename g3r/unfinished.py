@@ -68,6 +68,13 @@ class UnfinishedRun:
         """Remove the stages: the result is whole, or the run starts anew."""
         shutil.rmtree(self.stages, ignore_errors=True)
 
+    def make_room(self, needed_bytes: int) -> None:
+        """Give the stages up where only that leaves enough space for the result."""
+        kept = sum(path.stat().st_size for path in self.stages.glob("*"))
+        free = shutil.disk_usage(self.folder).free
+        if free < needed_bytes <= free + kept:
+            self.forget_stages()
+
     @contextmanager
     def result(self) -> Iterator[Path]:
         """A folder to write a result into; it becomes the output at the end, or is gone if writing fails.

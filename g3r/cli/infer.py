@@ -13,8 +13,9 @@ from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r.cli.failures import EXPECTED, line_and_code
 from g3r.cli.infer_options import parsed_options
-from g3r.errors import G3RError, InputError, cannot_be_written
+from g3r.errors import InputError
 from g3r.interruption import Interruption
 
 if TYPE_CHECKING:
@@ -44,32 +45,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with interruption:
             return _run(options, interruption)
-    except G3RError as error:
-        return _failed(str(error), error.exit_code)
     except KeyboardInterrupt:
         line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
         return _failed(line, interruption.exit_code)
-    except (MemoryError, RuntimeError, ImportError, OSError) as error:
-        if _is_out_of_memory(error):
-            return _failed(
-                "out of memory; choose a coarser --resolution or --preset draft, or crop the stacks", 4
-            )
-        if isinstance(error, OSError):
-            refused = cannot_be_written(error.filename or options.output, error)
-            return _failed(str(refused), refused.exit_code)
-        raise
+    except EXPECTED as error:
+        return _failed(*line_and_code(error))
 
 
 def _failed(line: str, exit_code: int) -> int:
     print(f"g3r-infer: {line}", file=sys.stderr)
     return exit_code
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether numpy, torch, the loader of libraries or the system could not get what they asked for."""
-    said = str(error).lower()
-    known = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
-    return isinstance(error, MemoryError) or any(words in said for words in known)
 
 
 def _way_on(folder: Path) -> str:
