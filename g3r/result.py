@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
-from g3r.errors import cannot_be_written
+from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
-from g3r.unfinished import UnfinishedRun, check_output_folder
+from g3r.unfinished import UnfinishedRun
 
 if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
     from g3r.gaussians import GaussianCloud
@@ -178,6 +178,29 @@ class ReconstructionResult:
         if n_pixels[k] < SMALL_SHARE * typical:
             return "does not fit, small slice"
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
+
+
+def check_output_folder(folder: Path, *, replace: bool) -> None:
+    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
+
+    Raises:
+        InputError: see above, or a parent in which no folder can be made and renamed.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+    if folder.exists() and any(folder.iterdir()) and not replace:
+        raise InputError(
+            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
+        )
+    target = Path(os.path.realpath(folder))
+    parent = next(path for path in target.parents if path.exists())
+    if not os.access(parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
+        raise InputError(f"{folder}: cannot be written; choose another --output")
+    if target.exists() and target.stat().st_dev != parent.stat().st_dev:
+        raise InputError(
+            f"{folder}: is a file system of its own, and a result is put in place as a whole folder; "
+            f"choose a folder in it, as {folder / 'result'}"
+        )
 
 
 def is_partial(folder: str | os.PathLike[str]) -> bool:

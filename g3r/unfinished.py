@@ -149,29 +149,6 @@ class UnfinishedRun:
                 path.rmdir()  # only where empty
 
 
-def check_output_folder(folder: Path, *, replace: bool) -> None:
-    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
-
-    Raises:
-        InputError: see above, or a parent in which no folder can be made and renamed.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-    if folder.exists() and any(folder.iterdir()) and not replace:
-        raise InputError(
-            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
-        )
-    target = Path(os.path.realpath(folder))
-    parent = next(path for path in target.parents if path.exists())
-    if not os.access(parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
-        raise InputError(f"{folder}: cannot be written; choose another --output")
-    if target.exists() and target.stat().st_dev != parent.stat().st_dev:
-        raise InputError(
-            f"{folder}: is a file system of its own, and a result is put in place as a whole folder; "
-            f"choose a folder in it, as {folder / 'result'}"
-        )
-
-
 def _to_disk(path: Path) -> None:
     number = os.open(path, os.O_RDONLY)
     try:

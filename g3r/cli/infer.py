@@ -65,8 +65,8 @@ def _way_on(folder: Path) -> str:
 
 
 def _run(options: argparse.Namespace, interruption: Interruption) -> int:
-    from g3r.result import OUTPUT_NAMES, is_partial
-    from g3r.unfinished import UnfinishedRun, check_output_folder
+    from g3r.result import OUTPUT_NAMES, check_output_folder, is_partial
+    from g3r.unfinished import UnfinishedRun
 
     folder = Path(options.output)
     replaces = options.force or (options.resume and is_partial(folder))
