@@ -19,7 +19,10 @@ anything was lost, even if a test forgot to.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
+from small_case import Killed, SmallCase, fork_server, make_small_case
 from tally import Counts, Tally, table
 
 ROWS = pytest.StashKey[dict[str, Counts]]()
@@ -48,3 +51,16 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     terminalreporter.section("faults: what was tried")
     for line in table(rows):
         terminalreporter.write_line(line)
+
+
+@pytest.fixture(scope="session")
+def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
+    """A case that is reconstructed in about a second."""
+    return make_small_case(tmp_path_factory.mktemp("small-case"))
+
+
+@pytest.fixture(scope="session")
+def killed() -> Iterator[Killed]:
+    """Runs of g3r-infer in processes of their own, to be killed."""
+    with fork_server() as run:
+        yield run
