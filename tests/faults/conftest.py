@@ -20,10 +20,13 @@ anything was lost, even if a test forgot to.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
-from small_case import Killed, SmallCase, fork_server, make_small_case
 from tally import Counts, Tally, table
+
+if TYPE_CHECKING:
+    from small_case import Killed, SmallCase
 
 ROWS = pytest.StashKey[dict[str, Counts]]()
 
@@ -56,11 +59,15 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 @pytest.fixture(scope="session")
 def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
     """A case that is reconstructed in about a second."""
+    from small_case import make_small_case
+
     return make_small_case(tmp_path_factory.mktemp("small-case"))
 
 
 @pytest.fixture(scope="session")
 def killed() -> Iterator[Killed]:
     """Runs of g3r-infer in processes of their own, to be killed."""
+    from small_case import fork_server
+
     with fork_server() as run:
         yield run
