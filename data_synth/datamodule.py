@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 import torchio as tio
 from lightning.pytorch import LightningDataModule
@@ -15,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from data_synth.dataset import (
     IMAGE_KEYS,
     N_STACKS_KEY,
+    SAMPLE_SEED_KEY,
     HeadPatchSampler,
     SyntheticSubjects,
     central_crop,
@@ -193,9 +195,27 @@ class EpochSampler(Sampler[int]):
 
 
 class PatchQueue(tio.Queue):
-    """torchio's queue for subjects that are made, not listed; it knows its length without the sampler."""
+    """torchio's queue for subjects that are made, not listed; it knows its length without the sampler.
+
+    An epoch begins with an empty queue and is shuffled by what is in it, so that it is the same whether or
+    not the epochs before it ran in this process.
+    """
 
     _subjects_loader: DataLoader | None = None
+
+    def __getitem__(self, index: int) -> tio.Subject:
+        """The next patch; number 0 begins an epoch."""
+        if index == 0:
+            self.patches_list.clear()  # left over where batches do not go into an epoch
+            if self._subjects_iterable is None or self._num_sampled_subjects:
+                self._initialize_subjects_iterable()
+        return super().__getitem__(index)
+
+    def _shuffle_patches_list(self) -> None:
+        patches: Any = self.patches_list
+        own = [number for patch in patches for number in patch[SAMPLE_SEED_KEY]]
+        order = np.random.default_rng([*own, 2]).permutation(len(self.patches_list))
+        self.patches_list = [self.patches_list[k] for k in order]
 
     @property
     def iterations_per_epoch(self) -> int:
