@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.header_text import HeaderText
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
@@ -61,6 +63,7 @@ class ReconstructionResult:
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
+        header_text: what the written headers say in words; nothing when None.
     """
 
     volume: NDArray[np.float32]
@@ -79,6 +82,7 @@ class ReconstructionResult:
     uncertainty: NDArray[np.float32]
     prior_share: NDArray[np.float32] | None = None
     record: dict[str, Any] = field(default_factory=dict)
+    header_text: HeaderText | None = None
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write every output into a folder; it appears whole or not at all.
@@ -113,13 +117,12 @@ class ReconstructionResult:
     def _write(self, folder: Path) -> None:
         from g3r.report.sections import save_sections
 
-        save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
-        save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
-        save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
-        if self.prior_share is not None:
-            save_volume(folder / "prior_share.nii.gz", self.prior_share, self.grid.affine)
-        for name in ("prior", "coarse", "density"):
-            save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
+        maps = {name: self.grid for name in ("volume", "mask", "uncertainty", "prior_share")}
+        maps |= {name: self.prior_grid for name in ("prior", "coarse", "density")}
+        for name, grid in maps.items():
+            data = getattr(self, name)
+            if data is not None:
+                save_volume(folder / f"{name}.nii.gz", data, grid.affine, self.header_text)
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
@@ -162,18 +165,37 @@ class ReconstructionResult:
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
 
 
-def check_output_folder(folder: Path, *, replace: bool) -> None:
+def check_output_folder(
+    folder: Path, *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()
+) -> None:
     """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
+
+    Args:
+        folder: that will be written.
+        replace: whether it may hold an earlier result.
+        inputs: files that are read; none of them may be in the way.
 
     Raises:
         InputError: see above, or a parent that cannot be written.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-    if folder.exists() and any(folder.iterdir()) and not replace:
-        raise InputError(
-            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
-        )
-    parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if not os.access(parent, os.W_OK):
-        raise InputError(f"{folder}: cannot be written; choose another --output")
+    try:
+        if folder.is_symlink() and not folder.exists():
+            raise InputError(f"{folder}: is a link to nothing; remove it or choose another --output")
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+        if folder.exists() and any(folder.iterdir()) and not replace:
+            raise InputError(
+                f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
+            )
+        parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+        if not parent.is_dir():
+            raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise InputError(f"{folder}: cannot be written; choose another --output")
+        outputs = {(folder / name).resolve() for name in OUTPUT_NAMES}
+    except (OSError, ValueError) as error:  # a name too long, a loop of links
+        found = getattr(error, "strerror", None) or error
+        raise InputError(f"{folder}: cannot be written ({found}); choose another --output") from None
+    for path in inputs:
+        if Path(path).resolve() in outputs:
+            raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")

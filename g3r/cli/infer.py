@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from g3r.memory import MemoryPlan
     from g3r.presets import ReconstructionSettings
     from g3r.reconstruct import Progress
-    from g3r.result import ReconstructionResult
 
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
@@ -74,6 +75,10 @@ def build_parser() -> argparse.ArgumentParser:
         "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
     )
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
+    parser.add_argument(
+        "--keep-header-text", action="store_true",
+        help="carry free text of the stacks' headers (may name patients, dates) into the results",
+    )  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
     parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
@@ -93,6 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(
             f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
         )
+    if options.seed < 0:
+        parser.error(f"--seed {options.seed}; expected 0 or above")
     if options.threads is not None and options.threads < 1:
         parser.error(f"--threads {options.threads}; expected at least 1")
     if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
@@ -109,6 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     try:
         return _run(options)
     except G3RError as error:
@@ -126,10 +135,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from g3r.result import check_output_folder
-
     folder = Path(options.output)
-    check_output_folder(folder, replace=options.force)  # before any work
+    _check_files(options, folder)  # before any work
     with _lines_held_back():
         stacks = _load(options)
         from g3r.memory import plan_for_stacks
@@ -152,9 +159,17 @@ def _run(options: argparse.Namespace) -> int:
     }  # fmt: skip
     result.record["memory"] = plan.record()
     result.record["notes"] += plan.changes
+    if options.keep_header_text:
+        from g3r.acquisition.header_text import read_header_text
+
+        texts = [read_header_text(path) for path in options.stacks]
+        result.record["header_text"] = [text.record() for text in texts]
+        result = replace(result, header_text=texts[0])
     result.save(folder, replace=options.force)
     if options.tensorboard:
-        _write_tensorboard(Path(options.tensorboard), result)
+        from g3r.report.tensorboard import write_tensorboard
+
+        write_tensorboard(Path(options.tensorboard), result.record["loss"], result.volume, result.mask)
     seconds = sum(result.record["seconds"].values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
@@ -178,19 +193,33 @@ def _lines_held_back() -> Iterator[None]:
         root.handlers = streams
 
 
-def _load(options: argparse.Namespace) -> list[Stack]:
-    from g3r.acquisition.stacks import load_stack
+def _check_files(options: argparse.Namespace, folder: Path) -> None:
+    """Refuse what can be seen without reading an image."""
+    from g3r.prior.archive import check_archive
+    from g3r.result import check_output_folder
 
-    n = len(options.stacks)
-    masks = options.masks or [None] * n
-    thickness = options.thickness or [None]
-    thickness = thickness * n if len(thickness) == 1 else thickness
-    return [load_stack(*one) for one in zip(options.stacks, masks, thickness, strict=True)]
+    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
+    check_output_folder(folder, replace=options.force, inputs=inputs)
+    for kind, path in networks.items():
+        if path:
+            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
+    if options.tensorboard:
+        from g3r.report.tensorboard import check_tensorboard
+
+        check_tensorboard(Path(options.tensorboard))
+
+
+def _load(options: argparse.Namespace) -> list[Stack]:
+    from g3r.acquisition.stacks import load_stacks
+
+    thickness = options.thickness
+    if thickness and len(thickness) == 1:
+        thickness = thickness * len(options.stacks)
+    return load_stacks(options.stacks, options.masks, thickness)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from dataclasses import replace
-
     from g3r.presets import PRESETS
 
     preset = PRESETS[options.preset]
@@ -266,26 +295,6 @@ def _bars(*, quiet: bool) -> Iterator[Progress]:
             bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
 
         yield report
-
-
-def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
-    import numpy as np
-
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise InputError("--tensorboard: tensorboard is not installed; pip install tensorboard") from None
-    with SummaryWriter(str(folder)) as writer:
-        for stage, history in result.record["loss"].items():
-            for step, entry in enumerate(history):
-                values = entry if isinstance(entry, dict) else {"image": entry}
-                for name, value in values.items():
-                    writer.add_scalar(f"{stage}/{name}", value, step)
-        middle = [int(n.mean()) for n in result.mask.nonzero()]
-        top = float(result.volume.max()) or 1.0
-        for axis, name in enumerate(("sagittal", "coronal", "axial")):
-            section = np.take(result.volume, middle[axis], axis=axis) / top
-            writer.add_image(f"volume/{name}", section.T[::-1].copy(), dataformats="HW")
 
 
 if __name__ == "__main__":
