@@ -193,9 +193,13 @@ def check_output_folder(
         if not os.access(parent, os.W_OK | os.X_OK):
             raise InputError(f"{folder}: cannot be written; choose another --output")
         outputs = {(folder / name).resolve() for name in OUTPUT_NAMES}
-    except (OSError, ValueError) as error:  # a name too long, a loop of links
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a loop of links
         found = getattr(error, "strerror", None) or error
         raise InputError(f"{folder}: cannot be written ({found}); choose another --output") from None
     for path in inputs:
-        if Path(path).resolve() in outputs:
+        try:
+            is_output = Path(path).resolve() in outputs
+        except (OSError, ValueError, RuntimeError):  # who reads it says what is wrong
+            continue
+        if is_output:
             raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")
