@@ -15,6 +15,10 @@ class G3RError(Exception):
 
     exit_code = 1
 
+    def __str__(self) -> str:
+        """The message on one line, whatever file names and headers brought along."""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in super().__str__())
+
 
 class InputError(G3RError):
     """The input cannot be used: names the file, what was found, what was expected, what to do."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.header_text import HeaderText
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, cannot_be_written
@@ -64,6 +66,7 @@ class ReconstructionResult:
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
+        header_text: what the written headers say in words; nothing when None.
     """
 
     volume: NDArray[np.float32]
@@ -82,6 +85,7 @@ class ReconstructionResult:
     uncertainty: NDArray[np.float32] | None
     prior_share: NDArray[np.float32] | None = None
     record: dict[str, Any] = field(default_factory=dict)
+    header_text: HeaderText | None = None
 
     def save(
         self, folder: str | os.PathLike[str], *, replace: bool = False, run: UnfinishedRun | None = None
@@ -119,14 +123,12 @@ class ReconstructionResult:
     def _write(self, folder: Path) -> None:
         from g3r.report.sections import save_sections
 
-        save_volume(folder / "volume.nii.gz", self.volume, self.grid.affine)
-        save_volume(folder / "mask.nii.gz", self.mask, self.grid.affine)
-        if self.uncertainty is not None:
-            save_volume(folder / "uncertainty.nii.gz", self.uncertainty, self.grid.affine)
-        if self.prior_share is not None:
-            save_volume(folder / "prior_share.nii.gz", self.prior_share, self.grid.affine)
-        for name in ("prior", "coarse", "density"):
-            save_volume(folder / f"{name}.nii.gz", getattr(self, name), self.prior_grid.affine)
+        maps = {name: self.grid for name in ("volume", "mask", "uncertainty", "prior_share")}
+        maps |= {name: self.prior_grid for name in ("prior", "coarse", "density")}
+        for name, grid in maps.items():
+            data = getattr(self, name)
+            if data is not None:
+                save_volume(folder / f"{name}.nii.gz", data, grid.affine, self.header_text)
         self.cloud.save(folder / "gaussians.npz")
         (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
         (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
@@ -180,27 +182,51 @@ class ReconstructionResult:
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
 
 
-def check_output_folder(folder: Path, *, replace: bool) -> None:
+def check_output_folder(
+    folder: Path, *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()
+) -> None:
     """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
+
+    Args:
+        folder: that will be written.
+        replace: whether it may hold an earlier result.
+        inputs: files that are read; none of them may be in the way.
 
     Raises:
         InputError: see above, or a parent in which no folder can be made and renamed.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-    if folder.exists() and any(folder.iterdir()) and not replace:
-        raise InputError(
-            f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
-        )
-    target = Path(os.path.realpath(folder))
-    parent = next(path for path in target.parents if path.exists())
-    if not os.access(parent, os.W_OK | os.X_OK) or (target.exists() and not os.access(target, os.W_OK)):
-        raise InputError(f"{folder}: cannot be written; choose another --output")
-    if target.exists() and target.stat().st_dev != parent.stat().st_dev:
-        raise InputError(
-            f"{folder}: is a file system of its own, and a result is put in place as a whole folder; "
-            f"choose a folder in it, as {folder / 'result'}"
-        )
+    try:
+        if folder.is_symlink() and not folder.exists():
+            raise InputError(f"{folder}: is a link to nothing; remove it or choose another --output")
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+        if folder.exists() and any(folder.iterdir()) and not replace:
+            raise InputError(
+                f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
+            )
+        target = Path(os.path.realpath(folder))
+        parent = next(path for path in target.parents if path.exists())
+        if not parent.is_dir():
+            raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
+        usable = [parent, target] if target.exists() else [parent]
+        if not all(os.access(path, os.W_OK | os.X_OK) for path in usable):
+            raise InputError(f"{folder}: cannot be written; choose another --output")
+        if target.exists() and target.stat().st_dev != parent.stat().st_dev:
+            raise InputError(
+                f"{folder}: is a file system of its own, and a result is put in place as a whole folder; "
+                f"choose a folder in it, as {folder / 'result'}"
+            )
+        outputs = {(folder / name).resolve() for name in OUTPUT_NAMES}
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a loop of links
+        found = getattr(error, "strerror", None) or error
+        raise InputError(f"{folder}: cannot be written ({found}); choose another --output") from None
+    for path in inputs:
+        try:
+            is_output = Path(path).resolve() in outputs
+        except (OSError, ValueError, RuntimeError):  # who reads it says what is wrong
+            continue
+        if is_output:
+            raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")
 
 
 def is_partial(folder: str | os.PathLike[str]) -> bool:

@@ -10,6 +10,7 @@ import nibabel as nib
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.header_text import HeaderText
 from g3r.acquisition.nifti import checked_grid, open_nifti, orientation_remarks, voxels
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
@@ -98,8 +99,19 @@ def _check_mask_values(mask: Volume) -> None:
         )
 
 
-def save_volume(path: str | os.PathLike[str], data: NDArray[np.generic], affine: NDArray[np.float64]) -> None:
+def save_volume(
+    path: str | os.PathLike[str],
+    data: NDArray[np.generic],
+    affine: NDArray[np.float64],
+    header_text: HeaderText | None = None,
+) -> None:
     """Write a volume as NIfTI: float32, or uint8 for masks, int16 as it is. Whole or not at all.
+
+    Args:
+        path: of the file.
+        data: [I, J, K].
+        affine: [4, 4] RAS+ mm from index.
+        header_text: free text for the header; none when None.
 
     Raises:
         InputError: the folder cannot be written.
@@ -114,6 +126,8 @@ def save_volume(path: str | os.PathLike[str], data: NDArray[np.generic], affine:
     image.header.set_xyzt_units("mm")
     image.set_sform(affine, code="scanner")
     image.set_qform(affine, code="scanner")
+    if header_text is not None:
+        header_text.put_into(image)
     suffix = ".nii.gz" if path.name.endswith(".nii.gz") else ".nii"
     beside = path.with_name(f".{path.name}.{os.getpid()}{suffix}")
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import logging
 import os
 import stat
@@ -13,6 +14,7 @@ from typing import Any
 
 import nibabel as nib
 import numpy as np
+from nibabel.arrayproxy import ArrayProxy
 from numpy.typing import NDArray
 
 from g3r.errors import InputError
@@ -26,6 +28,9 @@ LARGEST_VOXEL_BYTES = 8 * LARGEST_VOXEL_COUNT
 GZIP_RATIO = 1032
 """Deflate makes of a byte at most this many, so a compressed file cannot hold more (zlib's documentation)."""
 
+BLOCK_BYTES, MOST_BLOCKS_BEYOND = 2**20, 64
+"""What may follow the voxels of a compressed file is read to its end, but not for ever."""
+
 NIFTI_ENDINGS = (".nii", ".hdr", ".img")
 """Of NIfTI files, alone or before .gz; .hdr and .img are the two halves of a pair."""
 
@@ -34,6 +39,9 @@ LENGTH_UNITS = {1: "metres", 3: "micrometres"}
 
 HEADERS_AGREE_VOXELS = 0.5
 """Corners by sform and by qform may differ by this much before it is worth a line."""
+
+NO_SIZE = "setting 0 dims to 1"
+"""What nibabel says of voxels without a size, which only an sform can then give."""
 
 NiftiImage = nib.Nifti1Image | nib.Nifti2Image | nib.Nifti1Pair
 
@@ -54,10 +62,17 @@ def open_nifti(path: str | os.PathLike[str]) -> tuple[NiftiImage, list[str]]:
             # no memory map: a file that is cut or written while it is mapped would kill the process
             image = nib.load(path, mmap=False)
     except Exception as error:  # nibabel's parsers raise whatever damaged bytes make them raise
+        found = one_line(error).replace(str(path), path.name)
         raise InputError(
-            f"{path.name}: not a readable NIfTI file ({one_line(error)}); expected .nii or .nii.gz"
+            f"{path.name}: not a readable NIfTI file ({found}); expected .nii or .nii.gz"
         ) from None
-    if not isinstance(image, (nib.Nifti1Image, nib.Nifti2Image, nib.Nifti1Pair)):
+    if (
+        isinstance(image, NiftiImage)
+        and int(image.header["sform_code"]) <= 0
+        and NO_SIZE in " ".join(remarks)
+    ):
+        raise InputError(f"{path.name}: bad header (pixdim is 0); fix pixdim, or give it an sform")
+    if not isinstance(image, NiftiImage):
         raise InputError(f"{path.name}: is a {type(image).__name__}; expected NIfTI, convert it first")
     return image, remarks
 
@@ -104,13 +119,30 @@ def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray
     """
     try:
         with np.errstate(all="ignore"), _remarks():  # what overflows is infinite, and who uses it decides
-            return np.asarray(image.dataobj, dtype=np.float32).reshape(shape)
+            return _read(image).reshape(shape)
+    except InputError:
+        raise
     except Exception as error:  # zlib, gzip and nibabel have many names for damage
         if isinstance(error, MemoryError):
             raise
         raise InputError(
             f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off"
         ) from None
+
+
+def _read(image: NiftiImage) -> NDArray[np.float32]:
+    """Scaled values; of a compressed file up to its end, where the checksum stands."""
+    file = Path(image.file_map["image"].filename)
+    if not file.name.lower().endswith(".gz"):
+        return np.asarray(image.dataobj, dtype=np.float32)
+    of_file = image.dataobj
+    layout = (of_file.shape, of_file.dtype, of_file.offset, of_file.slope, of_file.inter)
+    with gzip.open(file) as stream:
+        data = np.asarray(ArrayProxy(stream, layout, mmap=False), dtype=np.float32)
+        for _ in range(MOST_BLOCKS_BEYOND):
+            if not stream.read(BLOCK_BYTES):
+                return data
+    raise InputError(f"{file.name}: holds far more than its header claims; export the image again")
 
 
 def orientation_remarks(image: NiftiImage, grid: VolumeGrid) -> list[str]:
@@ -146,7 +178,8 @@ def _check_file(path: Path) -> None:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError) as error:  # a loop of links, a name too long, a zero byte in it
-        raise InputError(f"{path}: cannot be read ({one_line(error)}); check the path") from None
+        found = getattr(error, "strerror", None) or one_line(error)
+        raise InputError(f"{path}: cannot be read ({found}); check the path") from None
     if stat.S_ISDIR(status.st_mode):
         raise InputError(
             f"{path}: is a folder; expected a NIfTI file (.nii or .nii.gz; dcm2niix makes one of DICOM)"

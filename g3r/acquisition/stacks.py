@@ -100,7 +100,7 @@ class Stack:
             raise InputError(
                 f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out"
             )
-        if inside.min() == inside.max():
+        if inside.size > 1 and inside.min() == inside.max():
             raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
         if np.count_nonzero(inside > 0) < LEAST_POSITIVE_SHARE * inside.size:
             raise InputError(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     interruption = Interruption()
     try:
         with interruption:
@@ -70,7 +74,7 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
 
     folder = Path(options.output)
     replaces = options.force or (options.resume and is_partial(folder))
-    check_output_folder(folder, replace=replaces)  # before any work
+    _check_files(options, folder, replaces=replaces)  # before any work
     with _lines_held_back():
         earlier = _earlier(options)
         stacks = _load(options, earlier)
@@ -116,11 +120,19 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
             result.record["memory"] = plan.record()
             result.record["notes"] += plan.changes
             result.record["warnings"] += differences
+            if options.keep_header_text:
+                from g3r.acquisition.header_text import read_header_text
+
+                texts = [read_header_text(path) for path in options.stacks]
+                result.record["header_text"] = [text.record() for text in texts]
+                result = replace(result, header_text=texts[0])
             result.save(folder, replace=replaces, run=unfinished)
             if not result.record["partial"]:
                 unfinished.forget_stages()
     if options.tensorboard:
-        _write_tensorboard(Path(options.tensorboard), result)
+        from g3r.report.tensorboard import write_tensorboard
+
+        write_tensorboard(Path(options.tensorboard), result.record["loss"], result.volume, result.mask)
     _say_what_was_done(result, folder)
     if not interruption.asked():
         return 0
@@ -170,19 +182,33 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
     return earlier
 
 
-def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack]:
-    from g3r.acquisition.stacks import load_stack
+def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
+    """Refuse what can be seen without reading an image."""
+    from g3r.prior.archive import check_archive
+    from g3r.result import check_output_folder
 
-    n = len(options.stacks)
-    masks = options.masks or [None] * n
-    thickness = options.thickness or (list(earlier.thickness_mm) if earlier else [None])
-    thickness = thickness * n if len(thickness) == 1 else thickness
-    return [load_stack(*one) for one in zip(options.stacks, masks, thickness, strict=True)]
+    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
+    check_output_folder(folder, replace=replaces, inputs=inputs)
+    for kind, path in networks.items():
+        if path:
+            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
+    if options.tensorboard:
+        from g3r.report.tensorboard import check_tensorboard
+
+        check_tensorboard(Path(options.tensorboard))
+
+
+def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack]:
+    from g3r.acquisition.stacks import load_stacks
+
+    thickness = options.thickness or (list(earlier.thickness_mm) if earlier else None)
+    if thickness and len(thickness) == 1:
+        thickness = thickness * len(options.stacks)
+    return load_stacks(options.stacks, options.masks, thickness)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from dataclasses import replace
-
     from g3r.presets import PRESETS
 
     preset = PRESETS[options.preset]
@@ -265,26 +291,6 @@ def _bars(*, quiet: bool) -> Iterator[Progress]:
             bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
 
         yield report
-
-
-def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
-    import numpy as np
-
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise InputError("--tensorboard: tensorboard is not installed; pip install tensorboard") from None
-    with SummaryWriter(str(folder)) as writer:
-        for stage, history in result.record["loss"].items():
-            for step, entry in enumerate(history):
-                values = entry if isinstance(entry, dict) else {"image": entry}
-                for name, value in values.items():
-                    writer.add_scalar(f"{stage}/{name}", value, step)
-        middle = [int(n.mean()) for n in result.mask.nonzero()]
-        top = float(result.volume.max()) or 1.0
-        for axis, name in enumerate(("sagittal", "coronal", "axial")):
-            section = np.take(result.volume, middle[axis], axis=axis) / top
-            writer.add_image(f"volume/{name}", section.T[::-1].copy(), dataformats="HW")
 
 
 if __name__ == "__main__":

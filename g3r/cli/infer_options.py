@@ -59,6 +59,10 @@ def build_parser() -> argparse.ArgumentParser:
         "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
     )
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
+    parser.add_argument(
+        "--keep-header-text", action="store_true",
+        help="carry free text of the stacks' headers (may name patients, dates) into the results",
+    )  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
     parser.add_argument(
@@ -81,6 +85,8 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(
             f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
         )
+    if options.seed is not None and options.seed < 0:
+        parser.error(f"--seed {options.seed}; expected 0 or above")
     if options.threads is not None and options.threads < 1:
         parser.error(f"--threads {options.threads}; expected at least 1")
     if options.time_budget is not None and not 0 < options.time_budget < float("inf"):

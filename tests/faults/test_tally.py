@@ -33,7 +33,7 @@ def test_cases_are_counted_and_errors_are_lost_and_go_on():
 
 @pytest.mark.parametrize("refused", [1, 2])
 def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int):
-    for name in ("conftest.py", "tally.py"):
+    for name in ("conftest.py", "tally.py", "nifti_files.py"):
         shutil.copy(Path(__file__).with_name(name), tmp_path)
     test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
     (tmp_path / "test_kills.py").write_text(test)
