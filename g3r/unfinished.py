@@ -28,18 +28,19 @@ class UnfinishedRun:
 
     Args:
         output: folder that the result will be.
-        names: of files that a result may have; others that lie in an earlier result are kept.
+        names: of files that a result may have; others that lie in an earlier result are kept. None replaces
+            the whole folder.
 
     Raises:
         InputError: another run is writing the same output, or the folder cannot be made.
     """
 
-    def __init__(self, output: str | os.PathLike[str], names: Collection[str] = ()) -> None:
+    def __init__(self, output: str | os.PathLike[str], names: Collection[str] | None = None) -> None:
         self.named = Path(output)
         self.output = Path(os.path.realpath(output))  # a link is followed, not replaced
         self.folder = self.output.with_name(self.output.name + SUFFIX)
         self.stages = self.folder / "stages"
-        self.names = frozenset(names)
+        self.names = names
         self._whole, self._earlier = self.folder / "whole", self.folder / "earlier"
         self._lock: int | None = None
         self._made: list[Path] = []
@@ -106,7 +107,8 @@ class UnfinishedRun:
             os.rename(self._earlier, self.output)
             return
         for path in self._earlier.iterdir():
-            if path.name not in self.names and not (self.output / path.name).exists():
+            own = self.names is None or path.name in self.names
+            if not own and not (self.output / path.name).exists():
                 os.rename(path, self.output / path.name)
         shutil.rmtree(self._earlier, ignore_errors=True)
 

@@ -47,7 +47,7 @@ ALLOWED["finish"] = ROOMS - {"reconstruct", "bench", "cli", "finish"}
 ALLOWED["reconstruct"] = ROOMS - {"bench", "cli", "reconstruct"}
 ALLOWED["bench"] = ROOMS - {"cli", "bench"}  # it measures the whole way of the data
 ALLOWED["cli"] = ROOMS - {"cli"}
-DATA_SYNTH_MAY = {"geometry", "acquisition"} | OPEN_TO_ALL
+DATA_SYNTH_MAY = {"geometry", "acquisition", "unfinished"} | OPEN_TO_ALL
 
 SOURCES = sorted(
     path
