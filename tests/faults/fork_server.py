@@ -35,6 +35,8 @@ def run(request: dict) -> dict:
                 code = g3r.cli.infer.main(request["arguments"])
             except SystemExit as end:
                 code = end.code
+            except KeyboardInterrupt:  # before the command listened
+                code = 130
             finally:
                 sys.stdout.flush()
                 os._exit(code)
