@@ -114,7 +114,8 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
             result.record["command"] = {
                 "stacks": [stack.name for stack in stacks],
                 "preset": None if options.time_budget or options.config else options.preset,
-                "seed": settings.seed, "threads": n_threads, "space": options.space,
+                "seed": settings.seed, "threads": n_threads,
+                "space": "standard" if settings.motion.standard_orientation else "scanner",
             }  # fmt: skip
             result.record["inputs"] = inputs.record()
             result.record["memory"] = plan.record()
@@ -134,8 +135,10 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
 
         write_tensorboard(Path(options.tensorboard), result.record["loss"], result.volume, result.mask)
     _say_what_was_done(result, folder)
-    if not interruption.asked():
-        return 0
+    return _said_of_interruption(result, folder, interruption) if interruption.asked() else 0
+
+
+def _said_of_interruption(result: ReconstructionResult, folder: Path, interruption: Interruption) -> int:
     if result.record["partial"]:
         cut = result.record["interrupted"]
         where = f"interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}"
