@@ -38,8 +38,9 @@ def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: 
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("threads", ["1", "2"])
-@pytest.mark.parametrize("further", [("--no-prior",), ("--space", "scanner", "--seed", "5")])
+@pytest.mark.parametrize(
+    ("threads", "further"), [("1", ("--no-prior",)), ("2", ("--space", "scanner", "--seed", "5"))]
+)
 def test_options_then_config_then_config_of_that(
     case: SmallCase, tmp_path: Path, tally: Tally, threads: str, further: tuple[str, ...]
 ):
