@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -126,22 +126,21 @@ class StackSynthesisDataModule(LightningDataModule):
         self.setup()
         h: Any = self.hparams
         assert self.train_subjects is not None
-        epoch, rank, n_ranks = 0, 0, 1
+        rank, n_ranks = 0, 1
         if self.trainer is not None:
-            epoch, rank, n_ranks = (
-                self.trainer.current_epoch,
-                self.trainer.global_rank,
-                self.trainer.world_size,
-            )
+            rank, n_ranks = self.trainer.global_rank, self.trainer.world_size
+        n_batches = h.patches_per_subject * h.subjects_per_epoch // h.batch_size
         queue = PatchQueue(
             self.train_subjects,  # type: ignore[arg-type]  # any dataset of subjects will do
             max_length=h.patches_per_subject * min(QUEUE_SUBJECTS, h.subjects_per_epoch),
             samples_per_volume=h.patches_per_subject,
             sampler=HeadPatchSampler(h.patch_size),
-            subject_sampler=EpochSampler(h.subjects_per_epoch, epoch, rank, n_ranks),
+            subject_sampler=EpochSampler(
+                h.subjects_per_epoch, 0, rank, n_ranks, epoch_of(self.trainer, n_batches)
+            ),
             shuffle_subjects=False,
             num_workers=h.num_workers,
-            start_background=h.num_workers > 0,
+            start_background=False,  # a run that goes on does not know its epoch yet
         )
         return tio.SubjectsLoader(
             queue, batch_size=h.batch_size, num_workers=0, drop_last=True, collate_fn=collate_images
@@ -169,17 +168,39 @@ class StackSynthesisDataModule(LightningDataModule):
         return train, val
 
 
+def epoch_of(trainer: Any, n_batches: int) -> Callable[[], int] | None:
+    """Tells the epoch of a trainer, of which loaders are made before a checkpoint has said how far it is.
+
+    Args:
+        trainer: None where there is none; then nothing is known.
+        n_batches: of an epoch.
+    """
+    if trainer is None:
+        return None
+    # an epoch that ended with the checkpoint is counted by its steps first
+    return lambda: max(trainer.current_epoch, trainer.global_step // n_batches)
+
+
 class EpochSampler(Sampler[int]):
     """Numbers epoch * length + index, one epoch further each time it is iterated.
 
     Args:
         length: of an epoch, over all processes; this is what `len` says, too.
         epoch: to begin with.
+        now: says which epoch it is when it is iterated; None counts.
         rank: of this process. Each of `n_ranks` processes has numbers of its own.
         n_ranks: processes that train together.
     """
 
-    def __init__(self, length: int, epoch: int = 0, rank: int = 0, n_ranks: int = 1) -> None:
+    def __init__(
+        self,
+        length: int,
+        epoch: int = 0,
+        rank: int = 0,
+        n_ranks: int = 1,
+        now: Callable[[], int] | None = None,
+    ) -> None:
+        self.now = now
         self.length = length
         self.epoch = epoch
         self.rank = rank
@@ -189,6 +210,8 @@ class EpochSampler(Sampler[int]):
         return self.length
 
     def __iter__(self) -> Iterator[int]:
+        if self.now is not None:
+            self.epoch = self.now()
         first = self.epoch * self.length
         self.epoch += 1
         return iter(range(first + self.rank % self.length, first + self.length, self.n_ranks))
