@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 import torchio as tio
 from lightning.pytorch import LightningDataModule
@@ -15,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from data_synth.dataset import (
     IMAGE_KEYS,
     N_STACKS_KEY,
+    SAMPLE_SEED_KEY,
     HeadPatchSampler,
     SyntheticSubjects,
     central_crop,
@@ -124,22 +126,21 @@ class StackSynthesisDataModule(LightningDataModule):
         self.setup()
         h: Any = self.hparams
         assert self.train_subjects is not None
-        epoch, rank, n_ranks = 0, 0, 1
+        rank, n_ranks = 0, 1
         if self.trainer is not None:
-            epoch, rank, n_ranks = (
-                self.trainer.current_epoch,
-                self.trainer.global_rank,
-                self.trainer.world_size,
-            )
+            rank, n_ranks = self.trainer.global_rank, self.trainer.world_size
+        n_batches = h.patches_per_subject * h.subjects_per_epoch // h.batch_size
         queue = PatchQueue(
             self.train_subjects,  # type: ignore[arg-type]  # any dataset of subjects will do
             max_length=h.patches_per_subject * min(QUEUE_SUBJECTS, h.subjects_per_epoch),
             samples_per_volume=h.patches_per_subject,
             sampler=HeadPatchSampler(h.patch_size),
-            subject_sampler=EpochSampler(h.subjects_per_epoch, epoch, rank, n_ranks),
+            subject_sampler=EpochSampler(
+                h.subjects_per_epoch, 0, rank, n_ranks, epoch_of(self.trainer, n_batches)
+            ),
             shuffle_subjects=False,
             num_workers=h.num_workers,
-            start_background=h.num_workers > 0,
+            start_background=False,  # a run that goes on does not know its epoch yet
         )
         return tio.SubjectsLoader(
             queue, batch_size=h.batch_size, num_workers=0, drop_last=True, collate_fn=collate_images
@@ -167,17 +168,39 @@ class StackSynthesisDataModule(LightningDataModule):
         return train, val
 
 
+def epoch_of(trainer: Any, n_batches: int) -> Callable[[], int] | None:
+    """Tells the epoch of a trainer, of which loaders are made before a checkpoint has said how far it is.
+
+    Args:
+        trainer: None where there is none; then nothing is known.
+        n_batches: of an epoch.
+    """
+    if trainer is None:
+        return None
+    # an epoch that ended with the checkpoint is counted by its steps first
+    return lambda: max(trainer.current_epoch, trainer.global_step // n_batches)
+
+
 class EpochSampler(Sampler[int]):
     """Numbers epoch * length + index, one epoch further each time it is iterated.
 
     Args:
         length: of an epoch, over all processes; this is what `len` says, too.
         epoch: to begin with.
+        now: says which epoch it is when it is iterated; None counts.
         rank: of this process. Each of `n_ranks` processes has numbers of its own.
         n_ranks: processes that train together.
     """
 
-    def __init__(self, length: int, epoch: int = 0, rank: int = 0, n_ranks: int = 1) -> None:
+    def __init__(
+        self,
+        length: int,
+        epoch: int = 0,
+        rank: int = 0,
+        n_ranks: int = 1,
+        now: Callable[[], int] | None = None,
+    ) -> None:
+        self.now = now
         self.length = length
         self.epoch = epoch
         self.rank = rank
@@ -187,15 +210,35 @@ class EpochSampler(Sampler[int]):
         return self.length
 
     def __iter__(self) -> Iterator[int]:
+        if self.now is not None:
+            self.epoch = self.now()
         first = self.epoch * self.length
         self.epoch += 1
         return iter(range(first + self.rank % self.length, first + self.length, self.n_ranks))
 
 
 class PatchQueue(tio.Queue):
-    """torchio's queue for subjects that are made, not listed; it knows its length without the sampler."""
+    """torchio's queue for subjects that are made, not listed; it knows its length without the sampler.
+
+    An epoch begins with an empty queue and is shuffled by what is in it, so that it is the same whether or
+    not the epochs before it ran in this process.
+    """
 
     _subjects_loader: DataLoader | None = None
+
+    def __getitem__(self, index: int) -> tio.Subject:
+        """The next patch; number 0 begins an epoch."""
+        if index == 0:
+            self.patches_list.clear()  # left over where batches do not go into an epoch
+            if self._subjects_iterable is None or self._num_sampled_subjects:
+                self._initialize_subjects_iterable()
+        return super().__getitem__(index)
+
+    def _shuffle_patches_list(self) -> None:
+        patches: Any = self.patches_list
+        own = [number for patch in patches for number in patch[SAMPLE_SEED_KEY]]
+        order = np.random.default_rng([*own, 2]).permutation(len(self.patches_list))
+        self.patches_list = [self.patches_list[k] for k in order]
 
     @property
     def iterations_per_epoch(self) -> int:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,7 +12,8 @@ import numpy as np
 from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import save_volume
-from g3r.errors import InputError
+from g3r.errors import InputError, cannot_be_written
+from g3r.unfinished import UnfinishedRun
 
 POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
 
@@ -46,18 +44,13 @@ def save_simulation(
         InputError: the folder exists and is not empty (without `replace`), or cannot be written.
     """
     check_output(folder, replace=replace)
-    beside: Path | None = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        beside.chmod(0o755)  # mkdtemp makes it private, an ordinary folder is not
-        _write(beside, truth, stacks, record)
-        _put_in_place(beside, folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another --output") from None
-    finally:
-        if beside is not None:
-            shutil.rmtree(beside, ignore_errors=True)
+    with UnfinishedRun(folder) as run:
+        check_output(folder, replace=replace)
+        try:
+            with run.result() as beside:
+                _write(beside, truth, stacks, record)
+        except OSError as error:
+            raise cannot_be_written(folder, error) from None
 
 
 def check_output(folder: Path, *, replace: bool) -> None:
@@ -77,21 +70,6 @@ def check_output(folder: Path, *, replace: bool) -> None:
         raise InputError(f"{folder}: is not empty; pass --force to replace it, or choose another --output")
     if content and "poses.tsv" not in content:
         raise InputError(f"{folder}: holds something else than a simulation; choose another --output")
-
-
-def _put_in_place(beside: Path, folder: Path) -> None:
-    """Rename the finished folder; an old one steps aside first and comes back should that fail."""
-    if not folder.exists():
-        os.replace(beside, folder)
-        return
-    old = folder.with_name(f".{folder.name}.old.{os.getpid()}")
-    os.replace(folder, old)
-    try:
-        os.replace(beside, folder)
-    except OSError:
-        os.replace(old, folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _write(

@@ -12,7 +12,7 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from data_synth.atlas import TruthVolume
-from data_synth.datamodule import EpochSampler
+from data_synth.datamodule import EpochSampler, epoch_of
 from data_synth.head_variation import varied_head
 from data_synth.heads import Subject, load_head, training_and_validation
 from data_synth.slice_sampling import Head
@@ -118,11 +118,11 @@ class SliceSetDataModule(LightningDataModule):
         self.setup()
         h: Any = self.hparams
         assert self.train_sets is not None
-        epoch = self.trainer.current_epoch if self.trainer is not None else 0
+        now = epoch_of(self.trainer, max(1, h.sets_per_epoch // h.batch_size))
         return DataLoader(
             self.train_sets,
             batch_size=h.batch_size,
-            sampler=EpochSampler(h.sets_per_epoch, epoch),
+            sampler=EpochSampler(h.sets_per_epoch, now=now),
             num_workers=h.num_workers,
             multiprocessing_context="spawn" if h.num_workers else None,
             persistent_workers=h.num_workers > 0,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
-from g3r.pace import Deadline
+from g3r.pace import Deadline, Pace
 from g3r.presets import PRESETS, ReconstructionSettings
 from g3r.start import FitStart, gaussian_spacing_mm
 
@@ -87,7 +88,7 @@ class TimeBudget:
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
-        return cls(Deadline.after(seconds - spent_s), seconds)
+        return cls(replace(Deadline.after(seconds - spent_s), pace=Pace()), seconds)
 
     @property
     def missed(self) -> bool:
@@ -185,7 +186,35 @@ class TimeBudget:
 
     def record(self) -> dict[str, Any]:
         """For run.json."""
-        return {"seconds": self.given_s, **self.choices}
+        pace = self.deadline.pace
+        return {"seconds": self.given_s, **self.choices, "pace": pace.loops if pace else []}
+
+
+class RepeatedBudget(TimeBudget):
+    """A run with a time budget once more, without a clock: the settings are known, loops do what they did.
+
+    Args:
+        record: what `TimeBudget.record` said of the run.
+    """
+
+    def __init__(self, record: Mapping[str, Any]) -> None:
+        told = {name: value for name, value in record.items() if name not in ("seconds", "pace")}
+        deadline = Deadline(pace=Pace(record["pace"], repeating=True))
+        super().__init__(deadline, record["seconds"], told)
+
+    def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
+        """The settings as they are."""
+        return settings, self.deadline
+
+    def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
+        """The settings as they are."""
+        return settings
+
+    def for_fit(
+        self, settings: ReconstructionSettings, *known: Any
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        """The settings as they are."""
+        return settings, self.deadline, self.deadline
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:

@@ -1,10 +1,23 @@
 """Errors that a user can act on, with the exit code of the command line for each."""
 
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+
+MEGABYTE = 1e6
+
 
 class G3RError(Exception):
     """Base of every error that g3r raises on purpose; the message is one actionable line."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """The message on one line, whatever file names and headers brought along."""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in super().__str__())
 
 
 class InputError(G3RError):
@@ -17,3 +30,35 @@ class NumericalError(G3RError):
     """The computation did not hold; what exists so far is kept and marked."""
 
     exit_code = 4
+
+
+def cannot_be_written(
+    path: str | os.PathLike[str], error: OSError, needed_bytes: int | None = None
+) -> InputError:
+    """The error to raise where a file or folder could not be written.
+
+    Args:
+        path: what was being written.
+        error: what the system said.
+        needed_bytes: what the file takes at most, where that is known.
+    """
+    said = error.strerror or type(error).__name__
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return InputError(f"{path}: cannot be written ({said}); choose another --output")
+    needed = "" if needed_bytes is None else f", at most {needed_bytes / MEGABYTE:.1f} MB are needed"
+    free = _free_bytes(Path(path))
+    # a quota or a limit on the size of files leaves the disk itself with space
+    left = "" if free is None else f", {free / MEGABYTE:.1f} MB are free"
+    return InputError(
+        f"{path}: cannot be written ({said}{needed}{left}); free some space or choose another --output"
+    )
+
+
+def _free_bytes(path: Path) -> int | None:
+    """Space on the disk of a path that need not exist."""
+    for folder in (path, *path.absolute().parents):
+        try:
+            return shutil.disk_usage(folder).free
+        except OSError:
+            continue
+    return None

@@ -1,10 +1,37 @@
-"""How long loops go on: for so many steps, or until a deadline, whichever comes first."""
+"""How long loops go on: for so many steps, until a deadline, or until somebody asks for the end."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+
+def _nobody() -> bool:
+    return False
+
+
+@dataclass
+class Pace:
+    """What the clock decided in the loops of a run, in their order, so that a later run can do the same.
+
+    Attributes:
+        loops: for each loop the fractions of its steps (see `paced`).
+        repeating: whether the loops are followed, and no longer written.
+    """
+
+    loops: list[list[float]] = field(default_factory=list)
+    repeating: bool = False
+    _next: int = 0
+
+    def begin(self) -> list[float]:
+        """The fractions of the next loop: as they were, or a list to fill."""
+        if self.repeating:
+            self._next += 1
+            return self.loops[self._next - 1] if self._next <= len(self.loops) else []
+        self.loops.append([])
+        return self.loops[-1]
 
 
 @dataclass(frozen=True)
@@ -12,12 +39,16 @@ class Deadline:
     """A moment by which something has to end.
 
     Args:
-        end_s: on the clock.
+        end_s: on the clock; infinity for none.
         clock: seconds that only go forwards.
+        is_cut: whether the end is asked for at once, whatever the clock says.
+        pace: remembers what the clock decided; None for nobody.
     """
 
-    end_s: float
+    end_s: float = math.inf
     clock: Callable[[], float] = field(default=time.monotonic, repr=False)
+    is_cut: Callable[[], bool] = field(default=_nobody, repr=False)
+    pace: Pace | None = field(default=None, repr=False)
 
     @classmethod
     def after(cls, seconds: float, clock: Callable[[], float] = time.monotonic) -> Deadline:
@@ -31,7 +62,16 @@ class Deadline:
 
     def part(self, share: float, reserve_s: float = 0.0) -> Deadline:
         """The deadline of a stage that may take a share of what is left but for a reserve."""
-        return Deadline(self.clock() + share * max(0.0, self.remaining_s - reserve_s), self.clock)
+        return replace(self, end_s=self.clock() + share * max(0.0, self.remaining_s - reserve_s))
+
+    def has_passed(self) -> bool:
+        """Whether no time is left, as the clock says now or said then."""
+        if self.pace is None:
+            return self.remaining_s <= 0
+        known = self.pace.begin()
+        if not self.pace.repeating:
+            known.append(float(self.remaining_s <= 0))
+        return bool(known and known[0])
 
 
 def paced(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Iterator[tuple[int, float]]:
@@ -42,13 +82,26 @@ def paced(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Ite
 
     Args:
         n_steps: at most so many.
-        deadline: no step begins that would probably end after it; None gives all steps.
-        least: so many steps are made even then.
+        deadline: no step begins that would probably end after it, or once it is cut; None gives all steps.
+        least: so many steps are made even after the deadline, but not once it is cut.
     """
     if deadline is None:
         for step in range(n_steps):
             yield step, step / n_steps
         return
+    written = deadline.pace.begin() if deadline.pace else []
+    steps = _by_the_clock(n_steps, deadline, least)
+    if deadline.pace and deadline.pace.repeating:
+        steps = enumerate(written)
+    for step, fraction in steps:
+        if deadline.is_cut():
+            return
+        if deadline.pace and not deadline.pace.repeating:
+            written.append(fraction)
+        yield step, fraction
+
+
+def _by_the_clock(n_steps: int, deadline: Deadline, least: int) -> Iterator[tuple[int, float]]:
     begun, fraction = deadline.clock(), 0.0
     for step in range(n_steps):
         total = n_steps
@@ -57,6 +110,6 @@ def paced(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Ite
             fitting = deadline.remaining_s / per_step if per_step > 0 else n_steps
             if fitting < 1 and step >= least:
                 return
-            total = min(n_steps, max(least, step + int(fitting), step + 1))
-        fraction = max(fraction, step / total)
+            total = max(least, step + int(min(fitting, n_steps)), step + 1)
+        fraction = max(fraction, step / min(n_steps, total))
         yield step, fraction

@@ -32,16 +32,22 @@ ALLOWED = {
     "presets": BELOW_FITTING | {"fitting"},
 }
 OPEN_TO_ALL = {"errors", "_version", "pace"}
+ALLOWED["interruption"] = set()
+ALLOWED["unfinished"] = set()
+ALLOWED["stage_file"] = set()
 ALLOWED["start"] = BELOW_FITTING
 ALLOWED["memory"] = BELOW_FITTING | {"fitting", "presets", "start"}
 ALLOWED["budget"] = BELOW_FITTING | {"fitting", "presets", "start"}
 ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "presets"}
-ROOMS = {*ALLOWED, "result", "reconstruct", "bench", "cli"}
-ALLOWED["result"] = ROOMS - {"reconstruct", "bench", "cli", "result"}
+ALLOWED["rerun"] = {"presets"}
+ALLOWED["stages"] = BELOW_FITTING | {"fitting", "run_record", "stage_file", "start"}
+ROOMS = {*ALLOWED, "result", "finish", "reconstruct", "bench", "cli"}
+ALLOWED["result"] = ROOMS - {"finish", "reconstruct", "bench", "cli", "result"}
+ALLOWED["finish"] = ROOMS - {"reconstruct", "bench", "cli", "finish"}
 ALLOWED["reconstruct"] = ROOMS - {"bench", "cli", "reconstruct"}
 ALLOWED["bench"] = ROOMS - {"cli", "bench"}  # it measures the whole way of the data
 ALLOWED["cli"] = ROOMS - {"cli"}
-DATA_SYNTH_MAY = {"geometry", "acquisition"} | OPEN_TO_ALL
+DATA_SYNTH_MAY = {"geometry", "acquisition", "unfinished"} | OPEN_TO_ALL
 
 SOURCES = sorted(
     path

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,18 @@ ORTHOGONALITY_TOLERANCE = 1e-3
 
 THICKNESS_RANGE_MM = (0.1, 20.0)
 
+SPACING_RANGE_MM = (0.05, 50.0)
+"""Of pixels and of slices; headers in metres or micrometres lie outside."""
+
+INTENSITY_RANGE = (1e-30, 1e30)
+"""Largest value inside a mask: what float32 can be divided by."""
+
+LEAST_POSITIVE_SHARE = 0.01
+"""Of the masked values; intensities are normalised by their 99th percentile."""
+
+FARTHEST_MM = 500.0
+"""Between the heads of two stacks by their headers; scans of one session share a frame."""
+
 
 @dataclass(frozen=True)
 class Stack:
@@ -34,7 +48,8 @@ class Stack:
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
-            that are not finite or all the same inside the mask, a thickness outside 0.1-20 mm.
+            that are not finite, not positive or all the same inside the mask, a thickness outside 0.1-20 mm,
+            voxels that are not of a size in mm.
     """
 
     image: NDArray[np.float32]
@@ -59,6 +74,12 @@ class Stack:
             spacing = VolumeGrid(image.shape, affine).spacing_mm
         except ValueError as error:
             raise InputError(f"{self.name}: bad header ({error}); fix the sform or qform") from None
+        low, high = SPACING_RANGE_MM
+        if not (low <= spacing.min() and spacing.max() <= high):
+            raise InputError(
+                f"{self.name}: voxels of {spaced(spacing)} mm; expected {low:g} to {high:g} mm, check the "
+                "header (units, pixdim, sform)"
+            )
         axes = affine[:3, :3] / spacing
         cosine = np.abs(axes.T @ axes - np.eye(3)).max()
         if cosine > ORTHOGONALITY_TOLERANCE:
@@ -79,8 +100,19 @@ class Stack:
             raise InputError(
                 f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out"
             )
-        if inside.min() == inside.max():
+        if inside.size > 1 and inside.min() == inside.max():
             raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
+        if np.count_nonzero(inside > 0) < LEAST_POSITIVE_SHARE * inside.size:
+            raise InputError(
+                f"{self.name}: hardly a value inside the mask is positive (the largest is {inside.max():g}); "
+                "expected a magnitude image"
+            )
+        low, high = INTENSITY_RANGE
+        if not low <= inside.max() <= high:
+            raise InputError(
+                f"{self.name}: largest value inside the mask is {inside.max():g}; expected {low:g} to "
+                f"{high:g}, scale the image"
+            )
         object.__setattr__(self, "image", np.where(np.isfinite(image), image, np.float32(0)))
         object.__setattr__(self, "mask", mask)
         object.__setattr__(self, "affine", affine)
@@ -113,6 +145,8 @@ def load_stack(
         InputError: what `load_volume`, `load_mask` and `Stack` refuse.
     """
     volume = load_volume(path)
+    for remark in volume.remarks:
+        logger.warning("%s: %s", volume.name, remark)
     if mask_path is None:
         mask = np.nan_to_num(volume.data) > 0
         if not mask.any():
@@ -120,6 +154,8 @@ def load_stack(
         logger.warning("%s: no mask given; every positive voxel is taken for brain", volume.name)
     else:
         mask = load_mask(mask_path, volume)
+        if mask.all():
+            logger.warning("%s: its mask marks every voxel; expected the brain alone", volume.name)
     spacing = volume.grid.spacing_mm
     through = int(np.argmax(spacing)) if np.max(spacing) > 1.1 * np.median(spacing) else 2
     order = [axis for axis in range(3) if axis != through] + [through]
@@ -128,10 +164,65 @@ def load_stack(
     if thickness_mm is None:
         thickness_mm = float(spacing[through])
         logger.info("%s: thickness taken as the distance of slices, %.2f mm", volume.name, thickness_mm)
-    return Stack(
+    stack = Stack(
         np.ascontiguousarray(volume.data.transpose(order)),
         np.ascontiguousarray(mask.transpose(order)),
         affine,
         thickness_mm,
         volume.name,
     )
+    if stack.thickness_mm < stack.spacing_mm[:2].min():
+        logger.warning(
+            "%s: thickness %g mm is less than the pixels' %s mm; check --thickness",
+            stack.name, stack.thickness_mm, spaced(stack.spacing_mm[:2]),
+        )  # fmt: skip
+    return stack
+
+
+def load_stacks(
+    paths: Sequence[str | os.PathLike[str]],
+    mask_paths: Sequence[str | os.PathLike[str] | None] | None = None,
+    thickness_mm: Sequence[float | None] | None = None,
+) -> list[Stack]:
+    """Read the stacks of one head, see `load_stack`.
+
+    Raises:
+        InputError: a stack that cannot be used, the same image twice, or stacks that lie too far apart.
+        ValueError: as many masks or thicknesses as stacks were expected.
+    """
+    masks = mask_paths or [None] * len(paths)
+    thickness = thickness_mm or [None] * len(paths)
+    stacks: list[Stack] = []
+    for path, mask, own_mm in zip(paths, masks, thickness, strict=True):
+        stack = load_stack(path, mask, own_mm)
+        for other, other_path in zip(stacks, paths, strict=False):
+            _check_pair(stack, other, Path(path), Path(other_path))
+        stacks.append(stack)
+    return stacks
+
+
+def spaced(lengths: NDArray[np.float64]) -> str:
+    """For people: 0.8 x 0.8 x 3."""
+    return " x ".join(f"{x:.3g}" for x in lengths)
+
+
+def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> None:
+    """Raise `InputError` for one image given twice, which would be believed twice, and for strangers."""
+    if path.resolve() == other_path.resolve():
+        raise InputError(f"{stack.name}: is given twice; pass each stack once")
+    if stack.image.shape == other.image.shape and np.array_equal(stack.image, other.image):
+        raise InputError(
+            f"{stack.name}: holds the same image as {other.name}; pass each stack once, and copies not at all"
+        )
+    apart_mm = float(np.linalg.norm(_middle_mm(stack) - _middle_mm(other)))
+    if apart_mm > FARTHEST_MM:
+        raise InputError(
+            f"{stack.name}: lies {apart_mm:.0f} mm from {other.name} by its header; expected scans of one "
+            "head in one session, fix the header or leave the stack out"
+        )
+
+
+def _middle_mm(stack: Stack) -> NDArray[np.float64]:
+    """World position of the middle of the mask's bounding box [3]."""
+    corners = [np.flatnonzero(stack.mask.any(axes))[[0, -1]].mean() for axes in ((1, 2), (0, 2), (0, 1))]
+    return stack.grid.world(corners)

@@ -5,105 +5,39 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
+import io
 import logging
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g3r.errors import G3RError, InputError
+from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.infer_options import parsed_options
+from g3r.errors import InputError
+from g3r.interruption import Interruption
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
     from g3r.budget import TimeBudget
     from g3r.memory import MemoryPlan
     from g3r.presets import ReconstructionSettings
-    from g3r.reconstruct import Progress
+    from g3r.reconstruct import GaussianReconstructor, Progress
+    from g3r.rerun import EarlierRun, Inputs
     from g3r.result import ReconstructionResult
 
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
 
-PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = argparse.ArgumentParser(
-        prog="g3r-infer",
-        description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
-        "For research only, not for diagnosis.",
-        epilog="exit codes: 0 done, 2 usage, 3 bad input, 4 numerical failure",
-    )
-    parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
-    parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
-    parser.add_argument(
-        "--thickness", nargs="+", type=float, metavar="MM",
-        help="slice thickness, one for all or one per stack (default: the distance of slices)",
-    )  # fmt: skip
-    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
-    parser.add_argument(
-        "--pose-ckpt",
-        metavar="POSE.pt",
-        help="pose network and mean heads from g3r-export (default: shipped)",
-    )
-    parser.add_argument(
-        "--space", choices=("standard", "scanner"), default="standard",
-        help="volume in standard orientation (RAS, mid-sagittal plane in the middle) or in scanner space",
-    )  # fmt: skip
-    parser.add_argument(
-        "--prior-voxel", type=float, default=0.8, metavar="MM",
-        help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
-    )  # fmt: skip
-    parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
-    parser.add_argument(
-        "--resolution", type=float, default=0.8, metavar="MM", help="voxel size (default 0.8)"
-    )
-    parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
-    parser.add_argument(
-        "--time-budget", type=float, metavar="SECONDS",
-        help="in place of --preset: the best that can be done from the start of the command to its files",
-    )  # fmt: skip
-    parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
-    parser.add_argument("--seed", type=int, default=0, help="of every random choice")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
-    parser.add_argument(
-        "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
-    )
-    parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
-    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
-    parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
-    return parser
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    parser = build_parser()
-    options = parser.parse_args(argv)
-    n_stacks = len(options.stacks)
-    if options.masks is not None and len(options.masks) != n_stacks:
-        parser.error(
-            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order"
-        )
-    if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
-        parser.error(
-            f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
-        )
-    if options.threads is not None and options.threads < 1:
-        parser.error(f"--threads {options.threads}; expected at least 1")
-    if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
-        parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
-    if options.time_budget is not None and options.preset:
-        parser.error("--preset and --time-budget exclude each other")
-    options.preset = options.preset or "balanced"
-    if options.ckpt and options.no_prior:
-        parser.error("--ckpt and --no-prior exclude each other")
+    options = parsed_options(argv)
     logging.basicConfig(
         level=logging.WARNING if options.quiet else logging.INFO,
         format="g3r-infer: %(message)s",
@@ -112,64 +46,122 @@ def main(argv: Sequence[str] | None = None) -> int:
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
+    interruption = Interruption()
     try:
-        return _run(options)
-    except G3RError as error:
-        print(f"g3r-infer: {error}", file=sys.stderr)
-        return error.exit_code
-    except MemoryError:
-        print(
-            "g3r-infer: out of memory; choose a coarser --resolution or --preset draft, or crop the stacks",
-            file=sys.stderr,
-        )
-        return 4
+        with interruption:
+            return _run(options, interruption)
     except KeyboardInterrupt:
-        print("g3r-infer: interrupted; nothing was written", file=sys.stderr)
-        return 130
+        line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
+        return _failed(line, interruption.exit_code)
+    except EXPECTED as error:
+        return _failed(*line_and_code(error))
 
 
-def _run(options: argparse.Namespace) -> int:
-    from g3r.result import check_output_folder
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-infer: {line}", file=sys.stderr)
+    return exit_code
+
+
+def _way_on(folder: Path) -> str:
+    from g3r.unfinished import UnfinishedRun
+
+    kept = UnfinishedRun(folder).stages.is_dir()
+    return "; --resume goes on from the last finished stage" if kept else ""
+
+
+def _run(options: argparse.Namespace, interruption: Interruption) -> int:
+    from g3r.result import OUTPUT_NAMES, check_output_folder, is_partial
+    from g3r.unfinished import UnfinishedRun
 
     folder = Path(options.output)
-    check_output_folder(folder, replace=options.force)  # before any work
+    replaces = options.force or (options.resume and is_partial(folder))
+    _check_files(options, folder, replaces=replaces)  # before any work
     with _lines_held_back():
-        stacks = _load(options)
+        earlier = _earlier(options)
+        stacks = _load(options, earlier)
         from g3r.memory import plan_for_stacks
         from g3r.reconstruct import GaussianReconstructor
+        from g3r.rerun import made_of
+        from g3r.stages import Stages
 
-        _use_threads(options.threads)
-        settings = _settings(options)
+        n_threads = _use_threads(options.threads or (earlier.n_threads if earlier else None))
+        settings = earlier.settings if earlier else _settings(options)
         reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+        inputs = _inputs(options, reconstructor)
         plan = plan_for_stacks(stacks, settings, options.max_memory)
         reconstructor.settings = plan.settings
+        budget = _budget(options, earlier)
+        if budget and options.resume:
+            raise InputError(
+                f"{options.config}: --resume: a run with a time budget keeps no stages; leave it out"
+            )
+        differences = earlier.differences(inputs) if earlier else []
+    for difference in differences:
+        logging.getLogger("g3r").warning(difference)
     with _bars(quiet=options.quiet) as progress:
         reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, plan, folder)
-        budget = _budget(options.time_budget)
-        result = reconstructor.reconstruct(stacks, budget=budget)
-    result.record["command"] = {
-        "stacks": [stack.name for stack in stacks],
-        "preset": None if options.time_budget else options.preset, "seed": options.seed,
-        "threads": options.threads, "space": options.space,
-    }  # fmt: skip
-    result.record["memory"] = plan.record()
-    result.record["notes"] += plan.changes
-    result.save(folder, replace=options.force)
+        with UnfinishedRun(folder, OUTPUT_NAMES) as unfinished:
+            check_output_folder(folder, replace=replaces)  # an earlier result may have come back
+            thickness = [stack.thickness_mm for stack in stacks]
+            told = made_of(
+                settings, inputs, threads=n_threads, thickness=thickness, memory=options.max_memory
+            )
+            stages = Stages(None, None if budget else unfinished.stages, told, resume=options.resume)
+            result = reconstructor.reconstruct(
+                stacks, budget=budget, stages=stages, interruption=interruption
+            )
+            result.record["command"] = {
+                "stacks": [stack.name for stack in stacks],
+                "preset": None if options.time_budget or options.config else options.preset,
+                "seed": settings.seed, "threads": n_threads,
+                "space": "standard" if settings.motion.standard_orientation else "scanner",
+            }  # fmt: skip
+            result.record["inputs"] = inputs.record()
+            result.record["memory"] = plan.record()
+            result.record["notes"] += plan.changes
+            result.record["warnings"] += differences
+            if options.keep_header_text:
+                from g3r.acquisition.header_text import read_header_text
+
+                texts = [read_header_text(path) for path in options.stacks]
+                result.record["header_text"] = [text.record() for text in texts]
+                result = replace(result, header_text=texts[0])
+            result.save(folder, replace=replaces, run=unfinished)
+            if not result.record["partial"]:
+                unfinished.forget_stages()
     if options.tensorboard:
-        _write_tensorboard(Path(options.tensorboard), result)
+        from g3r.report.tensorboard import write_tensorboard
+
+        write_tensorboard(Path(options.tensorboard), result.record["loss"], result.volume, result.mask)
     if budget is not None and budget.missed:
-        logging.getLogger(__name__).warning(
+        logging.getLogger("g3r").warning(
             "time budget of %g s: took %.0f s; registration, volume and files need at least that here",
             budget.given_s, time.monotonic() - STARTED_S,
         )  # fmt: skip
+    _say_what_was_done(result, folder)
+    return _said_of_interruption(result, folder, interruption) if interruption.asked() else 0
+
+
+def _said_of_interruption(result: ReconstructionResult, folder: Path, interruption: Interruption) -> int:
+    if result.record["partial"]:
+        cut = result.record["interrupted"]
+        where = f"interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}"
+        line = f"{where}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
+    else:
+        line = f"interrupted when the fit had ended: the result in {folder} is whole"
+    return _failed(line, interruption.exit_code)
+
+
+def _say_what_was_done(result: ReconstructionResult, folder: Path) -> None:
     seconds = sum(result.record["seconds"].values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
     print(f"poses:   {result.record['registration']['summary']}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
-    return 0
 
 
 @contextmanager
@@ -187,19 +179,47 @@ def _lines_held_back() -> Iterator[None]:
         root.handlers = streams
 
 
-def _load(options: argparse.Namespace) -> list[Stack]:
-    from g3r.acquisition.stacks import load_stack
+def _earlier(options: argparse.Namespace) -> EarlierRun | None:
+    if not options.config:
+        return None
+    from g3r.rerun import read_run
 
-    n = len(options.stacks)
-    masks = options.masks or [None] * n
-    thickness = options.thickness or [None]
-    thickness = thickness * n if len(thickness) == 1 else thickness
-    return [load_stack(*one) for one in zip(options.stacks, masks, thickness, strict=True)]
+    earlier = read_run(options.config)
+    n_then, n_now = len(earlier.thickness_mm), len(options.stacks)
+    if n_then != n_now and not options.thickness:
+        raise InputError(
+            f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it"
+        )
+    return earlier
+
+
+def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
+    """Refuse what can be seen without reading an image."""
+    from g3r.prior.archive import check_archive
+    from g3r.result import check_output_folder
+
+    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
+    check_output_folder(folder, replace=replaces, inputs=inputs)
+    for kind, path in networks.items():
+        if path:
+            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
+    if options.tensorboard:
+        from g3r.report.tensorboard import check_tensorboard
+
+        check_tensorboard(Path(options.tensorboard))
+
+
+def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack]:
+    from g3r.acquisition.stacks import load_stacks
+
+    thickness = options.thickness or (list(earlier.thickness_mm) if earlier else None)
+    if thickness and len(thickness) == 1:
+        thickness = thickness * len(options.stacks)
+    return load_stacks(options.stacks, options.masks, thickness)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from dataclasses import replace
-
     from g3r.presets import PRESETS
 
     preset = PRESETS[options.preset]
@@ -215,15 +235,30 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     )
 
 
-def _budget(seconds: float | None) -> TimeBudget | None:
-    """What is left of a time budget that began with the command."""
-    from g3r.budget import TimeBudget
+def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
+    from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
+    from g3r.rerun import FileMark, Inputs
 
+    return Inputs(
+        tuple(map(FileMark.of, options.stacks)),
+        tuple(map(FileMark.of, options.masks or [])),
+        FileMark.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
+        FileMark.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+    )
+
+
+def _budget(options: argparse.Namespace, earlier: EarlierRun | None) -> TimeBudget | None:
+    """What is left of a time budget that began with the command, or the earlier run's once more."""
+    from g3r.budget import RepeatedBudget, TimeBudget
+
+    if earlier and earlier.time_budget:
+        return RepeatedBudget(earlier.time_budget)
+    seconds = options.time_budget
     return None if seconds is None else TimeBudget.of(seconds, time.monotonic() - STARTED_S)
 
 
-def _use_threads(n: int | None) -> None:
-    """Give both thread pools the same number; they take turns, stage by stage."""
+def _use_threads(n: int | None) -> int:
+    """Give both thread pools the same number, which is returned; they take turns, stage by stage."""
     import numba
     import torch
 
@@ -233,15 +268,7 @@ def _use_threads(n: int | None) -> None:
         raise InputError(f"--threads {wanted}: this machine offers {most}; choose at most that")
     numba.set_num_threads(wanted)
     torch.set_num_threads(wanted)
-
-
-def _size(text: str) -> int:
-    from g3r.memory import parsed_size
-
-    try:
-        return parsed_size(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    return wanted
 
 
 def _dry_run(stacks: list[Stack], plan: MemoryPlan, folder: Path) -> int:
@@ -277,26 +304,6 @@ def _bars(*, quiet: bool) -> Iterator[Progress]:
             bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
 
         yield report
-
-
-def _write_tensorboard(folder: Path, result: ReconstructionResult) -> None:
-    import numpy as np
-
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise InputError("--tensorboard: tensorboard is not installed; pip install tensorboard") from None
-    with SummaryWriter(str(folder)) as writer:
-        for stage, history in result.record["loss"].items():
-            for step, entry in enumerate(history):
-                values = entry if isinstance(entry, dict) else {"image": entry}
-                for name, value in values.items():
-                    writer.add_scalar(f"{stage}/{name}", value, step)
-        middle = [int(n.mean()) for n in result.mask.nonzero()]
-        top = float(result.volume.max()) or 1.0
-        for axis, name in enumerate(("sagittal", "coronal", "axial")):
-            section = np.take(result.volume, middle[axis], axis=axis) / top
-            writer.add_image(f"volume/{name}", section.T[::-1].copy(), dataformats="HW")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
@@ -32,10 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     from g3r.errors import G3RError
 
     try:
-        from lightning.pytorch import LightningDataModule
+        from lightning.pytorch import LightningDataModule, Trainer
         from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-        from g3r.prior.training import AnnealedModule
+        from g3r.prior.training import AnnealedModule, WholeCheckpoints
     except ModuleNotFoundError as error:
         advice = "install the training extra: pip install 'g3r[train]'"
         print(f"g3r-pretrain: {error.name} is not installed; {advice}", file=sys.stderr)
@@ -45,6 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
             # a config that names no class is one of the prior's
             parser.set_defaults({"model": {"class_path": "g3r.prior.lightning_module.PriorModule"}})
+
+        def instantiate_trainer(self, **options: Any) -> Trainer:
+            return super().instantiate_trainer(plugins=[WholeCheckpoints()], **options)
 
     try:
         PretrainCLI(

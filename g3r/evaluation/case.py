@@ -131,6 +131,9 @@ def _recorded_thickness_mm(folder: Path) -> float | None:
     path = folder / "simulation.json"
     if not path.is_file():
         return None
-    record = json.loads(path.read_text(encoding="utf-8"))
-    value = record.get("thickness_mm", record.get("thickness"))
-    return None if value is None else float(value)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        value = record.get("thickness_mm", record.get("thickness"))
+        return None if value is None else float(value)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); expected the record of g3r-simulate") from None

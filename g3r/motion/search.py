@@ -86,7 +86,7 @@ def search(
         if best is None or judgement.cost < best[0].cost:
             best = judgement, found
         least = min(p.correlation for p in best[0].prediction)
-        if least >= SETTLED or not settings.runs or (deadline is not None and deadline.remaining_s <= 0):
+        if least >= SETTLED or not settings.runs or (deadline is not None and deadline.has_passed()):
             break
         logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, least)
     assert best is not None

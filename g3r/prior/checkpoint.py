@@ -14,12 +14,16 @@ from g3r.acquisition.scatter import DENSITY_CONVENTION, INTENSITY_CONVENTION
 from g3r.errors import InputError
 from g3r.prior.checkpoint_file import (
     again,
+    built,
     check_digest,
     check_identity,
-    fill,
+    number,
     one_line,
+    plain_arguments,
     plain_weights,
     read_file,
+    scores,
+    text,
     weights_digest,
     write_file,
 )
@@ -31,6 +35,9 @@ KIND = "prior"
 FORMAT_VERSION = 1
 VOXEL_MM_RANGE = (0.1, 10.0)
 VOXEL_MM_TOLERANCE = 1e-3
+
+LARGEST_ARGUMENTS = {"channels": 4096, "units": 64, "tail_channels": 4096}
+"""Beyond these a network takes minutes to build, and is none of ours."""
 
 _ANOTHER_FILE = "pass a file made by g3r-export, or leave --ckpt out to use the weights that ship with g3r"
 
@@ -147,28 +154,40 @@ def load_prior(
             f"{path}: was trained on voxels of {meta.voxel_mm:g} mm, expected {voxel_mm:g} mm; pass another "
             f"file, or --prior-voxel {meta.voxel_mm:g} if that is what you want"
         )
-    network = _build(path, meta)
-    fill(path, network, content["weights"], KIND)
+    from g3r.prior.dgpn import DensityGatedPriorNetwork  # MONAI: only once the file has proved good
+
+    fewest = _fewest_values(path, meta.network_arguments)
+    network = built(path, lambda: DensityGatedPriorNetwork(**meta.network_arguments), fewest, content, KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))
     # Only the speed changes: convolutions on a CPU are up to twice as fast with channels innermost.
     return network.to(memory_format=torch.channels_last_3d).eval(), meta  # type: ignore[call-overload]
 
 
+def _fewest_values(path: Path, arguments: Mapping[str, Any]) -> float:
+    """A lower bound on the number of a network's weights: of its residual units and its tail."""
+    try:
+        levels = zip(arguments["channels"], arguments["units"], strict=True)
+        return 27 * (sum(2 * n * width**2 for width, n in levels) + arguments["tail_channels"] ** 2)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: weights and network arguments do not fit together ({one_line(error)}); {again(KIND)}"
+        ) from error
+
+
 def _describe(path: Path, content: Mapping[str, Any]) -> PriorCheckpoint:
     """Return the description with its values checked."""
     try:
-        arguments = content["network_arguments"]
         meta = PriorCheckpoint(
-            network_arguments=dict(arguments),
-            voxel_mm=float(content["voxel_mm"]),
-            training_data=str(content["training_data"]),
-            validation={str(name): float(value) for name, value in content["validation"].items()},
+            network_arguments=plain_arguments(content, LARGEST_ARGUMENTS),
+            voxel_mm=number(content, "voxel_mm"),
+            training_data=text(content, "training_data"),
+            validation=scores(content),
             density_convention=content["density_convention"],
             intensity_convention=content["intensity_convention"],
             sharp_convention=content["sharp_convention"],
-            g3r_version=str(content["g3r_version"]),
+            g3r_version=text(content, "g3r_version"),
         )
-        agrees = (meta.alpha, meta.beta) == (content["alpha"], content["beta"])
+        agrees = (meta.alpha, meta.beta) == (number(content, "alpha"), number(content, "beta"))
     except KeyError as error:
         raise InputError(f"{path}: is damaged (entry {error} is missing); copy or export it again") from error
     except (TypeError, ValueError, AttributeError) as error:
@@ -176,15 +195,3 @@ def _describe(path: Path, content: Mapping[str, Any]) -> PriorCheckpoint:
     if not agrees or not isinstance(content.get("weights"), dict):
         raise InputError(f"{path}: is damaged (its entries contradict each other); copy or export it again")
     return meta
-
-
-def _build(path: Path, meta: PriorCheckpoint) -> "DensityGatedPriorNetwork":
-    """Return the network, without its weights."""
-    from g3r.prior.dgpn import DensityGatedPriorNetwork  # MONAI: only once the file has proved good
-
-    try:
-        return DensityGatedPriorNetwork(**meta.network_arguments)
-    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: weights and network arguments do not fit together ({one_line(error)}); {again(KIND)}"
-        ) from error

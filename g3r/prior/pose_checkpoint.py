@@ -1,5 +1,6 @@
 """The one file that carries a trained pose network: weights, mean heads, and what they hold for."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +15,16 @@ from g3r.acquisition.template import AtlasTemplate
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 from g3r.prior.checkpoint_file import (
-    again,
+    built,
     check_digest,
     check_identity,
-    fill,
+    number,
     one_line,
+    plain_arguments,
     plain_weights,
     read_file,
+    scores,
+    text,
     weights_digest,
     write_file,
 )
@@ -32,6 +36,12 @@ KIND = "pose"
 FORMAT_VERSION = 1
 TEMPLATE_KEY = "template"
 """The network's buffer of mean heads."""
+
+LARGEST_ARGUMENTS = {
+    "template_shape": 1024, "template_spacing_mm": 100, "image_size": 1024, "pixel_mm": 100, "channels": 4096,
+    "width": 8192, "n_blocks": 64, "n_heads": 64, "n_refinements": 16,
+}  # fmt: skip
+"""Beyond these a network takes minutes to build, and is none of ours."""
 
 _ANOTHER_FILE = (
     "pass a pose network made by g3r-export, or leave it out to use the weights that ship with g3r"
@@ -144,14 +154,13 @@ def load_pose_network(path: str | Path) -> "tuple[PoseNetwork, PoseCheckpoint]":
     from g3r.prior.pose_network import PoseNetwork  # MONAI: only once the file has proved good
 
     try:
-        network = PoseNetwork(**content["network_arguments"])
+        arguments = plain_arguments(content, LARGEST_ARGUMENTS)
+        fewest = _fewest_values(arguments)
     except KeyError as error:
         raise InputError(f"{path}: is damaged (entry {error} is missing); copy or export it again") from error
-    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: network arguments make no network ({one_line(error)}); {again(KIND)}"
-        ) from error
-    fill(path, network, content["weights"], KIND)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {one_line(error)}; copy or export it again") from error
+    network = built(path, lambda: PoseNetwork(**arguments), fewest, content, KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))
     return network.eval(), _describe(path, content, network)
 
@@ -162,19 +171,35 @@ def _describe(path: Path, content: Mapping[str, Any], network: "PoseNetwork") ->
     grid = centred_grid(arguments["template_shape"], arguments["template_spacing_mm"])
     try:
         template = AtlasTemplate(
-            network.template.permute(3, 0, 1, 2).numpy(), grid.affine, np.asarray(content["weeks"], float)
+            network.template.permute(3, 0, 1, 2).numpy(), grid.affine, np.array(_weeks(content), float)
         )
         return PoseCheckpoint(
             network_arguments=arguments,
             template=template,
-            training_data=str(content["training_data"]),
-            validation={str(name): float(value) for name, value in content["validation"].items()},
-            g3r_version=str(content["g3r_version"]),
+            training_data=text(content, "training_data"),
+            validation=scores(content),
+            g3r_version=text(content, "g3r_version"),
         )
     except KeyError as error:
         raise InputError(f"{path}: is damaged (entry {error} is missing); copy or export it again") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: {one_line(error)}; copy or export it again") from error
+
+
+def _fewest_values(arguments: Mapping[str, Any]) -> float:
+    """A lower bound on the number of a network's weights: of its template, token layers, units and blocks."""
+    third, width = arguments["channels"][-1], arguments["width"]
+    token = third * (arguments["image_size"] // 8) ** 2 * width
+    units = 9 * sum(one**2 for one in arguments["channels"][1:])
+    return math.prod(arguments["template_shape"]) + 2 * (token + units + 4 * arguments["n_blocks"] * width**2)
+
+
+def _weeks(content: Mapping[str, Any]) -> list[float]:
+    """Gestational ages of the mean heads; `KeyError` without them, `TypeError` for something else."""
+    weeks = content["weeks"]
+    if not isinstance(weeks, list | tuple):
+        raise TypeError("weeks is no list of ages")
+    return [number({"weeks": week}, "weeks") for week in weeks]
 
 
 def _rounded(name: str, value: Tensor) -> Tensor:

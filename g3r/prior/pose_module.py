@@ -1,7 +1,6 @@
 """Training of the pose network."""
 
 import logging
-import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -189,7 +188,7 @@ class PoseModule(AnnealedModule):
             if fresh:
                 logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
             self.network.load_state_dict({**own, **taken, "template": own["template"]})
-        except (OSError, pickle.UnpicklingError, RuntimeError, LookupError, TypeError) as error:
+        except Exception as error:  # torch.load says "damaged" in many types
             raise InputError(
                 f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
                 "checkpoint of a pose network"

@@ -4,14 +4,21 @@ Only the modules with `Module` classes import Lightning; inference never does.
 """
 
 import math
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from g3r.errors import InputError, cannot_be_written
+
+UNFINISHED = ".unfinished"
 
 
 class AnnealedModule(LightningModule):
@@ -46,8 +53,15 @@ class AnnealedModule(LightningModule):
         raise NotImplementedError
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Note when the data arrived."""
+        """Note when the data arrived, and begin the step's own random numbers.
+
+        They depend on the run's seed and the number of the step alone: a run that was killed and goes on from
+        a checkpoint draws what it would have drawn.
+        """
         self._pace.start_batch()
+        run_seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
+        seed = np.random.SeedSequence([run_seed, self.global_step]).generate_state(1, np.uint64)[0]
+        torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Log samples per second and the share of time spent waiting for data."""
@@ -89,6 +103,54 @@ class AnnealedModule(LightningModule):
             if remaining is not None and elapsed > 0:
                 progress = max(progress, elapsed / (elapsed + max(remaining, 0.0)))
         return min((step + 1) / (self.warmup_steps + 1), 1.0) * cosine_factor(progress)
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes a checkpoint beside its place and renames it: a kill leaves the earlier one.
+
+    Lightning's own goes through a temporary file, which is copied where those are on another disk.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
+    ) -> None:
+        """Write a checkpoint, whole or not at all.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        path = Path(path)
+        beside = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.save(checkpoint, beside)
+            os.replace(beside, path)
+        except OSError as error:
+            raise cannot_be_written(path, error) from None
+        except RuntimeError as error:  # what torch makes of a full disk
+            if "write" not in str(error):
+                raise
+            raise InputError(f"{path}: cannot be written ({error}); free some space") from None
+        finally:
+            beside.unlink(missing_ok=True)
+
+    def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
+        """Read a checkpoint to go on from; remove what its run, if dead, had not finished writing."""
+        for beside in Path(path).parent.glob(f".*{UNFINISHED}"):
+            process = beside.name.removesuffix(UNFINISHED).rpartition(".")[2]
+            if not (process.isdigit() and _is_alive(int(process))):
+                beside.unlink(missing_ok=True)
+        return super().load_checkpoint(path, *arguments, **options)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's
+        pass
+    return True
 
 
 class _Pace:

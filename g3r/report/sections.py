@@ -12,7 +12,7 @@ import nibabel as nib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g3r.errors import InputError
+from g3r.errors import cannot_be_written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -254,6 +254,6 @@ def _write(figure: Figure, path: Path) -> None:
         FigureCanvasAgg(figure).print_png(beside)
         os.replace(beside, path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None
+        raise cannot_be_written(path, error) from None
     finally:
         beside.unlink(missing_ok=True)

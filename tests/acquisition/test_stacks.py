@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.images import LARGEST_VOXEL_COUNT, Volume, load_mask, load_volume, save_volume
+from g3r.acquisition.images import Volume, load_mask, load_volume, save_volume
+from g3r.acquisition.nifti import LARGEST_VOXEL_COUNT
 from g3r.acquisition.planes import Planes, slices_from_stacks, volume_from_pixels, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack, load_stack
@@ -329,7 +330,7 @@ def bad_files(folder: Path) -> dict[str, Path]:
         ("colour", "colour"),
         ("singular", "bad header.*singular"),
         ("huge", "header claims"),
-        ("other format", "MGHImage; expected NIfTI"),
+        ("other format", "not NIfTI by its name; expected .nii"),
     ],
 )
 def test_unusable_files_are_refused_in_one_line_that_names_them(tmp_path: Path, kind: str, message: str):

@@ -89,7 +89,7 @@ REFUSALS = {
     "another weight": (flip_a_bit, "do not match their checksum"),
     "no checksum": (without("weights_sha256"), "do not match their checksum"),
     "NaN": (poison, "NaN or infinity"),
-    "an unknown argument": (other_arguments(depth=3), "make no network"),
+    "an unknown argument": (other_arguments(depth=3), "do not fit together"),
     "another width": (other_arguments(width=64), "do not fit together"),
     "another template": (other_arguments(template_shape=[3, 8, 9, 10]), "do not fit together"),
 }

@@ -1,0 +1,45 @@
+"""What the machine could not give (memory, space on a disk), as one line and an exit code."""
+
+from __future__ import annotations
+
+import errno
+
+from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written
+
+EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
+"""Errors that `line_and_code` may know; a defect of the program is none of them, or is raised again."""
+
+SAID_WITHOUT_MEMORY = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
+"""Words of numpy, torch, the loader of libraries and the system."""
+
+OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset draft, or crop the stacks"
+KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
+
+
+def line_and_code(error: BaseException) -> tuple[str, int]:
+    """The line for the user and the exit code.
+
+    Raises:
+        BaseException: the error itself where it is a defect of the program.
+    """
+    if isinstance(error, G3RError):
+        return str(error), error.exit_code
+    if is_out_of_memory(error):
+        return OUT_OF_MEMORY, NumericalError.exit_code
+    if isinstance(error, OSError):
+        if error.filename is not None:
+            return str(cannot_be_written(error.filename, error)), InputError.exit_code
+        said = " ".join(str(error.strerror or error).split())
+        remedy = f"; {KERNEL_CACHE}" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
+        return f"a file could not be read or written ({said}){remedy}", InputError.exit_code
+    raise error
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one that led to it, means that memory could not be had."""
+    while error is not None:
+        said = str(error).lower()
+        if isinstance(error, MemoryError) or any(words in said for words in SAID_WITHOUT_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -1,0 +1,118 @@
+"""The options of `g3r-infer`, and which of them go together; nothing heavy is imported here."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+
+DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
+"""Of the options that --config takes the place of, --no-prior and --time-budget besides."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="g3r-infer",
+        description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
+        "For research only, not for diagnosis.",
+        epilog="exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out of memory, "
+        "130 interrupted",
+    )
+    parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
+    parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
+    parser.add_argument(
+        "--thickness", nargs="+", type=float, metavar="MM",
+        help="slice thickness, one for all or one per stack (default: the distance of slices)",
+    )  # fmt: skip
+    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
+    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument(
+        "--pose-ckpt",
+        metavar="POSE.pt",
+        help="pose network and mean heads from g3r-export (default: shipped)",
+    )
+    parser.add_argument(
+        "--space", choices=("standard", "scanner"),
+        help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
+    )  # fmt: skip
+    parser.add_argument(
+        "--prior-voxel", type=float, metavar="MM",
+        help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
+    )  # fmt: skip
+    parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
+    parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")
+    parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
+    parser.add_argument(
+        "--time-budget", type=float, metavar="SECONDS",
+        help="in place of --preset: the best that can be done from the start of the command to its files",
+    )  # fmt: skip
+    parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
+    parser.add_argument(
+        "--config", metavar="RUN.json",
+        help="settings and threads of an earlier result, in place of the options that decide them",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
+    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    parser.add_argument(
+        "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
+    )
+    parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
+    parser.add_argument(
+        "--keep-header-text", action="store_true",
+        help="carry free text of the stacks' headers (may name patients, dates) into the results",
+    )  # fmt: skip
+    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
+    parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
+    return parser
+
+
+def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The options as they hold, defaults filled in; ends the program with 2 where they cannot go together."""
+    parser = build_parser()
+    options = parser.parse_args(argv)
+    n_stacks = len(options.stacks)
+    if options.masks is not None and len(options.masks) != n_stacks:
+        parser.error(
+            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order"
+        )
+    if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
+        parser.error(
+            f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
+        )
+    if options.seed is not None and options.seed < 0:
+        parser.error(f"--seed {options.seed}; expected 0 or above")
+    if options.threads is not None and options.threads < 1:
+        parser.error(f"--threads {options.threads}; expected at least 1")
+    if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
+        parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
+    if options.time_budget is not None and options.preset:
+        parser.error("--preset and --time-budget exclude each other")
+    if options.resume and options.time_budget is not None:
+        parser.error("--resume and --time-budget exclude each other: such a run keeps no stages")
+    if options.config:
+        decided = [name for name in (*DEFAULTS, "time_budget") if getattr(options, name) is not None]
+        decided += ["no_prior"] if options.no_prior else []
+        if decided:
+            named = ", ".join(f"--{name.replace('_', '-')}" for name in decided)
+            parser.error(f"--config and {named} exclude each other: the file decides that")
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
+    if options.ckpt and options.no_prior:
+        parser.error("--ckpt and --no-prior exclude each other")
+    return options
+
+
+def _size(text: str) -> int:
+    from g3r.memory import parsed_size
+
+    try:
+        return parsed_size(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

@@ -1,0 +1,92 @@
+"""Commands run inside the test's process, and what a refusal must look like."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+MOST_SECONDS = 5.0
+MOST_BYTES = 500_000_000
+"""By which a refusal may raise the peak of memory: far under what the files claim."""
+
+Main = Callable[[Sequence[str]], int]
+
+
+class TooSlowError(BaseException):
+    """A command took longer than `MOST_SECONDS`; no handler of the code under test catches it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command did: its exit code, what it printed, seconds, peak memory gained, files that changed."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+    gained_bytes: int
+    changed: set[str]
+
+
+@contextlib.contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Raise `TooSlowError` in the block once that time is over."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TooSlowError(f"longer than {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def run(main: Main, arguments: Sequence[object], watched: Path) -> Outcome:
+    """Run a command's `main`; an exception other than the parser's exit goes on."""
+    out, err = io.StringIO(), io.StringIO()
+    before, peak, start = state(watched), _peak_bytes(), time.monotonic()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), within(MOST_SECONDS):
+        try:
+            code = main([str(one) for one in arguments])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    seconds, gained = time.monotonic() - start, _peak_bytes() - peak
+    changed = {name for name, _ in before ^ state(watched)}
+    return Outcome(code, out.getvalue(), err.getvalue(), seconds, gained, changed)
+
+
+def assert_refused(outcome: Outcome, command: str, names: str, says: str) -> None:
+    """Exit code 3, one line that names what is wrong and says what to do, nothing written, memory bounded."""
+    assert outcome.code == 3, outcome
+    lines = outcome.err.splitlines()
+    assert len(lines) == 1, outcome.err
+    assert lines[0].startswith(f"{command}: "), lines[0]
+    assert names in lines[0], lines[0]
+    assert re.search(says, lines[0]), lines[0]
+    assert re.search(r"[;,] ", lines[0]), f"no remedy: {lines[0]}"
+    assert outcome.out == ""
+    assert outcome.changed == set()
+    assert outcome.gained_bytes < MOST_BYTES
+
+
+def state(folder: Path) -> set[tuple[str, object]]:
+    """Everything below a folder: names, and the bytes of ordinary files."""
+    return {
+        (str(path), path.read_bytes() if path.is_file() and not path.is_symlink() else path.lstat().st_mode)
+        for path in folder.rglob("*")
+    }
+
+
+def _peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

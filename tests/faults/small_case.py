@@ -1,0 +1,104 @@
+"""A case that is reconstructed in about a second, as a command and in processes that are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from g3r._version import __version__
+from g3r.cli.infer import main as infer
+from g3r.cli.simulate import main as simulate
+from g3r.presets import PRESETS
+from g3r.rerun import FileMark, Inputs
+
+FOLDER = Path(__file__).parent
+
+WHOLE = {
+    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
+    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
+}  # fmt: skip
+"""Files of a result without a prior network."""
+
+
+@dataclass(frozen=True)
+class SmallCase:
+    """Three small stacks, settings for a quick run in a run.json, and the volume that they give."""
+
+    folder: Path
+    config: Path
+    volume: bytes
+
+    def arguments(self, output: Path, *further: str) -> list[str]:
+        """Of g3r-infer, for the quick run."""
+        return [
+            "--stacks", *self.files("stack"), "--masks", *self.files("mask"), "--config", str(self.config),
+            "--quiet", "--output", str(output), *further,
+        ]  # fmt: skip
+
+    def files(self, kind: str) -> list[str]:
+        """Of stacks or masks."""
+        return [str(self.folder / f"{kind}-{n}.nii.gz") for n in range(3)]
+
+    def run(self, output: Path, *further: str) -> int:
+        """The quick run in this process; its exit code."""
+        return infer(self.arguments(output, *further))
+
+
+def make_small_case(folder: Path) -> SmallCase:
+    """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
+    options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
+    assert simulate([*options, "--seed", "61001", "--output", str(folder / "stacks")]) == 0
+    draft = PRESETS["draft"]
+    motion = replace(
+        draft.motion, template=False, network=False, stacks=False, runs=False, n_rounds=1,
+        standard_orientation=False,
+    )  # fmt: skip  # a fraction of a second; the poses do not matter here
+    settings = replace(draft, motion=motion, resolution_mm=2.0, use_prior=False)
+    case = SmallCase(folder / "stacks", folder / "run.json", b"")
+    inputs = Inputs(*(tuple(map(FileMark.of, case.files(kind))) for kind in ("stack", "mask")))
+    record = {
+        "g3r": __version__, "partial": False, "settings": asdict(settings), "inputs": inputs.record(),
+        "stacks": [{"thickness_mm": 4.0}] * 3, "command": {"threads": 1}, "time_budget": None,
+    }  # fmt: skip
+    case.config.write_text(json.dumps(record))
+    assert case.run(folder / "out") == 0
+    return replace(case, volume=(folder / "out" / "volume.nii.gz").read_bytes())
+
+
+def names(folder: Path) -> set[str]:
+    """What lies in a folder."""
+    return {path.name for path in folder.iterdir()}
+
+
+Killed = Callable[..., dict[str, Any]]
+
+
+@contextmanager
+def fork_server() -> Iterator[Killed]:
+    """Runs of g3r-infer in processes that begin at once: call with arguments and kill_after_s, signal."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(FOLDER.parents[1]), os.environ.get("PYTHONPATH", "")])
+    with subprocess.Popen(
+        [sys.executable, str(FOLDER / "fork_server.py")], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True, env=environment,
+    ) as server:  # fmt: skip
+        assert server.stdin is not None
+        assert server.stdout is not None
+        write, read = server.stdin, server.stdout
+
+        def run(arguments: list[str], **request: Any) -> dict[str, Any]:
+            with suppress(BrokenPipeError):
+                print(json.dumps({"arguments": arguments, **request}), file=write, flush=True)
+            answer = read.readline()
+            assert answer, "the server has ended"
+            return json.loads(answer)
+
+        yield run
+        write.close()

@@ -1,0 +1,190 @@
+"""A full disk, a quota, a limit on files: one line that says so, nothing half written, and a way on."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from small_case import WHOLE, Killed, SmallCase, names
+from tally import Tally
+
+from g3r.errors import cannot_be_written
+
+SIZES = ("16k", "100k", "200k", "400k", "600k", "800k", "1000k", "1200k", "1400k", "2000k")
+ENOUGH = "20m"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """An empty folder where a small disk can be mounted; skips where this user may not."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if shutil.which("mount") is None or not mounted(place, ENOUGH):
+        pytest.skip("no tmpfs can be mounted here")
+    subprocess.run(["umount", str(place)], check=True)
+    yield place
+    subprocess.run(["umount", str(place)], check=False, capture_output=True)
+
+
+def mounted(place: Path, size: str) -> bool:
+    line = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+    return subprocess.run(line, check=False, capture_output=True).returncode == 0
+
+
+def last_line(output: str) -> str:
+    assert "Traceback" not in output
+    return output.splitlines()[-1]
+
+
+@pytest.mark.faults
+def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
+    case: SmallCase, killed: Killed, small_disk: Path, tally: Tally
+):
+    codes = []
+    for size in SIZES:
+        with tally.case() as one:
+            assert mounted(small_disk, size)
+            out = small_disk / "out"
+            ended = killed(case.arguments(out))
+            codes.append(ended["code"])
+            if ended["code"] == 0:
+                assert names(small_disk) == {"out"}
+                assert names(out) == WHOLE
+            else:
+                assert ended["code"] == 3, ended
+                line = last_line(ended["output"])
+                assert "No space left on device" in line
+                assert "MB are free" in line
+                assert names(small_disk) <= {"out.unfinished"}
+                assert not (small_disk / "out.unfinished" / "whole").exists()
+                # somebody makes room
+                line = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
+                subprocess.run(line, check=True, capture_output=True)
+                assert killed(case.arguments(out, "--resume"))["code"] == 0
+                assert names(small_disk) == {"out"}
+                one.refused()
+            assert (out / "volume.nii.gz").read_bytes() == case.volume
+            subprocess.run(["umount", str(small_disk)], check=True)
+    assert {0, 3} == set(codes)
+
+
+@pytest.mark.faults
+def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally):
+    for file_bytes in (1, 2_000, 20_000, 60_000, 100_000, 300_000):
+        with tally.case() as one:
+            ended = killed(case.arguments(tmp_path / "out"), file_bytes=file_bytes)
+            assert ended["code"] == 3, ended
+            assert "File too large" in last_line(ended["output"])
+            assert names(tmp_path) <= {"out.unfinished"}
+            one.refused()
+
+
+def test_a_write_that_fails_leaves_the_earlier_result(
+    case: SmallCase,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+):
+    """As on a disk that is full when the last file is written."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "volume.nii.gz").write_text("old")
+
+    def full(*arguments: object, **options: object) -> None:
+        raise cannot_be_written("sections.png", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+    monkeypatch.setattr("g3r.report.sections.save_sections", full)
+    with tally.case() as one:
+        assert case.run(out, "--force") == 3
+        line = last_line(capsys.readouterr().err)
+        assert line.startswith("g3r-infer: sections.png: cannot be written (No space left on device, ")
+        assert (out / "volume.nii.gz").read_text() == "old"
+        assert names(tmp_path) == {"out", "out.unfinished"}
+        one.refused()
+    with tally.case():
+        monkeypatch.undo()
+        assert case.run(out, "--force", "--resume") == 0
+        assert len(json.loads((out / "run.json").read_text())["resumed"]) == 4
+        assert names(out) == WHOLE
+        assert names(tmp_path) == {"out"}
+
+
+def test_stages_that_cannot_be_kept_do_not_end_a_run(
+    case: SmallCase,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+):
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("g3r.stages.write_stage", full)
+    with tally.case():
+        assert case.run(tmp_path / "out") == 0
+        assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
+        assert names(tmp_path) == {"out"}
+
+
+def test_stages_give_way_where_only_that_makes_room(
+    case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
+):
+    from g3r.unfinished import UnfinishedRun
+
+    with UnfinishedRun(tmp_path / "out") as run:
+        run.stages.mkdir()
+        (run.stages / "motion.npz").write_bytes(bytes(1000))
+        free = shutil.disk_usage(tmp_path)
+        monkeypatch.setattr("shutil.disk_usage", lambda path: free._replace(free=500))
+        run.make_room(400)
+        run.make_room(2000)  # would not be enough all the same
+        assert run.stages.exists()
+        run.make_room(1400)
+        assert not run.stages.exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (errno.ENOSPC, "No space left on device, at most 2.0 MB are needed, "),
+        (errno.EACCES, "Permission denied); choose another --output"),
+    ],
+)
+def test_what_is_said_of_a_file_that_could_not_be_written(tmp_path: Path, number: int, expected: str):
+    error = cannot_be_written(tmp_path / "no" / "file", OSError(number, os.strerror(number)), 2_000_000)
+    assert expected in str(error)
+
+
+@pytest.mark.faults
+def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally: Tally):
+    """ulimit -v, from far too little to enough."""
+    codes = []
+    for megabytes in (120, 200, 300, 450, 600, 800, 1000, 1100, 1200, 3000):
+        with tally.case() as one:
+            out = tmp_path / "out"
+            line = [sys.executable, "-m", "g3r.cli.infer", *case.arguments(out)]
+            done = subprocess.run(
+                ["bash", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "-", *line],
+                check=False, capture_output=True, text=True,
+                env=os.environ | {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")},
+            )  # fmt: skip
+            codes.append(done.returncode)
+            if done.returncode:
+                assert done.returncode == 4, done.stderr
+                assert last_line(done.stderr).startswith("g3r-infer: out of memory; choose")
+                assert names(tmp_path) <= {"out.unfinished"}
+                one.refused()
+            else:
+                assert (out / "volume.nii.gz").read_bytes() == case.volume
+                assert names(tmp_path) == {"out"}
+                shutil.rmtree(out)
+    assert codes[0] == 4
+    assert codes[-1] == 0

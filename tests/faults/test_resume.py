@@ -1,0 +1,206 @@
+"""--resume: the same bytes from whatever stages there are, and only from stages of the same run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_case import SmallCase, names
+from tally import Tally
+
+from g3r.errors import InputError
+from g3r.gaussians import GaussianCloud
+from g3r.geometry import RigidPose
+from g3r.stage_file import UnreadableStage, as_stored, read_stage, write_stage
+from g3r.stages import NAMES, RECORDS, Stages, stage_rng
+from g3r.unfinished import UnfinishedRun
+
+STAGES = ("motion", "prior", "fit-to-prior", "fit-to-slices")
+
+
+@pytest.fixture(scope="module")
+def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stages of a whole run, which ends without writing its result."""
+    folder = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "g3r.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError)
+        )
+        assert case.run(folder / "out") == 4
+    assert names(folder / "out.unfinished" / "stages") == {"made_of.json", *(f"{s}.npz" for s in STAGES)}
+    return folder / "out.unfinished"
+
+
+@pytest.mark.parametrize("n_stages", range(5))
+def test_the_same_bytes_from_any_number_of_finished_stages(
+    case: SmallCase, kept: Path, tmp_path: Path, tally: Tally, n_stages: int
+):
+    with tally.case():
+        shutil.copytree(kept, tmp_path / "out.unfinished")
+        for stage in STAGES[n_stages:]:
+            (tmp_path / "out.unfinished" / "stages" / f"{stage}.npz").unlink()
+        assert case.run(tmp_path / "out", "--resume") == 0
+        assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
+        record = json.loads((tmp_path / "out" / "run.json").read_text())
+        assert record["resumed"] == list(NAMES[:n_stages])
+        assert set(record["seconds"]) >= {"motion", "coarse", "prior", "fit to prior", "fit to slices"}
+        assert names(tmp_path) == {"out"}
+
+
+@pytest.mark.parametrize("n_bytes", [0, 100, 20_000])
+def test_a_stage_that_was_cut_off_is_made_again(
+    case: SmallCase, kept: Path, tmp_path: Path, tally: Tally, n_bytes: int
+):
+    with tally.case():
+        shutil.copytree(kept, tmp_path / "out.unfinished")
+        path = tmp_path / "out.unfinished" / "stages" / "fit-to-prior.npz"
+        path.write_bytes(path.read_bytes()[:n_bytes])
+        assert case.run(tmp_path / "out", "--resume") == 0
+        assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
+        record = json.loads((tmp_path / "out" / "run.json").read_text())
+        assert "fit to prior" not in record["resumed"]
+
+
+@pytest.mark.parametrize(("key", "n_stages"), [("seed", 4), ("distillation", 4)])
+def test_stages_of_another_run_are_refused_by_name(
+    case: SmallCase,
+    kept: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+    key,
+    n_stages,
+):
+    with tally.case() as one:
+        shutil.copytree(kept, tmp_path / "out.unfinished")
+        record = json.loads(case.config.read_text())
+        record["settings"][key] = 7 if key == "seed" else False
+        (tmp_path / "other.json").write_text(json.dumps(record))
+        arguments = SmallCase(case.folder, tmp_path / "other.json", b"")
+        assert arguments.run(tmp_path / "out", "--resume") == 3
+        assert f"the earlier run differs in setting {key}; " in capsys.readouterr().err
+        assert (
+            len(list((tmp_path / "out.unfinished" / "stages").glob("*.npz"))) == n_stages
+        )  # nothing is lost
+        one.refused()
+
+
+def test_without_resume_a_run_begins_anew(case: SmallCase, kept: Path, tmp_path: Path, tally: Tally):
+    with tally.case():
+        shutil.copytree(kept, tmp_path / "out.unfinished")
+        assert case.run(tmp_path / "out") == 0
+        assert json.loads((tmp_path / "out" / "run.json").read_text())["resumed"] == []
+        assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
+        assert names(tmp_path) == {"out"}
+
+
+def test_nothing_of_a_living_run_is_touched(
+    case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+):
+    with tally.case() as one, UnfinishedRun(tmp_path / "out") as living:
+        (living.folder / "stages").mkdir()
+        (living.folder / "stages" / "motion.npz").write_text("mine")
+        assert case.run(tmp_path / "out") == 3
+        assert f"another run is writing it (process {os.getpid()})" in capsys.readouterr().err
+        assert names(living.folder) == {"lock", "stages"}
+        assert (living.folder / "stages" / "motion.npz").read_text() == "mine"
+        one.refused()
+
+
+def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tally):
+    code = (
+        "import sys, time\nfrom g3r.unfinished import UnfinishedRun\n"
+        "run = UnfinishedRun(sys.argv[1]).__enter__()\nprint('in', flush=True)\ntime.sleep(60)"
+    )
+    with tally.case():
+        line = [sys.executable, "-c", code, str(tmp_path / "out")]
+        with subprocess.Popen(line, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]) as other:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"in\n"
+            with pytest.raises(InputError, match=f"process {other.pid}"), UnfinishedRun(tmp_path / "out"):
+                pass
+            other.kill()
+            other.wait()
+        with UnfinishedRun(tmp_path / "out"):
+            pass
+        assert names(tmp_path) == set()
+
+
+def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, tally: Tally):
+    out, unfinished = tmp_path / "out", tmp_path / "out.unfinished"
+    with tally.case():  # killed between two renames: the earlier result comes back
+        (unfinished / "earlier").mkdir(parents=True)
+        (unfinished / "whole").mkdir()
+        (unfinished / "earlier" / "volume").write_text("old")
+        with UnfinishedRun(out, ["volume"]):
+            assert (out / "volume").read_text() == "old"
+        assert names(tmp_path) == {"out"}
+    with tally.case():  # killed after them: what is not of a result is brought over
+        (unfinished / "earlier").mkdir(parents=True)
+        (unfinished / "earlier" / "volume").write_text("older")
+        (unfinished / "earlier" / "notes").write_text("mine")
+        with UnfinishedRun(out, ["volume"]):
+            pass
+        assert (out / "volume").read_text() == "old"
+        assert names(out) == {"volume", "notes"}
+        assert names(tmp_path) == {"out"}
+
+
+def test_a_link_as_output_stays_a_link(case: SmallCase, tmp_path: Path, tally: Tally):
+    with tally.case():
+        (tmp_path / "there").mkdir()
+        (tmp_path / "out").symlink_to(tmp_path / "there")
+        assert case.run(tmp_path / "out") == 0
+        assert (tmp_path / "out").is_symlink()
+        assert (tmp_path / "there" / "volume.nii.gz").read_bytes() == case.volume
+        assert names(tmp_path) == {"out", "there"}
+
+
+def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    pose = RigidPose.from_rotvec(rng.normal(size=(3, 3)), rng.normal(size=(3, 3)))
+    cloud = GaussianCloud.of([torch.randn(4, n) for n in (3, 3, 4)] + [torch.randn(4)], np.ones(3))
+    strided = rng.normal(size=(6, 8))[::2, ::2]
+    value = (pose, cloud, {"a": [1, 2.5, None, "x", True]}, (0.1, np.float64(1 / 3)), strided, strided[:0])
+    write_stage(tmp_path / "one.npz", value)
+    back = read_stage(tmp_path / "one.npz", RECORDS)
+    same = as_stored(value, RECORDS)
+    for one in (back, same):
+        np.testing.assert_array_equal(one[0].rotation, pose.rotation)
+        assert torch.equal(one[1].quaternion_wxyz, cloud.quaternion_wxyz)
+        assert one[2:4] == value[2:4]
+        np.testing.assert_array_equal(one[4], strided)
+        assert one[4].flags.c_contiguous
+        assert one[5].shape == (0, 4)
+    with pytest.raises(TypeError, match="no place"):
+        write_stage(tmp_path / "two.npz", object())
+    with pytest.raises(UnreadableStage):
+        read_stage(tmp_path / "one.npz", [RigidPose])  # a record that is not expected
+    assert names(tmp_path) == {"one.npz"}
+
+
+def test_stages_draw_their_own_numbers():
+    first, again, other = (stage_rng(3, name).random() for name in (NAMES[2], NAMES[2], NAMES[3]))
+    assert first == again != other
+    assert stage_rng(4, NAMES[2]).random() != first
+
+
+def test_seconds_of_a_stage_are_those_that_it_took(tmp_path: Path):
+    def work(stages: Stages) -> float:
+        with stages.clock("motion"):
+            time.sleep(0.03)
+        return 1.0
+
+    for resume in (False, True):
+        stages = Stages(None, tmp_path / "stages", {"a": "b"}, resume=resume)
+        assert stages.once("motion", lambda: work(stages)) == 1.0  # noqa: B023
+        assert stages.clock.seconds["motion"] >= 0.03
+        assert stages.resumed == ["motion"] * resume

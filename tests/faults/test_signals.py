@@ -1,0 +1,129 @@
+"""Ctrl-C at chosen moments: what is kept, how it is marked, and that a second one ends at once."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_case import WHOLE, SmallCase, names
+from tally import Tally
+
+from g3r.acquisition.images import load_volume
+from g3r.gaussians import GaussianCloud
+
+N_STEPS = 45
+
+
+@pytest.fixture
+def interrupt_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Sends a signal when a stage has reached a step, as often as is said."""
+
+    def choose(stage: str, step: int, number: signal.Signals = signal.SIGINT, times: int = 1) -> None:
+        def progress(name: str, done: int, total: int) -> None:
+            if (name, done) == (stage, step):
+                for _ in range(times):
+                    signal.raise_signal(number)
+
+        @contextmanager
+        def bars(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+            yield progress
+
+        monkeypatch.setattr("g3r.cli.infer._bars", bars)
+
+    return choose
+
+
+def test_before_there_is_a_volume_nothing_is_written(
+    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+):
+    with tally.case():
+        interrupt_at("motion", 0)
+        assert case.run(tmp_path / "deep" / "out") == 130
+        assert capsys.readouterr().err.endswith("g3r-infer: interrupted; nothing was written\n")
+        assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_in_the_fit_the_cloud_so_far_is_the_volume(
+    case: SmallCase,
+    interrupt_at,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+    number,
+    code,
+):
+    with tally.case():
+        out = tmp_path / "out"
+        interrupt_at("fit to slices", 20, number)
+        assert case.run(out) == code
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert f"interrupted in fit to slices, step 21 of {N_STEPS}: {out} holds the volume so far" in last
+        assert "--resume" in last
+        assert names(out) == WHOLE - {"uncertainty.nii.gz"}
+        record = json.loads((out / "run.json").read_text())
+        assert record["partial"] is True
+        assert record["interrupted"] == {"stage": "fit to slices", "step": 21, "n_steps": N_STEPS}
+        assert len(record["loss"]["fit to slices"]) == 21
+        volume = load_volume(out / "volume.nii.gz").data
+        (tmp_path / "whole.nii.gz").write_bytes(case.volume)
+        whole = load_volume(tmp_path / "whole.nii.gz").data
+        assert np.abs(volume - whole).max() > 0
+        assert np.corrcoef(volume[whole > 0], whole[whole > 0])[0, 1] > 0.95
+        # and on to the same end, over the partial result
+        interrupt_at("nothing", 0)
+        assert case.run(out, "--resume") == 0
+        assert (out / "volume.nii.gz").read_bytes() == case.volume
+        assert json.loads((out / "run.json").read_text())["resumed"] == ["motion", "prior", "fit to prior"]
+        assert names(tmp_path) == {"out", "whole.nii.gz"}
+
+
+def test_before_the_fit_to_slices_the_prior_is_the_volume(
+    case: SmallCase, interrupt_at, tmp_path: Path, tally: Tally
+):
+    with tally.case():
+        out = tmp_path / "out"
+        interrupt_at("fit to prior", 3)
+        assert case.run(out) == 130
+        assert json.loads((out / "run.json").read_text())["interrupted"]["stage"] == "fit to prior"
+        volume, prior, mask = (
+            load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask")
+        )
+        np.testing.assert_array_equal(volume, prior * mask)
+        assert len(GaussianCloud.load(out / "gaussians.npz")) == 0
+
+
+def test_a_partial_result_is_replaced_only_when_told(
+    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+):
+    with tally.case() as one:
+        interrupt_at("fit to slices", 5)
+        assert case.run(tmp_path / "out") == 130
+        assert case.run(tmp_path / "out") == 3
+        assert "--force" in capsys.readouterr().err
+        one.refused()
+
+
+def test_a_second_signal_ends_at_once(
+    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+):
+    with tally.case():
+        interrupt_at("fit to slices", 5, times=2)
+        assert case.run(tmp_path / "out") == 130
+        assert "nothing was written; --resume goes on" in capsys.readouterr().err
+        assert names(tmp_path) == {"out.unfinished"}
+        interrupt_at("nothing", 0)
+        assert case.run(tmp_path / "out", "--resume") == 0
+        assert names(tmp_path) == {"out"}
+
+
+def test_signals_are_handled_as_before_afterwards(case: SmallCase, interrupt_at, tmp_path: Path):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    interrupt_at("fit to slices", 5)
+    case.run(tmp_path / "out")
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

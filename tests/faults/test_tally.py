@@ -1,0 +1,53 @@
+"""The table of counts itself: what is lost is seen."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tally import Case, Counts, Tally, table
+
+
+def wrong_after_all(case: Case) -> None:
+    case.refused()
+    raise ZeroDivisionError
+
+
+def test_cases_are_counted_and_errors_are_lost_and_go_on():
+    rows: dict[str, Counts] = {}
+    tally = Tally("bad input", rows)
+    with tally.case():
+        pass
+    with tally.case() as case:
+        case.refused()
+    with pytest.raises(ZeroDivisionError), tally.case() as case:
+        wrong_after_all(case)
+    tally.named("fuzz").add(tried=10, survived=3, refused=6)
+    assert rows["bad input"] == Counts(3, 1, 1)
+    assert [rows[name].lost for name in ("bad input", "fuzz")] == [1, 1]
+    assert table(rows)[-1].split() == ["all", "13", "4", "7", "2"]
+
+
+@pytest.mark.parametrize("refused", [1, 2])
+def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int):
+    for name in ("conftest.py", "tally.py", "nifti_files.py"):
+        shutil.copy(Path(__file__).with_name(name), tmp_path)
+    test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
+    (tmp_path / "test_kills.py").write_text(test)
+    line = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "no:cacheprovider",
+        str(tmp_path),
+        "--rootdir",
+        str(tmp_path),
+    ]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == (pytest.ExitCode.TESTS_FAILED if refused == 1 else 0), done.stdout
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert ["kills", "3", "1", str(refused), str(2 - refused)] in lines
