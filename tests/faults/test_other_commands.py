@@ -1,0 +1,236 @@
+"""`g3r-evaluate`, `g3r-simulate`, `g3r-export` and `g3r-bench` with bad files: a line, never a traceback."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from bad_files import BAD_MASKS, BAD_STACKS
+from commands import Outcome, assert_refused, run
+from nifti_files import ball, image, write
+from tally import Tally
+
+from g3r.cli import bench, evaluate, export, simulate
+from g3r.cli.infer import main as infer
+
+USABLE_AS_A_VOLUME = {
+    "sheared axes", "metres without a word", "micrometres without a word", "one infinite", "beyond float32",
+    "constant", "too faint to divide by", "too bright to square", "one slice", "one pixel", "a mask",
+    "slope beyond float32", "all infinite", "all zero", "all negative", "all NaN",
+}  # fmt: skip
+"""Bad as a stack of thick slices; as a volume each command judges for itself."""
+
+
+def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) -> bool:
+    """Whether a command refused; asserts that it did so properly, or else went through."""
+    if must or outcome.code:
+        assert_refused(
+            outcome, command, bad.name.replace("\0", "\\x00") if must else "", says if must else ""
+        )
+        return True
+    return False
+
+
+@pytest.mark.parametrize("name", BAD_STACKS)
+@pytest.mark.parametrize("role", ["volume", "reference", "mask"])
+def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally):
+    make, says = BAD_STACKS[name]
+    files = {"volume": write(tmp_path / "v.nii"), "reference": write(tmp_path / "r.nii", image(1))}
+    files["mask"] = write(tmp_path / "m.nii", ball())
+    (tmp_path / "bad files").mkdir()
+    files[role] = make(tmp_path / "bad files")
+    with tally.case() as case:
+        line = [f"--{key}={path}" for key, path in files.items()]
+        outcome = run(evaluate.main, [*line, "--json", tmp_path / "s.json"], tmp_path)
+        must = name not in USABLE_AS_A_VOLUME and says != "no positive value"
+        if judged(outcome, "g3r-evaluate", files[role], says, must=must and role != "mask"):
+            case.refused()
+
+
+@pytest.mark.parametrize("name", BAD_MASKS)
+def test_evaluate_with_a_bad_mask(name: str, tmp_path: Path, tally: Tally):
+    make, says = BAD_MASKS[name]
+    reference = write(tmp_path / "stack.nii.gz", image(1))
+    (tmp_path / "masks").mkdir()
+    bad = make(tmp_path / "masks")
+    with tally.case() as case:
+        line = ["--volume", write(tmp_path / "v.nii"), "--reference", reference, "--mask", bad]
+        outcome = run(evaluate.main, line, tmp_path)
+        if judged(outcome, "g3r-evaluate", bad, says, must="12 masked" not in says):
+            case.refused()
+
+
+TABLES = {
+    "missing": None, "empty": b"", "no columns": b"a\tb\n1\t2\n", "binary": bytes(range(256)),
+    "text for a number": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\tx\t0\t0\t0\t0\t0\t0\n",
+    "NaN": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\tnan\t0\t0\t0\t0\t0\n",
+    "short row": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\t0\n",
+    "twice": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n" + b"0\t0\t0\t0\t0\t0\t0\t0\n" * 2,
+    "negative stack": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n-7\t0\t0\t0\t0\t0\t0\t0\n",
+    "a billion stacks": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n999999999\t0\t0\t0\t0\t0\t0\t0\n",
+    "beyond int64": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n" + b"9" * 30 + b"\t0\t0\t0\t0\t0\t0\t0\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Tally):
+    volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
+    table = tmp_path / "poses.tsv"
+    if TABLES[name] is not None:
+        table.write_bytes(TABLES[name] or b"")
+    with tally.case() as case:
+        line = [
+            "--volume",
+            volume,
+            "--reference",
+            volume,
+            "--mask",
+            mask,
+            "--poses",
+            table,
+            "--slices",
+            table,
+        ]
+        assert_refused(run(evaluate.main, line, tmp_path), "g3r-evaluate", "", "expected|check|no such file")
+        case.refused()
+
+
+def test_evaluate_writes_nowhere_else(tmp_path: Path, tally: Tally):
+    volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
+    for option in ("--json", "--sections"):
+        with tally.case() as case:
+            line = [
+                "--volume",
+                volume,
+                "--reference",
+                volume,
+                "--mask",
+                mask,
+                option,
+                tmp_path / "no" / "out",
+            ]
+            outcome = run(evaluate.main, line, tmp_path)
+            assert outcome.code == 3
+            assert len(outcome.err.splitlines()) == 1
+            assert outcome.changed == set()
+            case.refused()
+
+
+@pytest.mark.parametrize("name", BAD_STACKS)
+def test_simulate(name: str, tmp_path: Path, tally: Tally):
+    if name in USABLE_AS_A_VOLUME:
+        pytest.skip("usable as a volume, and slicing it takes seconds")
+    make, says = BAD_STACKS[name]
+    (tmp_path / "bad files").mkdir()
+    bad = make(tmp_path / "bad files")
+    with tally.case() as case:
+        line = ["--volume", bad, "--mask", write(tmp_path / "m.nii", ball()), "--output", tmp_path / "out"]
+        outcome = run(simulate.main, line, tmp_path)
+        assert_refused(outcome, "g3r-simulate", bad.name.replace("\0", "\\x00"), says)
+        case.refused()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--resolution=0", "--resolution=-1", "--resolution=nan", "--thickness=0", "--thickness=nan",
+        "--gap=-9", "--gap=nan", "--snr=0", "--snr=nan", "--snr=-3", "--bias=nan", "--gain=nan", "--gain=-1",
+        "--phantom=5", "--phantom=nan", "--phantom=1e9", "--seed=-1", "--stacks=0", "--motion=wild",
+        "--stacks=many",
+    ],
+)  # fmt: skip
+def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tally: Tally):
+    with tally.case() as case:
+        source = [] if option.startswith("--phantom") else ["--phantom", "22"]
+        outcome = run(simulate.main, [*source, option, "--output", tmp_path / "out"], tmp_path)
+        assert outcome.code in (2, 3), outcome
+        assert outcome.changed == set()
+        assert outcome.code == 2 or len(outcome.err.splitlines()) == 1, outcome.err
+        case.refused()
+
+
+SAID = {"training_data": "", "optimiser_steps": 1}
+RUNS = {
+    "missing": None, "empty": b"", "text": b"weights\n", "zip": b"PK\x03\x04" + bytes(100),
+    "plain values": {"state_dict": {}}, "nothing in it": {"state_dict": {}, "g3r_prior": {}},
+    "text for a description": {"state_dict": {}, "g3r_prior": "prior"},
+    "text for weights": {"state_dict": {"network.a": "heavy"}, "g3r_prior": SAID},
+    "list of weights": {"state_dict": [1], "g3r_pose": SAID},
+    "a list": [1, 2], "a tensor": torch.zeros(2),
+    "huge numbers": {
+        "state_dict": {"network.a": torch.zeros(1)},
+        "g3r_prior": {**SAID, "network_arguments": {"channels": 10**400}},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_export(name: str, tmp_path: Path, tally: Tally):
+    path, content = tmp_path / "last.ckpt", RUNS[name]
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with tally.case() as case:
+        outcome = run(export.main, [path, tmp_path / "prior.pt"], tmp_path)
+        assert_refused(outcome, "g3r-export", "last.ckpt", "expected a training checkpoint|export another")
+        case.refused()
+
+
+@pytest.mark.parametrize(
+    "content", [None, b"", b"{", b"[1]", b'{"thickness_mm": "thick"}', b'{"thickness": []}']
+)
+def test_bench_of_a_broken_case(content: bytes | None, tmp_path: Path, tally: Tally):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    if content is not None:
+        write(folder / "stack-0.nii.gz")
+        write(folder / "mask-0.nii.gz", ball())
+        (folder / "simulation.json").write_bytes(content)
+    with tally.case() as case:
+        outcome = run(bench.main, ["trade", folder, "--output", tmp_path / "out"], folder)
+        assert outcome.code == 3, outcome
+        assert len(outcome.err.splitlines()) == 1, outcome.err
+        case.refused()
+
+
+REAL = {
+    "infer": (["--stacks", "bad.nii.gz", "--output", "out"], 3),
+    "evaluate": (["--volume", "bad.nii.gz", "--reference", "good.nii", "--mask", "good.nii"], 3),
+    "simulate": (["--volume", "bad.nii.gz", "--mask", "good.nii", "--output", "out"], 3),
+    "export": (["bad.nii.gz", "out.pt"], 3),
+    "pretrain": (["fit", "--config", "bad.nii.gz"], 2),
+}
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("command", REAL)
+def test_as_a_process(command: str, tmp_path: Path, tally: Tally):
+    """The exit code that a shell sees, and no more than five seconds of a processor."""
+    write(tmp_path / "good.nii")
+    (tmp_path / "bad.nii.gz").write_bytes(b"no image\n")
+    words, code = REAL[command]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tally.case() as case:
+        line = [sys.executable, "-m", f"g3r.cli.{command}", *words]
+        root = Path(infer.__code__.co_filename).parents[2]
+        done = subprocess.run(
+            line, cwd=tmp_path, capture_output=True, text=True, check=False, env=_environment(root)
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        assert code == 2 or len(done.stderr.splitlines()) == 1, done.stderr
+        assert {path.name for path in tmp_path.iterdir()} == {"good.nii", "bad.nii.gz"}
+        seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        assert command == "pretrain" or seconds < 5, f"{seconds:.1f} s of CPU time"
+        case.refused()
+
+
+def _environment(root: Path) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
