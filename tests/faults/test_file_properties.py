@@ -1,4 +1,4 @@
-"""For any grid: `Stack` to file to `Stack`; for any header: `g3r-infer --dry-run` ends with 0 or a line and 3."""
+"""Any grid: `Stack` to file to `Stack`. Any header: `g3r-infer --dry-run` ends with 0 or a line."""
 
 from __future__ import annotations
 
