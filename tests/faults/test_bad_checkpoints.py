@@ -44,7 +44,7 @@ def packed_again(path: Path) -> None:
 
 
 def zeros_unfold(path: Path) -> None:
-    """A small archive whose first weight unfolds to 4 GB."""
+    """A small archive with an entry that unfolds to 64 MB."""
     small_prior(path)
     with (
         zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import assert_refused, run
 from fuzz_headers import FIELDS, NUMBERS
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from nifti_files import ball, image, write, write_raw
 from scipy.spatial.transform import Rotation
@@ -24,7 +24,10 @@ from g3r.cli.infer import main
 FIELD_EPSILON = float(np.finfo(np.float32).eps)
 """NIfTI-1 keeps affines as float32."""
 
-quick = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
+quick = settings(
+    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True,
+    phases=(Phase.explicit, Phase.generate),  # shrinking takes minutes, and these cases are small
+)  # fmt: skip
 
 
 @st.composite
@@ -84,7 +87,7 @@ def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack:
         written = nib.Nifti1Image(stack.image, stack.affine)
         written.set_data_dtype(np.dtype(dtype))
         nib.save(written, path)
-        slope = float(nib.load(path).dataobj.slope)
+        slope = abs(float(nib.load(path).dataobj.slope))
         save_volume(path.with_name("mask.nii"), stack.mask, stack.affine)
         back = load_stack(path, path.with_name("mask.nii"), stack.thickness_mm)
         largest = float(np.abs(stack.image).max())
