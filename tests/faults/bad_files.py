@@ -284,3 +284,10 @@ BAD_MASKS: dict[str, tuple[Maker, str]] = {
     "the stack as int16": (values(lambda: image().astype(np.int16)), "as an image does"),
 }  # fmt: skip
 """Masks for `stack.nii.gz`, the good stack."""
+
+USABLE_AS_A_VOLUME = {
+    "sheared axes", "metres without a word", "micrometres without a word", "one infinite", "beyond float32",
+    "constant", "too faint to divide by", "too bright to square", "one slice", "one pixel", "a mask",
+    "slope beyond float32", "all infinite", "all zero", "all negative", "all NaN",
+}  # fmt: skip
+"""Bad as a stack of thick slices; as a volume each command judges for itself."""
