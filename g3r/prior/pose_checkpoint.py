@@ -168,8 +168,8 @@ def load_pose_network(path: str | Path) -> "tuple[PoseNetwork, PoseCheckpoint]":
 def _describe(path: Path, content: Mapping[str, Any], network: "PoseNetwork") -> PoseCheckpoint:
     """Return the description with its values checked."""
     arguments = network.arguments()
-    grid = centred_grid(arguments["template_shape"], arguments["template_spacing_mm"])
     try:
+        grid = centred_grid(arguments["template_shape"], arguments["template_spacing_mm"])
         template = AtlasTemplate(
             network.template.permute(3, 0, 1, 2).numpy(), grid.affine, np.array(_weeks(content), float)
         )
