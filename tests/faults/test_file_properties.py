@@ -145,7 +145,7 @@ def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], e
 @pytest.mark.faults
 @pytest.mark.usefixtures("networks_once")
 @given(headers, st.sampled_from([".nii", ".nii.gz"]), st.sampled_from(["stack", "mask"]))
-@settings(quick, max_examples=1500)
+@settings(quick, max_examples=1000)
 def test_a_dry_run_of_any_header_at_length(
     tally: Tally, fields: dict[str, list[float]], ending: str, role: str
 ):

@@ -6,6 +6,7 @@ import os
 import resource
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,19 @@ from tally import Tally
 
 from g3r.cli import bench, export, simulate
 from g3r.cli.infer import main as infer
+
+
+@pytest.fixture(autouse=True, scope="module")
+def everything_is_imported() -> None:
+    """What a command imports when it first needs it takes seconds, and is not what is measured here."""
+    for module in (
+        "data_synth.export",
+        "data_synth.phantom",
+        "data_synth.simulator",
+        "g3r.prior.pose_network",
+    ):
+        import_module(module)
+    import_module("g3r.prior.dgpn")
 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
