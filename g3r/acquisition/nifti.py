@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import nibabel as nib
 import numpy as np
@@ -132,10 +132,10 @@ def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray
 
 def _read(image: NiftiImage) -> NDArray[np.float32]:
     """Scaled values; of a compressed file up to its end, where the checksum stands."""
-    file = Path(image.file_map["image"].filename)
+    file = Path(str(image.file_map["image"].filename))
     if not file.name.lower().endswith(".gz"):
         return np.asarray(image.dataobj, dtype=np.float32)
-    of_file = image.dataobj
+    of_file: Any = image.dataobj
     layout = (of_file.shape, of_file.dtype, of_file.offset, of_file.slope, of_file.inter)
     with gzip.open(file) as stream:
         data = np.asarray(ArrayProxy(stream, layout, mmap=False), dtype=np.float32)
@@ -223,10 +223,10 @@ def _check_size(image: NiftiImage, shape: tuple[int, ...], voxel_bytes: int, nam
             f"{name}: header claims {shape} voxels ({claimed / 1e9:.3g} GB); expected a stack or volume of "
             "ordinary size"
         )
-    file = Path(image.file_map["image"].filename)
+    file, of_file = Path(str(image.file_map["image"].filename)), cast(Any, image.dataobj)
     try:
         size = file.stat().st_size
-        start = int(image.dataobj.offset)
+        start = int(of_file.offset)
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(
             f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off"

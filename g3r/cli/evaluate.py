@@ -102,7 +102,8 @@ def _pose_error(poses: str, slices: str) -> PoseError:
 
     true, estimated = read_poses(poses), read_poses(slices)
     n_stacks = 1 + max(stack for stack, _ in true.keys)
-    masks = [Path(poses).parent / f"mask-{n}.nii.gz" for n in range(n_stacks)]
+    # one by one: a table may name a billionth stack, and the first mask that is missing ends it
+    masks = (Path(poses).parent / f"mask-{n}.nii.gz" for n in range(n_stacks))
     return target_registration_error(slice_points(masks), true, estimated)
 
 

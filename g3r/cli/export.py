@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,7 +153,8 @@ def _read_run(run: Path) -> dict[str, Any]:
 
     expected = "expected a training checkpoint of g3r-pretrain, such as .../checkpoints/last.ckpt"
     try:
-        content = torch.load(run, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # the file's, which a refusal says better
+            content = torch.load(run, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise InputError(f"{run}: no such file; {expected}") from error
     except Exception as error:  # torch.load says "damaged" in many types

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,7 +99,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
     return PoseTable(keys, pose)
 
 
-def slice_points(mask_paths: Sequence[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
+def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
     """Where the headers put the brain: up to ~128 points [n, 3] (mm) of each slice with enough mask."""
     points: dict[SliceKey, NDArray[np.float64]] = {}
     for stack, path in enumerate(mask_paths):

@@ -149,14 +149,18 @@ def scores(content: Mapping[str, Any]) -> dict[str, float]:
 
 
 def built(
-    path: Path, build: Callable[[], Network], fewest_values: float, content: Mapping[str, Any], kind: str
+    path: Path,
+    build: Callable[[], Network],
+    fewest_values: Callable[[], float],
+    content: Mapping[str, Any],
+    kind: str,
 ) -> Network:
     """A network with a file's weights; memory is taken only once the file is known to hold enough to fill it.
 
     Args:
         path: for the message.
         build: makes the network.
-        fewest_values: a lower bound, about the number of its weights.
+        fewest_values: a lower bound, about the number of its weights, from the same arguments.
         content: of the file.
         kind: for the message: "prior".
 
@@ -172,8 +176,8 @@ def built(
             if value.numel() * value.element_size() > value.untyped_storage().nbytes():
                 raise ValueError(f"weight {_shown(name)} claims more values than the file holds")
             n_values += value.numel()
-        if fewest_values > n_values:
-            raise ValueError(f"{n_values} values for at least {fewest_values:.3g}")
+        if fewest_values() > n_values:
+            raise ValueError(f"{n_values} values for at least {fewest_values():.3g}")
         network = build()
         network.load_state_dict(dict(weights), strict=True)
     except MemoryError:

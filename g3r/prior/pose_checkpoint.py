@@ -155,12 +155,11 @@ def load_pose_network(path: str | Path) -> "tuple[PoseNetwork, PoseCheckpoint]":
 
     try:
         arguments = plain_arguments(content, LARGEST_ARGUMENTS)
-        fewest = _fewest_values(arguments)
     except KeyError as error:
         raise InputError(f"{path}: is damaged (entry {error} is missing); copy or export it again") from error
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {one_line(error)}; copy or export it again") from error
-    network = built(path, lambda: PoseNetwork(**arguments), fewest, content, KIND)
+    network = built(path, lambda: PoseNetwork(**arguments), lambda: _fewest_values(arguments), content, KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))
     return network.eval(), _describe(path, content, network)
 
@@ -168,8 +167,8 @@ def load_pose_network(path: str | Path) -> "tuple[PoseNetwork, PoseCheckpoint]":
 def _describe(path: Path, content: Mapping[str, Any], network: "PoseNetwork") -> PoseCheckpoint:
     """Return the description with its values checked."""
     arguments = network.arguments()
-    grid = centred_grid(arguments["template_shape"], arguments["template_spacing_mm"])
     try:
+        grid = centred_grid(arguments["template_shape"], arguments["template_spacing_mm"])
         template = AtlasTemplate(
             network.template.permute(3, 0, 1, 2).numpy(), grid.affine, np.array(_weeks(content), float)
         )

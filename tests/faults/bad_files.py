@@ -155,8 +155,9 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "a byte turned over": (content("bad.nii.gz", lambda: packed(flip=len(packed()) // 2)), CUT_OFF),
     "wrong checksum": (content("bad.nii.gz", lambda: packed(flip=-6)), CUT_OFF),
     "other bytes behind it": (content("bad.nii.gz", lambda: packed() + b"more" * 9), CUT_OFF),
-    "100 MB of zeros behind it": (
-        content("bad.nii.gz", lambda: gzip.compress(raw() + bytes(10**8))), "far more than its header claims",
+    "70 MB of zeros behind it": (
+        content("bad.nii.gz", lambda: gzip.compress(raw() + bytes(7 * 10**7), 1)),
+        "far more than its header claims",
     ),
     # headers
     "wrong magic": (header(magic=b"nope"), NOT_READABLE),
@@ -284,3 +285,10 @@ BAD_MASKS: dict[str, tuple[Maker, str]] = {
     "the stack as int16": (values(lambda: image().astype(np.int16)), "as an image does"),
 }  # fmt: skip
 """Masks for `stack.nii.gz`, the good stack."""
+
+USABLE_AS_A_VOLUME = {
+    "sheared axes", "metres without a word", "micrometres without a word", "one infinite", "beyond float32",
+    "constant", "too faint to divide by", "too bright to square", "one slice", "one pixel", "a mask",
+    "slope beyond float32", "all infinite", "all zero", "all negative", "all NaN",
+}  # fmt: skip
+"""Bad as a stack of thick slices; as a volume each command judges for itself."""

@@ -14,6 +14,11 @@ from pathlib import Path
 from types import FrameType
 
 MOST_SECONDS = 5.0
+"""Of a processor: the machine may be busy with something else."""
+
+MOST_WAITING_SECONDS = 60.0
+"""For what waits without computing, such as a pipe that nobody writes to."""
+
 MOST_BYTES = 500_000_000
 """By which a refusal may raise the peak of memory: far under what the files claim."""
 
@@ -38,18 +43,25 @@ class Outcome:
 
 @contextlib.contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Raise `TooSlowError` in the block once that time is over."""
+    """Raise `TooSlowError` in the block once it has computed that long, or waited for a minute."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise TooSlowError(f"longer than {seconds} s")
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    clocks = (
+        (signal.ITIMER_PROF, signal.SIGPROF, seconds),
+        (signal.ITIMER_REAL, signal.SIGALRM, MOST_WAITING_SECONDS),
+    )
+    before = [signal.signal(number, stop) for _, number, _ in clocks]
+    for timer, _, limit in clocks:
+        signal.setitimer(timer, limit)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        for timer, _, _ in clocks:
+            signal.setitimer(timer, 0)
+        for (_, number, _), handler in zip(clocks, before, strict=True):
+            signal.signal(number, handler)
 
 
 def run(main: Main, arguments: Sequence[object], watched: Path) -> Outcome:

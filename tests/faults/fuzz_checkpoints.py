@@ -193,12 +193,12 @@ def change_entry(rng: np.random.Generator, content: dict[str, Any]) -> None:
         del chosen[name]
     elif kind == 2:
         chosen[rng.choice([0, 1])] = chosen.pop(name)
-    elif kind == 3 and isinstance(chosen[name], torch.Tensor) and chosen[name].numel():
-        flat = chosen[name].clone().flatten()
+    elif kind == 3 and isinstance(chosen[name], torch.Tensor) and 0 < chosen[name].numel() < 10**6:
+        flat = chosen[name].clone().flatten().real.float()
         flat[int(rng.integers(flat.numel()))] = float(rng.choice([np.nan, np.inf, 1e38, 0.0, -1.0]))
         chosen[name] = flat.reshape(chosen[name].shape)
     elif kind == 4 and isinstance(chosen[name], int | float):
-        chosen[name] = type(chosen[name])(chosen[name] * rng.choice([-1, 0, 2, 1000]))
+        chosen[name] = type(chosen[name])(chosen[name] * int(rng.choice([-1, 0, 2, 1000])))
     else:
         chosen[name] = odd_value(rng)
 

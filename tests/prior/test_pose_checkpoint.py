@@ -90,6 +90,8 @@ REFUSALS = {
     "no checksum": (without("weights_sha256"), "do not match their checksum"),
     "NaN": (poison, "NaN or infinity"),
     "an unknown argument": (other_arguments(depth=3), "do not fit together"),
+    "no channels": (other_arguments(channels=[]), "do not fit together"),
+    "a template without a voxel size": (other_arguments(template_spacing_mm=0.0), "singular"),
     "another width": (other_arguments(width=64), "do not fit together"),
     "another template": (other_arguments(template_shape=[3, 8, 9, 10]), "do not fit together"),
 }

@@ -1,0 +1,108 @@
+"""`g3r-evaluate` with bad files: a line, never a traceback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bad_files import BAD_MASKS, BAD_STACKS, USABLE_AS_A_VOLUME
+from commands import Outcome, assert_refused, run
+from nifti_files import ball, image, write
+from tally import Tally
+
+from g3r.cli import evaluate
+
+
+def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) -> bool:
+    """Whether a command refused; asserts that it did so properly, or else went through."""
+    if must or outcome.code:
+        assert_refused(
+            outcome, command, bad.name.replace("\0", "\\x00") if must else "", says if must else ""
+        )
+        return True
+    return False
+
+
+@pytest.mark.parametrize("name", BAD_STACKS)
+@pytest.mark.parametrize("role", ["volume", "reference", "mask"])
+def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally):
+    make, says = BAD_STACKS[name]
+    files = {"volume": write(tmp_path / "v.nii"), "reference": write(tmp_path / "r.nii", image(1))}
+    files["mask"] = write(tmp_path / "m.nii", ball())
+    (tmp_path / "bad files").mkdir()
+    files[role] = make(tmp_path / "bad files")
+    with tally.case() as case:
+        line = [f"--{key}={path}" for key, path in files.items()]
+        outcome = run(evaluate.main, [*line, "--json", tmp_path / "s.json"], tmp_path)
+        must = name not in USABLE_AS_A_VOLUME and says != "no positive value"
+        if judged(outcome, "g3r-evaluate", files[role], says, must=must and role != "mask"):
+            case.refused()
+
+
+@pytest.mark.parametrize("name", BAD_MASKS)
+def test_evaluate_with_a_bad_mask(name: str, tmp_path: Path, tally: Tally):
+    make, says = BAD_MASKS[name]
+    reference = write(tmp_path / "stack.nii.gz", image(1))
+    (tmp_path / "masks").mkdir()
+    bad = make(tmp_path / "masks")
+    with tally.case() as case:
+        line = ["--volume", write(tmp_path / "v.nii"), "--reference", reference, "--mask", bad]
+        outcome = run(evaluate.main, line, tmp_path)
+        if judged(outcome, "g3r-evaluate", bad, says, must="12 masked" not in says):
+            case.refused()
+
+
+TABLES = {
+    "missing": None, "empty": b"", "no columns": b"a\tb\n1\t2\n", "binary": bytes(range(256)),
+    "text for a number": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\tx\t0\t0\t0\t0\t0\t0\n",
+    "NaN": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\tnan\t0\t0\t0\t0\t0\n",
+    "short row": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\t0\n",
+    "twice": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n" + b"0\t0\t0\t0\t0\t0\t0\t0\n" * 2,
+    "negative stack": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n-7\t0\t0\t0\t0\t0\t0\t0\n",
+    "a billion stacks": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n999999999\t0\t0\t0\t0\t0\t0\t0\n",
+    "beyond int64": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n" + b"9" * 30 + b"\t0\t0\t0\t0\t0\t0\t0\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Tally):
+    volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
+    table = tmp_path / "poses.tsv"
+    if TABLES[name] is not None:
+        table.write_bytes(TABLES[name] or b"")
+    with tally.case() as case:
+        line = [
+            "--volume",
+            volume,
+            "--reference",
+            volume,
+            "--mask",
+            mask,
+            "--poses",
+            table,
+            "--slices",
+            table,
+        ]
+        assert_refused(run(evaluate.main, line, tmp_path), "g3r-evaluate", "", "expected|check|no such file")
+        case.refused()
+
+
+def test_evaluate_writes_nowhere_else(tmp_path: Path, tally: Tally):
+    volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
+    for option in ("--json", "--sections"):
+        with tally.case() as case:
+            line = [
+                "--volume",
+                volume,
+                "--reference",
+                volume,
+                "--mask",
+                mask,
+                option,
+                tmp_path / "no" / "out",
+            ]
+            outcome = run(evaluate.main, line, tmp_path)
+            assert outcome.code == 3
+            assert len(outcome.err.splitlines()) == 1
+            assert outcome.changed == set()
+            case.refused()
