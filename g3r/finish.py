@@ -183,6 +183,11 @@ def _record(run: RunSoFar, first: PriorCloud, fit: SliceFit) -> dict[str, Any]:
     record["gaussians"] = first.counts | {"n_final": len(fit.cloud)}
     record["left_out"] = left_out_terms(run.volume.start.slices, settings, first.counts)
     record["loss"] = {"fit to prior": first.history, "fit to slices": fit.history}
+    if record["n_steps_back"]:
+        run.warnings.append(
+            f"the loss of the fit rose: {record['n_steps_back']} times it went back to its best state and on "
+            "with shorter steps; look at the volume"
+        )
     for warning in run.warnings:
         logger.warning(warning)
     return record
