@@ -15,8 +15,9 @@ from tally import Tally
 
 from g3r.acquisition.images import load_volume
 from g3r.gaussians import GaussianCloud
+from g3r.presets import PRESETS
 
-N_STEPS = 45
+N_STEPS = PRESETS["draft"].slice_stage.n_steps
 
 
 @pytest.fixture
