@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import platform
-import resource
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from g3r._version import __version__
 from g3r.acquisition.planes import SMALLEST_SLICE_PIXELS, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.slice_stage import SliceFit
+from g3r.memory import peak_bytes
 from g3r.motion import MotionEstimate
 from g3r.motion.confidence import StackConfidence, registration_summary, registration_trusted
 from g3r.presets import ReconstructionSettings
@@ -85,7 +85,7 @@ def run_record(
         },
         "seconds": clock.seconds,
         "cpu_seconds": clock.cpu_seconds,
-        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "peak_memory_bytes": peak_bytes(),
         "notes": notes,
         "warnings": warnings,
     }

@@ -18,8 +18,6 @@ from g3r.evaluation.case import SimulatedCase
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
-KIB = 1024
-
 
 @dataclass(frozen=True)
 class CommandRun:
@@ -78,5 +76,4 @@ def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
     if child.returncode:
         raise NumericalError(f"g3r-infer ended with {child.returncode}: {said[-2000:]}")
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
-    peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else KIB)
-    return CommandRun(seconds, usage.ru_utime + usage.ru_stime, peak, record)
+    return CommandRun(seconds, usage.ru_utime + usage.ru_stime, record["peak_memory_bytes"], record)

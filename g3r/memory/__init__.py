@@ -1,7 +1,7 @@
 """Memory: stated before it is taken, planned to stay below a limit."""
 
 from g3r.memory.allocator import give_back
-from g3r.memory.estimate import MemoryEstimate, estimate_memory
+from g3r.memory.estimate import MemoryEstimate, estimate_memory, peak_bytes
 from g3r.memory.plan import MemoryPlan, plan_for_stacks, plan_memory
 from g3r.memory.size import gigabytes, parsed_size
 
@@ -12,6 +12,7 @@ __all__ = [
     "gigabytes",
     "give_back",
     "parsed_size",
+    "peak_bytes",
     "plan_for_stacks",
     "plan_memory",
 ]

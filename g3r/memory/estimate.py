@@ -8,6 +8,8 @@ benchmarks.memory`, docs/tradeoff.md): they are on the safe side, and cover what
 from __future__ import annotations
 
 import math
+import resource
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -161,6 +163,19 @@ def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> fl
 def held_bytes() -> int:
     """What this process holds now."""
     return _kilobytes(Path("/proc/self/status"), "VmRSS") or USUAL_PROCESS_BYTES
+
+
+def peak_bytes() -> int:
+    """The most that this process has held so far.
+
+    Not `getrusage`, where the system counts this process alone: there a process begins with the peak of the
+    one that started it.
+    """
+    own = _kilobytes(Path("/proc/self/status"), "VmHWM")
+    if own is not None:
+        return own
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def available_bytes() -> int | None:
