@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+# torch's threads wait for each other busily: on two cores with anything beside them, small networks take
+# ten times as long; commands that tests start choose their own number
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
