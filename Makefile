@@ -25,7 +25,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench bench-phantom bench-memory clean
+.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench-budgets bench bench-phantom bench-memory clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -110,6 +110,10 @@ bench-gaussians: install ## PSNR against number of Gaussians, by bound and on a 
 
 bench-convergence: install ## optimiser steps to within 0.1 dB of the end (G3R_TEST_DATA): docs/tradeoff.md
 	$(BIN)/python -m benchmarks.fit_convergence "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --docs docs/tradeoff.md $(BENCH_ARGS)
+
+bench-budgets: install ## whether --time-budget is kept, and what more time brings (G3R_TEST_DATA): docs/tradeoff.md
+	$(BIN)/python -m benchmarks.time_budgets "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --thickness 2.2 \
+		--docs docs/tradeoff.md $(BENCH_ARGS)
 
 bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
 	$(BIN)/python -m benchmarks.lesions --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
