@@ -93,8 +93,8 @@ def budget_table(cases: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     ]
     return (
         f"{markdown_table(head, rows)}\n\nWhole command, one run each, kernels compiled. (!): more than "
-        f"{MORE_SHARE:.0%} and {MORE_S:g} s over the budget, or more than {MOST_LOSS_DB:g} dB below a shorter "
-        "one."
+        f"{MORE_SHARE:.0%} and {MORE_S:g} s over the budget, or more than {MOST_LOSS_DB:g} dB below a "
+        "shorter one."
     )
 
 
