@@ -15,7 +15,7 @@ from tally import Tally
 
 from g3r.acquisition.images import load_volume
 
-N_KILLS, N_SIGNALS = 40, 20
+N_KILLS, N_SIGNALS = 24, 12
 
 
 def is_whole(folder: Path, case: SmallCase) -> bool:

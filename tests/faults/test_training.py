@@ -76,7 +76,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("end_at", [4, 6, 11])
+@pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
 ):
@@ -164,7 +164,7 @@ def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: 
     done = subprocess.run(command(tmp_path / "whole"), check=False, **quiet)
     assert done.returncode == 0, done.stderr
     folder, last = tmp_path / "killed", tmp_path / "killed" / "kept" / "last.ckpt"
-    for n_more in (0.3, 1.0, 1.7):  # seconds after a new checkpoint
+    for n_more in (0.3, 1.3):  # seconds after a new checkpoint
         with tally.case():
             before = last.stat().st_mtime_ns if last.exists() else 0
             options = ["--ckpt_path", str(last)] if last.exists() else []
