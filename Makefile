@@ -80,49 +80,49 @@ tensorboard: install ## watch the training runs
 	$(BIN)/tensorboard --logdir runs
 
 bench-motion: install ## registration of 30 random subjects (G3R_TEST_DATA): the table of docs/motion.md
-	$(BIN)/python -m benchmarks.motion_sweep --docs docs/motion.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.motion.sweep --docs docs/motion.md $(BENCH_ARGS)
 
 bench-layers: install ## what each layer of registration brings, on the cases (G3R_TEST_DATA)
-	$(BIN)/python -m benchmarks.motion_layers --docs docs/motion.md --figure docs/images/motion-tre.png $(BENCH_ARGS)
+	$(BIN)/python -m studies.motion.layers --docs docs/motion.md --figure docs/images/motion-tre.png $(BENCH_ARGS)
 
 bench-bias: install ## poses and volume under shading (G3R_TEST_DATA)
-	$(BIN)/python -m benchmarks.motion_bias --docs docs/motion.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.motion.bias --docs docs/motion.md $(BENCH_ARGS)
 
 bench-prior: install ## the prior volume alone at true poses, and its seconds (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m benchmarks.prior_alone --docs docs/prior.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.prior.alone --docs docs/prior.md $(BENCH_ARGS)
 
 bench-ablation: install ## with and without the prior, 1 to 3 stacks, 8 subjects (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m benchmarks.prior_ablation --jobs 2 --docs docs/prior.md \
+	$(BIN)/python -m studies.prior.ablation --jobs 2 --docs docs/prior.md \
 		--figure docs/images/prior-ablation.png $(BENCH_ARGS)
 
 fit-uncertainty: install ## coefficients of uncertainty.nii.gz, with and without prior (G3R_TEST_DATA), about 10 min
-	$(BIN)/python -m benchmarks.uncertainty fit $(BENCH_ARGS)
-	$(BIN)/python -m benchmarks.uncertainty fit --no-prior $(BENCH_ARGS)
+	$(BIN)/python -m studies.uncertainty.calibration fit $(BENCH_ARGS)
+	$(BIN)/python -m studies.uncertainty.calibration fit --no-prior $(BENCH_ARGS)
 
 bench-uncertainty: install ## stated uncertainty against error, on subjects left out (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m benchmarks.uncertainty check --no-prior $(BENCH_ARGS)
-	$(BIN)/python -m benchmarks.uncertainty check --docs docs/prior.md \
+	$(BIN)/python -m studies.uncertainty.calibration check --no-prior $(BENCH_ARGS)
+	$(BIN)/python -m studies.uncertainty.calibration check --docs docs/prior.md \
 		--figure docs/images/uncertainty-calibration.png $(BENCH_ARGS)
 
 bench-gaussians: install ## PSNR against number of Gaussians, by bound and on a lattice (G3R_TEST_DATA for the atlas)
-	$(BIN)/python -m benchmarks.gaussian_count --docs docs/tradeoff.md \
+	$(BIN)/python -m studies.tradeoff.gaussian_count --docs docs/tradeoff.md \
 		--figure docs/images/gaussian-count.png
 
 bench-convergence: install ## optimiser steps to within 0.1 dB of the end (G3R_TEST_DATA): docs/tradeoff.md
-	$(BIN)/python -m benchmarks.fit_convergence "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --docs docs/tradeoff.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.tradeoff.convergence "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --docs docs/tradeoff.md $(BENCH_ARGS)
 
 bench-budgets: install ## whether --time-budget is kept, and what more time brings (G3R_TEST_DATA): docs/tradeoff.md
-	$(BIN)/python -m benchmarks.time_budgets "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --thickness 2.2 \
+	$(BIN)/python -m studies.tradeoff.time_budgets "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --thickness 2.2 \
 		--docs docs/tradeoff.md $(BENCH_ARGS)
 
 bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m benchmarks.lesions --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
+	$(BIN)/python -m studies.lesions.kept --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
 
 bench-cases: install ## with and without the prior on the cases (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m benchmarks.prior_cases --docs docs/prior.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.prior.cases --docs docs/prior.md $(BENCH_ARGS)
 
 ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
-	$(BIN)/python -m benchmarks.prior_networks --docs docs/prior.md \
+	$(BIN)/python -m studies.prior.networks --docs docs/prior.md \
 		--figure docs/images/prior-networks.png $(BENCH_ARGS) -- $(SHORT_TRAINING)
 
 bench: install ## kernels, scaling and speed against accuracy, on phantoms or on CASES="DIR ..." (BENCH_ARGS=--sweeps)
@@ -134,12 +134,12 @@ bench: install ## kernels, scaling and speed against accuracy, on phantoms or on
 		--docs docs/tradeoff.md --figure docs/images/tradeoff.png $(BENCH_ARGS)
 
 bench-phantom: install ## a small phantom of the size that other methods were timed on: seconds of `fast`
-	$(BIN)/python -m benchmarks.peer_phantom --force --output $(PHANTOM_CASES)/small
+	$(BIN)/python -m studies.tradeoff.peer_phantom --force --output $(PHANTOM_CASES)/small
 	$(BIN)/g3r-bench trade $(PHANTOM_CASES)/small --presets fast --output runs/bench/phantom $(BENCH_ARGS)
 
 bench-memory: install ## memory as stated and as held, runs below limits, on phantoms, about 20 min: docs/tradeoff.md
-	$(BIN)/python -m benchmarks.memory --docs docs/tradeoff.md $(BENCH_ARGS)
+	$(BIN)/python -m studies.tradeoff.memory --docs docs/tradeoff.md $(BENCH_ARGS)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find g3r data_synth benchmarks tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find g3r data_synth studies tests -name __pycache__ -type d -prune -exec rm -rf {} +

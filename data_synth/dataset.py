@@ -19,10 +19,8 @@ from torch.utils.data import Dataset
 from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
 from data_synth.heads import Subject, load_volume_of
-from data_synth.kept_subjects import KeptSubjects, SyntheticSubject
 from data_synth.motion import ResidualKind, draw_residual_kind, residual_errors
-from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
-from data_synth.stack_draws import (
+from data_synth.protocol_sampling import (
     RIM_SHARE,
     SMALL_MASK_SHARE,
     draw_settings,
@@ -30,9 +28,11 @@ from data_synth.stack_draws import (
     remasked,
     with_rim,
 )
+from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
+from data_synth.subject_cache import KeptSubjects, SyntheticSubject
+from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices, slices_from_stacks
-from g3r.acquisition.scatter import coarse_and_density, normalisation_scale
 from g3r.geometry import RigidPose, VolumeGrid
 
 logger = logging.getLogger(__name__)

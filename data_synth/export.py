@@ -13,7 +13,7 @@ from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError, cannot_be_written
-from g3r.unfinished import UnfinishedRun
+from g3r.run.output_folder import UnfinishedRun
 
 POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
 

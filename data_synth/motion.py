@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from g3r.acquisition.timing import acquisition_order
+from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 
 Array = NDArray[np.float64]

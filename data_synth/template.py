@@ -11,7 +11,7 @@ from scipy.ndimage import affine_transform
 
 from data_synth.atlas import TruthVolume
 from data_synth.heads import Subject, load_head, weeks_of
-from g3r.acquisition.template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 

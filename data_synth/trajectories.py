@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from data_synth.motion import about
-from g3r.acquisition.timing import acquisition_order
+from g3r.acquisition.interleave import acquisition_order
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from g3r._kernel_cache import ensure_kernel_cache
 from g3r._version import __version__
+from g3r.run.kernel_cache import ensure_kernel_cache
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import load_stack

@@ -11,36 +11,38 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.scatter import confidence
 from g3r.acquisition.stacks import Stack
-from g3r.budget import TimeBudget
 from g3r.errors import InputError
-from g3r.finish import Cut, RunSoFar, cut_short, finished
 from g3r.fitting.adaptive_stage import fit_adaptive
+from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
 from g3r.gaussians.seeding import seed_cloud
-from g3r.interruption import Interruption
-from g3r.memory import give_back
-from g3r.motion import MotionEstimate, estimate_motion
-from g3r.motion.confidence import pose_warnings, stack_confidences
-from g3r.motion.prior_registration import register_to_prior
-from g3r.motion.template_registration import head_volume_mm3, template_fits
-from g3r.pace import Deadline
-from g3r.presets import PRESETS, ReconstructionSettings
-from g3r.prior import PriorCheckpoint, estimate_prior, load_pose_network, load_prior, predict_poses
+from g3r.output.assemble import Cut, RunSoFar, cut_short, finished
+from g3r.output.record import Clock, left_out_notes
+from g3r.output.result import ReconstructionResult
+from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.planning.time_budget import TimeBudget
+from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
+from g3r.pose_network.inference import predict_poses
+from g3r.pose_network.network import PoseNetwork
+from g3r.prior.checkpoint import PriorCheckpoint, load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.pose_checkpoint import PoseCheckpoint
-from g3r.prior.pose_network import PoseNetwork
-from g3r.result import ReconstructionResult
-from g3r.run_record import Clock, left_out_notes
-from g3r.stages import PriorCloud, PriorVolume, Stages, stage_rng
-from g3r.start import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
+from g3r.prior.inference import estimate_prior
+from g3r.registration import MotionEstimate, estimate_motion
+from g3r.registration.prior_registration import register_to_prior
+from g3r.registration.quality import pose_warnings, stack_confidences
+from g3r.registration.template_search import head_volume_mm3, template_fits
+from g3r.run.allocator import give_back
+from g3r.run.deadline import Deadline
+from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
+from g3r.run.stop_request import Interruption
 
-DEFAULT_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "prior.pt"
-DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "prior" / "weights" / "pose.pt"
+DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
+DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 

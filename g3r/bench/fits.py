@@ -11,9 +11,9 @@ from g3r.bench.scores import Quality, cloud_psnr_db, quality
 from g3r.evaluation.case import SimulatedCase, pose_table
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
-from g3r.motion import MotionEstimate
-from g3r.presets import ReconstructionSettings, changed
+from g3r.planning.presets import ReconstructionSettings, changed
 from g3r.reconstruct import GaussianReconstructor
+from g3r.registration import MotionEstimate
 
 SAMPLES_PER_FIT = 10
 
@@ -24,7 +24,7 @@ RESOLUTIONS_MM = (0.6, 0.8, 1.0, 1.3, 1.6)
 
 
 def sweeps(base: ReconstructionSettings) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """What is varied, one at a time: sweep, label, change of the settings (see `g3r.presets.changed`)."""
+    """What is varied, one at a time: sweep, label, change of the settings (see `g3r.planning.presets.changed`)."""
     prior_steps, slice_steps = base.prior_stage.n_steps, base.slice_stage.n_steps
     return {
         "Gaussians": {

@@ -15,7 +15,7 @@ from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, find_pairs, kernels, kernels_backward, render
-from g3r.gaussians.pairs import CloudArrays, Workspace
+from g3r.gaussians.overlap import CloudArrays, Workspace
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
 CLOCK = time.thread_time

@@ -11,7 +11,7 @@ from g3r.acquisition.planes import Planes, Slices, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.cloud import rotation_from_quaternion
-from g3r.gaussians.pairs import PairList
+from g3r.gaussians.overlap import PairList
 from g3r.geometry import VolumeGrid
 
 HEAD_MM = 50.0

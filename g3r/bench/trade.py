@@ -129,7 +129,7 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
 def _measure_fits(case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any]) -> None:
     """Curves during the fit of each preset, and the sweeps, into the record of a case."""
     from g3r.bench.fits import measured_fit, measured_sweeps
-    from g3r.presets import PRESETS
+    from g3r.planning.presets import PRESETS
 
     found = record["cases"][case.name]
     found["fits"] = {}

@@ -86,7 +86,7 @@ def _compare(options: argparse.Namespace) -> Comparison:
     mask = load_mask(options.mask, reference)
     comparison = compare(volume, reference, mask, align=options.align)
     if options.sections:
-        from g3r.report.sections import save_sections
+        from g3r.output.sections import save_sections
 
         rows = {
             "reference": reference.data,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
+    from g3r.pose_network.checkpoint import PoseCheckpoint
     from g3r.prior.checkpoint import PriorCheckpoint
-    from g3r.prior.pose_checkpoint import PoseCheckpoint
 
 EXPORT_KEYS = ("g3r_prior", "g3r_pose")
 """Where training checkpoints keep what an export needs: of the prior, of the pose network."""
@@ -102,14 +102,14 @@ def _write_pose(
     """Write a pose file, and see that it can be read."""
     import numpy as np
 
-    from g3r.acquisition.template import AtlasTemplate
-    from g3r.prior.pose_checkpoint import (
+    from g3r.acquisition.atlas_template import AtlasTemplate
+    from g3r.pose_network.checkpoint import (
         PoseCheckpoint,
         centred_grid,
         load_pose_network,
         save_pose_checkpoint,
     )
-    from g3r.prior.pose_network import PoseNetwork
+    from g3r.pose_network.network import PoseNetwork
 
     network = PoseNetwork(**described["network_arguments"])
     network.load_state_dict(weights)

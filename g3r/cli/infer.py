@@ -20,16 +20,16 @@ from typing import TYPE_CHECKING
 from g3r.cli.failures import EXPECTED, line_and_code
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
-from g3r.interruption import Interruption
+from g3r.run.stop_request import Interruption
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
-    from g3r.budget import TimeBudget
-    from g3r.memory import MemoryPlan
-    from g3r.presets import ReconstructionSettings
+    from g3r.output.earlier_run import EarlierRun, Inputs
+    from g3r.output.result import ReconstructionResult
+    from g3r.planning.memory_limit import MemoryPlan
+    from g3r.planning.presets import ReconstructionSettings
+    from g3r.planning.time_budget import TimeBudget
     from g3r.reconstruct import GaussianReconstructor, Progress
-    from g3r.rerun import EarlierRun, Inputs
-    from g3r.result import ReconstructionResult
 
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
@@ -65,15 +65,15 @@ def _failed(line: str, exit_code: int) -> int:
 
 
 def _way_on(folder: Path) -> str:
-    from g3r.unfinished import UnfinishedRun
+    from g3r.run.output_folder import UnfinishedRun
 
     kept = UnfinishedRun(folder).stages.is_dir()
     return "; --resume goes on from the last finished stage" if kept else ""
 
 
 def _run(options: argparse.Namespace, interruption: Interruption) -> int:
-    from g3r.result import OUTPUT_NAMES, check_output_folder, is_partial
-    from g3r.unfinished import UnfinishedRun
+    from g3r.output.result import OUTPUT_NAMES, check_output_folder, is_partial
+    from g3r.run.output_folder import UnfinishedRun
 
     folder = Path(options.output)
     replaces = options.force or (options.resume and is_partial(folder))
@@ -81,10 +81,10 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
     with _lines_held_back():
         earlier = _earlier(options)
         stacks = _load(options, earlier)
-        from g3r.memory import plan_for_stacks
+        from g3r.output.earlier_run import made_of
+        from g3r.planning.memory_limit import plan_for_stacks
         from g3r.reconstruct import GaussianReconstructor
-        from g3r.rerun import made_of
-        from g3r.stages import Stages
+        from g3r.run.stage_store import Stages
 
         n_threads = _use_threads(options.threads or (earlier.n_threads if earlier else None))
         settings = earlier.settings if earlier else _settings(options)
@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
             if not result.record["partial"]:
                 unfinished.forget_stages()
     if options.tensorboard:
-        from g3r.report.tensorboard import write_tensorboard
+        from g3r.output.tensorboard import write_tensorboard
 
         write_tensorboard(Path(options.tensorboard), result.record["loss"], result.volume, result.mask)
     if budget is not None and budget.missed:
@@ -182,7 +182,7 @@ def _lines_held_back() -> Iterator[None]:
 def _earlier(options: argparse.Namespace) -> EarlierRun | None:
     if not options.config:
         return None
-    from g3r.rerun import read_run
+    from g3r.output.earlier_run import read_run
 
     earlier = read_run(options.config)
     n_then, n_now = len(earlier.thickness_mm), len(options.stacks)
@@ -195,8 +195,8 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
 
 def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
     """Refuse what can be seen without reading an image."""
-    from g3r.prior.archive import check_archive
-    from g3r.result import check_output_folder
+    from g3r.checkpoints.archive import check_archive
+    from g3r.output.result import check_output_folder
 
     networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
     inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
@@ -205,7 +205,7 @@ def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -
         if path:
             check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
     if options.tensorboard:
-        from g3r.report.tensorboard import check_tensorboard
+        from g3r.output.tensorboard import check_tensorboard
 
         check_tensorboard(Path(options.tensorboard))
 
@@ -220,7 +220,7 @@ def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from g3r.presets import PRESETS
+    from g3r.planning.presets import PRESETS
 
     preset = PRESETS[options.preset]
     if options.time_budget is not None:
@@ -236,8 +236,8 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
 
 def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
+    from g3r.output.earlier_run import FileMark, Inputs
     from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
-    from g3r.rerun import FileMark, Inputs
 
     return Inputs(
         tuple(map(FileMark.of, options.stacks)),
@@ -249,7 +249,7 @@ def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -
 
 def _budget(options: argparse.Namespace, earlier: EarlierRun | None) -> TimeBudget | None:
     """What is left of a time budget that began with the command, or the earlier run's once more."""
-    from g3r.budget import RepeatedBudget, TimeBudget
+    from g3r.planning.time_budget import RepeatedBudget, TimeBudget
 
     if earlier and earlier.time_budget:
         return RepeatedBudget(earlier.time_budget)

@@ -110,7 +110,7 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _size(text: str) -> int:
-    from g3r.memory import parsed_size
+    from g3r.planning.memory_size import parsed_size
 
     try:
         return parsed_size(text)

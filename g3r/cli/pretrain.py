@@ -12,8 +12,8 @@ TensorBoard, checkpoints beside them.
 
   fit, validate            what to do
   --config FILE            settings; every one of them can be overridden on the command line
-  --model CLASS            what to train: g3r.prior.lightning_module.PriorModule (default, also where a config
-                           names no class) or g3r.prior.pose_module.PoseModule
+  --model CLASS            what to train: g3r.training.prior_module.PriorModule (default, also where a config
+                           names no class) or g3r.training.pose_module.PoseModule
   --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
   --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit
   --ckpt_path FILE         go on from a training checkpoint
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from lightning.pytorch import LightningDataModule, Trainer
         from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-        from g3r.prior.training import AnnealedModule, WholeCheckpoints
+        from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
     except ModuleNotFoundError as error:
         advice = "install the training extra: pip install 'g3r[train]'"
         print(f"g3r-pretrain: {error.name} is not installed; {advice}", file=sys.stderr)
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     class PretrainCLI(LightningCLI):
         def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
             # a config that names no class is one of the prior's
-            parser.set_defaults({"model": {"class_path": "g3r.prior.lightning_module.PriorModule"}})
+            parser.set_defaults({"model": {"class_path": "g3r.training.prior_module.PriorModule"}})
 
         def instantiate_trainer(self, **options: Any) -> Trainer:
             return super().instantiate_trainer(plugins=[WholeCheckpoints()], **options)

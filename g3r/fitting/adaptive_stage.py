@@ -10,15 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import volume_from_pixels
-from g3r.fitting.prior_stage import (
-    NO_PROGRESS,
-    PriorStageSettings,
-    VolumeTarget,
-    fit_prior,
-    solve_peaks_on,
-)
+from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings, VolumeTarget, fit_prior, solve_peaks_on
 from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.refinement import (
+from g3r.gaussians.densification import (
     crowded,
     find_blobs,
     joined,
@@ -28,7 +22,7 @@ from g3r.gaussians.refinement import (
 )
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
-from g3r.pace import Deadline
+from g3r.run.deadline import Deadline
 
 WINDOW_SHARE = 0.5
 """Sigma of the neighbourhood in which the residual is judged, over the finest spacing."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from g3r.gaussians.kernels import clear, set_up_plane, sweep_plane
 from g3r.gaussians.kernels_backward import gather_plane
-from g3r.gaussians.lanes import N_LANES
+from g3r.gaussians.simd import N_LANES
 
 f32 = np.float32
 

@@ -18,7 +18,7 @@ from g3r.fitting import kernels
 from g3r.fitting.parameters import FitParameters
 from g3r.gaussians.kernels import N_GRADIENTS, N_PLANE_GRADIENTS, SHAPE_COLUMNS, derive_shapes
 from g3r.gaussians.kernels_backward import shape_gradients
-from g3r.gaussians.pairs import PairFinder, PairList, Workspace
+from g3r.gaussians.overlap import PairFinder, PairList, Workspace
 from g3r.gaussians.render import CUTOFF_SIGMA
 
 PAIR_MARGIN_SIGMA = 1.0

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
+from g3r.fitting.divergence_guard import Safeguard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
-from g3r.fitting.safeguard import Safeguard
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_peaks
-from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
+from g3r.gaussians.amplitudes import RECORD_BYTES_AT_MOST
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
-from g3r.pace import Deadline, paced
+from g3r.run.deadline import Deadline, paced
 
 NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.fitting.bias_field import N_TERMS, StackShading
+from g3r.fitting.divergence_guard import Safeguard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
-from g3r.fitting.safeguard import Safeguard
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
-from g3r.fitting.shading import N_TERMS, StackShading
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, solve_peaks
-from g3r.gaussians.peaks import RECORD_BYTES_AT_MOST
+from g3r.gaussians.amplitudes import RECORD_BYTES_AT_MOST
 from g3r.gaussians.render import CUTOFF_SIGMA
-from g3r.pace import Deadline, paced
+from g3r.run.deadline import Deadline, paced
 
 MOST_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""

@@ -13,7 +13,7 @@ import math
 import numba
 import numpy as np
 
-from g3r.gaussians.lanes import N_LANES, add_strip
+from g3r.gaussians.simd import N_LANES, add_strip
 
 f32 = np.float32
 

@@ -16,7 +16,7 @@ from g3r.gaussians.kernels import (
     strip_columns,
     strip_rows,
 )
-from g3r.gaussians.lanes import N_LANES, strip_moments
+from g3r.gaussians.simd import N_LANES, strip_moments
 
 f32 = np.float32
 

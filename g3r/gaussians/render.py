@@ -13,7 +13,7 @@ from torch import Tensor
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import kernels, kernels_backward
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.pairs import CloudArrays, PairList, Workspace, find_pairs
+from g3r.gaussians.overlap import CloudArrays, PairList, Workspace, find_pairs
 from g3r.gaussians.reference import render_reference
 from g3r.geometry import RigidPose
 

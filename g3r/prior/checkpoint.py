@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from g3r._version import __version__
+from g3r.acquisition.coarse_volume import DENSITY_CONVENTION, INTENSITY_CONVENTION
 from g3r.acquisition.least_squares import SHARP_CONVENTION
-from g3r.acquisition.scatter import DENSITY_CONVENTION, INTENSITY_CONVENTION
-from g3r.errors import InputError
-from g3r.prior.checkpoint_file import (
+from g3r.checkpoints.file import (
     built,
     check_digest,
     check_identity,
@@ -26,6 +25,7 @@ from g3r.prior.checkpoint_file import (
     weights_digest,
     write_file,
 )
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.prior.dgpn import DensityGatedPriorNetwork

@@ -37,7 +37,7 @@ def estimate_prior(
 
     Args:
         network: from `load_prior`, on any device; its mode is left as it is.
-        v_coarse: [I, J, K], already divided by `g3r.acquisition.scatter.normalisation_scale`.
+        v_coarse: [I, J, K], already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
         m_rho: [I, J, K], dimensionless density M >= 0.
         v_sharp: [I, J, K], on V_coarse's scale; needed by networks with `use_sharp`.
         n_views: number of mirror images and half turns to average over, 1 to 8.

@@ -11,7 +11,7 @@ from g3r.bench import kernels
 from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
 from g3r.bench.kernel_scene import count_pixels, head_scene, record_space
 from g3r.gaussians import find_pairs
-from g3r.gaussians.pairs import CloudArrays
+from g3r.gaussians.overlap import CloudArrays
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
 

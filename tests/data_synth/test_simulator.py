@@ -6,21 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from data_synth.motion import (
-    LEVELS,
-    MotionLevel,
-    draw_residual_kind,
-    residual_errors,
-    slice_trajectory,
-)
-from data_synth.simulator import (
-    SimulatedStack,
-    StackSettings,
-    orthogonal_settings,
-    simulate_stacks,
-)
+from data_synth.motion import LEVELS, MotionLevel, draw_residual_kind, residual_errors, slice_trajectory
+from data_synth.simulator import SimulatedStack, StackSettings, orthogonal_settings, simulate_stacks
+from g3r.acquisition.interleave import acquisition_order
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.timing import acquisition_order
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 

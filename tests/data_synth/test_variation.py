@@ -10,10 +10,10 @@ from data_synth.contrast import recoloured
 from data_synth.heads import PhantomSubject, load_volume_of
 from data_synth.motion import LEVELS, slice_trajectory
 from data_synth.pathology import enlarged_ventricles, with_lesion, with_lesions
+from data_synth.protocol_sampling import draw_settings, in_line, remasked, with_rim
 from data_synth.simulator import StackSettings, simulate_stacks
-from data_synth.stack_draws import draw_settings, in_line, remasked, with_rim
+from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import slices_from_stacks
-from g3r.acquisition.scatter import coarse_and_density
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 

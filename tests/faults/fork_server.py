@@ -15,10 +15,11 @@ import sys
 import tempfile
 import time
 
-import g3r.cli.infer
 import g3r.memory
+
+import g3r.cli.infer
+import g3r.output.sections
 import g3r.reconstruct
-import g3r.report.sections
 
 
 def run(request: dict) -> dict:

@@ -17,20 +17,13 @@ import numpy as np
 import torch
 from fuzz_headers import damaged_bytes
 
-from g3r.acquisition.template import AtlasTemplate
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.checkpoints.file import weights_digest
 from g3r.errors import InputError
-from g3r.prior import (
-    DensityGatedPriorNetwork,
-    PoseCheckpoint,
-    PoseNetwork,
-    PriorCheckpoint,
-    load_pose_network,
-    load_prior,
-    save_pose_checkpoint,
-    save_prior_checkpoint,
-)
-from g3r.prior.checkpoint_file import weights_digest
-from g3r.prior.pose_checkpoint import centred_grid
+from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid, load_pose_network, save_pose_checkpoint
+from g3r.pose_network.network import PoseNetwork
+from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint
+from g3r.prior.dgpn import DensityGatedPriorNetwork
 
 Loader = Callable[[Path], tuple[torch.nn.Module, Any]]
 

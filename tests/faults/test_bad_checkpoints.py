@@ -19,7 +19,7 @@ from tally import Tally
 from g3r.cli import export
 from g3r.cli.infer import main
 from g3r.errors import InputError
-from g3r.prior import load_prior
+from g3r.prior.checkpoint import load_prior
 
 pytestmark = pytest.mark.usefixtures("networks_once")
 

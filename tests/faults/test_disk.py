@@ -102,7 +102,7 @@ def test_a_write_that_fails_leaves_the_earlier_result(
     def full(*arguments: object, **options: object) -> None:
         raise cannot_be_written("sections.png", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
 
-    monkeypatch.setattr("g3r.report.sections.save_sections", full)
+    monkeypatch.setattr("g3r.output.sections.save_sections", full)
     with tally.case() as one:
         assert case.run(out, "--force") == 3
         line = last_line(capsys.readouterr().err)
@@ -128,7 +128,7 @@ def test_stages_that_cannot_be_kept_do_not_end_a_run(
     def full(*arguments: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("g3r.stages.write_stage", full)
+    monkeypatch.setattr("g3r.run.stage_store.write_stage", full)
     with tally.case():
         assert case.run(tmp_path / "out") == 0
         assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
@@ -138,7 +138,7 @@ def test_stages_that_cannot_be_kept_do_not_end_a_run(
 def test_stages_give_way_where_only_that_makes_room(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
 ):
-    from g3r.unfinished import UnfinishedRun
+    from g3r.run.output_folder import UnfinishedRun
 
     with UnfinishedRun(tmp_path / "out") as run:
         run.stages.mkdir()

@@ -16,12 +16,12 @@ from nifti_files import AFFINE, ball, image, write_raw
 from scipy.ndimage import gaussian_filter
 from tally import Tally
 
+from data_synth import cli as simulate
 from g3r.acquisition.header_text import HeaderText, read_header_text
 from g3r.acquisition.images import load_volume, save_volume
-from g3r.cli import simulate
 from g3r.cli.infer import main
+from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
-from g3r.result import ReconstructionResult
 
 CANARY = "DOE^JANE 1987"
 """As short as the shortest text field, so that each can hold it whole."""

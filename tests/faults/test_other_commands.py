@@ -16,7 +16,8 @@ from commands import assert_refused, run
 from nifti_files import ball, write
 from tally import Tally
 
-from g3r.cli import bench, export, simulate
+from data_synth import cli as simulate
+from g3r.cli import bench, export
 from g3r.cli.infer import main as infer
 
 
@@ -27,7 +28,7 @@ def everything_is_imported() -> None:
         "data_synth.export",
         "data_synth.phantom",
         "data_synth.simulator",
-        "g3r.prior.pose_network",
+        "g3r.pose_network.network",
     ):
         import_module(module)
     import_module("g3r.prior.dgpn")

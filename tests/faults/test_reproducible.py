@@ -17,7 +17,7 @@ from tally import Tally
 
 from g3r.cli.infer import main as infer
 from g3r.errors import InputError
-from g3r.rerun import FileMark, read_run
+from g3r.output.earlier_run import FileMark, read_run
 
 SAME = ("volume.nii.gz", "mask.nii.gz", "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "sections.png")
 QUICK = ("--preset", "draft", "--resolution", "2", "--thickness", "4")

@@ -19,9 +19,9 @@ from tally import Tally
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
-from g3r.stage_file import UnreadableStage, as_stored, read_stage, write_stage
-from g3r.stages import NAMES, RECORDS, Stages, stage_rng
-from g3r.unfinished import UnfinishedRun
+from g3r.run.output_folder import UnfinishedRun
+from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
+from g3r.run.stage_store import NAMES, RECORDS, Stages, stage_rng
 
 STAGES = ("motion", "prior", "fit-to-prior", "fit-to-slices")
 
@@ -32,7 +32,7 @@ def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "g3r.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError)
+            "g3r.output.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError)
         )
         assert case.run(folder / "out") == 4
     assert names(folder / "out.unfinished" / "stages") == {"made_of.json", *(f"{s}.npz" for s in STAGES)}
@@ -117,7 +117,7 @@ def test_nothing_of_a_living_run_is_touched(
 
 def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tally):
     code = (
-        "import sys, time\nfrom g3r.unfinished import UnfinishedRun\n"
+        "import sys, time\nfrom g3r.run.output_folder import UnfinishedRun\n"
         "run = UnfinishedRun(sys.argv[1]).__enter__()\nprint('in', flush=True)\ntime.sleep(60)"
     )
     with tally.case():

@@ -15,7 +15,7 @@ from tally import Tally
 
 from g3r.acquisition.images import load_volume
 from g3r.gaussians import GaussianCloud
-from g3r.presets import PRESETS
+from g3r.planning.presets import PRESETS
 
 N_STEPS = PRESETS["draft"].slice_stage.n_steps
 

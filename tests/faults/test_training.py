@@ -19,9 +19,9 @@ from g3r.errors import InputError
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 pytest.importorskip("torchio", reason="the training extra is not installed")
 
-from data_synth.datamodule import StackSynthesisDataModule  # noqa: E402
-from g3r.prior.lightning_module import PriorModule  # noqa: E402
-from g3r.prior.training import WholeCheckpoints  # noqa: E402
+from data_synth.prior_data import StackSynthesisDataModule  # noqa: E402
+from g3r.training.annealed_module import WholeCheckpoints  # noqa: E402
+from g3r.training.prior_module import PriorModule  # noqa: E402
 
 NETWORK = {"channels": [4, 4], "units": [1, 1], "tail_channels": 2, "warmup_steps": 2}
 # ten patches an epoch in batches of three: one is left over each time
@@ -114,7 +114,7 @@ CONFIG = """
 seed_everything: 5
 model: {channels: [4, 4], units: [1, 1], tail_channels: 2, warmup_steps: 2}
 data:
-  class_path: data_synth.datamodule.StackSynthesisDataModule
+  class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
     {spacing_mm: 2.0, patch_size: 24, patches_per_subject: 2, batch_size: 3, subjects_per_epoch: 5,
      val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.gaussian_count import BALL_MOST, ball, lattice_cloud, psnr_db
 from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget
 from g3r.geometry import VolumeGrid
+from studies.tradeoff.gaussian_count import BALL_MOST, ball, lattice_cloud, psnr_db
 
 GRID = VolumeGrid.isotropic([-14.0] * 3, [14.0] * 3, 1.0)
 INDEX = np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1)

@@ -10,14 +10,14 @@ from test_stages import BALL, GRID, make_slices, seeded, true_cloud
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.errors import NumericalError
+from g3r.fitting.bias_field import StackShading
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import VolumeTarget
-from g3r.fitting.shading import StackShading
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.pairs import PairFinder
+from g3r.gaussians.overlap import PairFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0)

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.numerics_errors import FULL_CUTOFF, gradients
-from benchmarks.numerics_scenes import single
 from g3r.acquisition.planes import Planes
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.gaussians import GaussianCloud
-from g3r.gaussians.peaks import PeakSystem
+from g3r.gaussians.amplitudes import PeakSystem
+from studies.numerics.errors import FULL_CUTOFF, gradients
+from studies.numerics.scenes import single
 
 Evaluated = tuple[Tensor, dict[str, Tensor]]
 

@@ -11,9 +11,14 @@ import torch
 from fast_backends import BACKENDS, FAST
 from scipy.spatial.transform import Rotation
 
-from benchmarks.numerics_errors import gradient_tolerance, shape_tolerance, sized_scenes
-from benchmarks.numerics_oracles import volume_at
-from benchmarks.numerics_scenes import (
+from g3r.acquisition.planes import Planes
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.gaussians import GaussianCloud, find_pairs, render
+from g3r.gaussians.cloud import SIGMA_RANGE_MM
+from g3r.geometry import RigidPose
+from studies.numerics.errors import gradient_tolerance, shape_tolerance, sized_scenes
+from studies.numerics.oracles import volume_at
+from studies.numerics.scenes import (
     ORIGIN_MM,
     Scene,
     cloud_of,
@@ -22,11 +27,6 @@ from benchmarks.numerics_scenes import (
     slender_scenes,
     stacks_of_planes,
 )
-from g3r.acquisition.planes import Planes
-from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, find_pairs, render
-from g3r.gaussians.cloud import SIGMA_RANGE_MM
-from g3r.geometry import RigidPose
 
 
 def of_sigma(sigma_mm: float, thickness_mm: float) -> Scene:

@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.numerics_fits import fit_at, slices_of_small_head, step_size_rows, times, volume_changes
-from benchmarks.numerics_scenes import head_scene, single
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, NumericalError
-from g3r.fitting import prior_stage, safeguard
+from g3r.fitting import divergence_guard as safeguard
+from g3r.fitting import prior_stage
+from g3r.fitting.divergence_guard import Safeguard
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
-from g3r.fitting.safeguard import Safeguard
 from g3r.fitting.schedules import AnnealedWeight
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
+from studies.numerics.fits import fit_at, slices_of_small_head, step_size_rows, times, volume_changes
+from studies.numerics.scenes import head_scene, single
 
 
 def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options) -> SliceFit:

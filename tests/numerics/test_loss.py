@@ -14,14 +14,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from benchmarks.numerics_scenes import head_scene, single
 from g3r.acquisition.planes import Planes, Slices
+from g3r.fitting.bias_field import StackShading
 from g3r.fitting.parameters import FitParameters
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight
-from g3r.fitting.shading import StackShading
 from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings, _blocks
 from g3r.gaussians import GaussianCloud, render
+from studies.numerics.scenes import head_scene, single
 
 CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
 STEP = 1e-5

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import numerics
-from benchmarks.numerics_errors import (
+from studies.numerics import tables as numerics
+from studies.numerics.errors import (
     comb,
     distance_rows,
     gradient_rows,

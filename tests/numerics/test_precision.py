@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.numerics_scenes import head_scene, single
 from g3r.gaussians import GaussianCloud, render
+from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_from_vector
+from g3r.pose_network.network import PoseNetwork
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.pose_geometry import moved_points, nearest_rotation, rotation_from_vector
-from g3r.prior.pose_network import PoseNetwork
+from studies.numerics.scenes import head_scene, single
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -36,7 +36,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
 
 def test_a_renderer_under_autocast_would_be_wrong():
     """The naive formula under the same autocast: why the reference switches it off."""
-    from benchmarks.numerics_oracles import naive_render
+    from studies.numerics.oracles import naive_render
 
     scene = head_scene()
     exact = render(scene.cloud, scene.planes, backend="reference")

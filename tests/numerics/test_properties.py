@@ -9,13 +9,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from benchmarks.numerics_errors import shape_tolerance
-from benchmarks.numerics_scenes import Scene, cloud_of, single
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.gaussians import find_pairs, render, solve_peaks
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
+from studies.numerics.errors import shape_tolerance
+from studies.numerics.scenes import Scene, cloud_of, single
 
 QUICK = settings(
     max_examples=40, deadline=None, derandomize=True,

@@ -6,8 +6,8 @@ import numpy as np
 
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose
-from g3r.presets import PRESETS
-from g3r.run_record import left_out_terms
+from g3r.output.record import left_out_terms
+from g3r.planning.presets import PRESETS
 
 
 def slices_of(stacks: list[int]) -> Slices:

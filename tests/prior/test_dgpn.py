@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch import nn
 
-from g3r.prior import DensityGatedPriorNetwork, ResidualRefiner
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.network import ResidualRefiner
 
 SMALL = {"channels": (8, 8, 8), "units": (1, 1, 1), "tail_channels": 4}
 

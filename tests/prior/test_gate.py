@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from g3r.prior import DensityGate, confidence_from_density
+from g3r.prior.gate import DensityGate, confidence_from_density
 
 
 def test_limits_are_alpha_and_beta():

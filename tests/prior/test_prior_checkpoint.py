@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from g3r.errors import InputError
-from g3r.prior import DensityGatedPriorNetwork, PriorCheckpoint, load_prior, save_prior_checkpoint
+from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint
+from g3r.prior.dgpn import DensityGatedPriorNetwork
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,8 @@ import torch
 from torch import nn
 
 from g3r.errors import NumericalError
-from g3r.prior import DensityGatedPriorNetwork, estimate_prior
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.inference import estimate_prior
 
 
 @pytest.fixture(scope="module")

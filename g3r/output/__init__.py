@@ -1,0 +1,1 @@
+"""What a reconstruction gives: the result, its record, files and pictures."""

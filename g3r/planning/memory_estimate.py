@@ -1,0 +1,194 @@
+"""How much memory each stage of a reconstruction takes, stated before it starts.
+
+Bytes follow from sizes that are known beforehand: pixels, the grid that the masks need at their header poses,
+the voxels of the output, the Gaussians that the head holds. The factors are measured (`python -m
+studies.tradeoff.memory`, docs/tradeoff.md): they are on the safe side, and cover what the allocator keeps.
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.voxel_operator import MOST_SCATTER_BUFFERS
+from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
+from g3r.planning.memory_size import gigabytes
+from g3r.planning.presets import ReconstructionSettings
+from g3r.registration.template_search import head_volume_mm3
+
+GRID_SLACK = 1.1
+"""Voxels over those of the box at header poses: heads that were turned into the atlas frame."""
+
+USUAL_PROCESS_BYTES = 500_000_000
+"""Python with the libraries and networks loaded, where the system does not tell."""
+
+PAIR_BYTES = 48
+"""A kept record of a pair (`gaussians.kernels.PAIR`)."""
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """What each stage holds at most, in bytes, the process with its libraries included."""
+
+    stages: dict[str, int]
+
+    @property
+    def stage(self) -> str:
+        """Which one needs most."""
+        return max(self.stages, key=lambda name: self.stages[name])
+
+    @property
+    def peak(self) -> int:
+        """What that one needs."""
+        return self.stages[self.stage]
+
+    def line(self) -> str:
+        """The statement for people."""
+        return f"needs about {gigabytes(self.peak)} of memory, most of it in {self.stage}"
+
+
+@dataclass(frozen=True)
+class ProblemSizes:
+    """What the estimate is made of: counts, none of them in bytes."""
+
+    n_pixels: int
+    n_stacks: int
+    prior_shape: tuple[int, ...]
+    prior_voxels: float
+    output_voxels: float
+    n_gaussians: float
+    n_pairs: float
+
+
+def estimate_memory(
+    slices: Slices,
+    settings: ReconstructionSettings,
+    n_threads: int = 1,
+    process_bytes: int | None = None,
+    *,
+    at_once: bool = False,
+) -> MemoryEstimate:
+    """Memory of every stage, from sizes alone.
+
+    Args:
+        slices: at their header poses.
+        settings: of the reconstruction.
+        n_threads: of the kernels.
+        process_bytes: what the process holds before; as it is now when None.
+        at_once: with `give_back_at_once`.
+    """
+    sizes = sizes_of(slices, settings)
+    start = held_bytes() if process_bytes is None else process_bytes
+    buffers = min(n_threads, MOST_SCATTER_BUFFERS)
+    n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
+    resting = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
+    volumes = resting + VOLUMES_PER_VOXEL * voxels
+    records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes)
+    cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
+    prior_records = min(PAIR_BYTES * sizes.n_pairs, settings.prior_stage.record_bytes)
+    outputs = volumes + OUTPUTS_PER_VOXEL * output + cloud
+    stages = {
+        "loading": resting,
+        "motion": resting + MOTION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
+        "coarse volumes": volumes + COARSE_PER_PIXEL * n_pixels + 4 * (COARSE_VOLUMES + buffers) * voxels,
+    }
+    if settings.use_prior:
+        seen = _seen_voxels(sizes.prior_shape, settings)
+        begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
+        stages["prior network"] = volumes + begin + per_voxel * seen + 16 * voxels
+    stages |= {
+        "fit to prior": volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
+        "fit to slices": volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
+        "volume": outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
+    }
+    if settings.use_prior:
+        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
+    stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + EVIDENCE_PER_VOXEL * output
+    stages["writing"] = outputs + WRITING_PER_VOXEL * output
+    return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
+
+
+# Bytes, measured; see the module's docstring.
+LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 110_000_000, 70_000_000
+SLICES_PER_PIXEL = 45
+VOLUMES_PER_VOXEL = 20
+MOTION_PER_PIXEL = 150
+COARSE_PER_PIXEL, COARSE_VOLUMES = 130, 5
+NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with, and per voxel
+CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
+TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
+OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
+SHARE_PER_PIXEL, SHARE_PER_VOXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
+
+
+def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
+    """Sizes of a reconstruction of slices at their header poses."""
+    voxel_mm = settings.prior_voxel_mm if settings.use_prior else settings.resolution_mm
+    grid = grid_around(slices, voxel_mm, MARGIN_MM)
+    n_voxels = GRID_SLACK * math.prod(grid.shape)
+    spacing_mm = gaussian_spacing_mm(slices, settings.gaussian_spacing_pixels)
+    n_gaussians = head_volume_mm3(slices) / spacing_mm**3
+    n_stacks = len(np.unique(slices.stack_id))
+    # a Gaussian reaches so far along a plane's normal, and so many planes of a stack lie within
+    reach_mm = (
+        2
+        * (settings.slice_stage.cutoff_sigma + 1)
+        * math.hypot(0.8 * spacing_mm, float(slices.thickness_mm.max()) / 2.355)
+    )
+    per_stack = reach_mm / float(slices.thickness_mm.min())
+    in_prior = reach_mm / voxel_mm
+    return ProblemSizes(
+        slices.planes.n_pixels, n_stacks, grid.shape, n_voxels,
+        n_voxels * (voxel_mm / settings.resolution_mm) ** 3, n_gaussians,
+        n_gaussians * max(n_stacks * per_stack, in_prior),
+    )  # fmt: skip
+
+
+def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> float:
+    """What the prior network sees at a time."""
+    n_voxels = GRID_SLACK * math.prod(shape)
+    if n_voxels <= settings.prior_whole_voxels:
+        return n_voxels
+    widest = settings.prior_tile_voxels + 2 * settings.prior_halo_voxels
+    return math.prod(min(GRID_SLACK ** (1 / 3) * extent, widest) for extent in shape)
+
+
+def held_bytes() -> int:
+    """What this process holds now."""
+    return _kilobytes(Path("/proc/self/status"), "VmRSS") or USUAL_PROCESS_BYTES
+
+
+def peak_bytes() -> int:
+    """The most that this process has held so far.
+
+    Not `getrusage`, where the system counts this process alone: there a process begins with the peak of the
+    one that started it.
+    """
+    own = _kilobytes(Path("/proc/self/status"), "VmHWM")
+    if own is not None:
+        return own
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def available_bytes() -> int | None:
+    """What the machine could still give; None where it does not tell."""
+    return _kilobytes(Path("/proc/meminfo"), "MemAvailable")
+
+
+def _kilobytes(path: Path, field: str) -> int | None:
+    try:
+        lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return None
+    for line in lines:
+        if line.startswith(f"{field}:"):
+            return int(line.split()[1]) * 1024
+    return None

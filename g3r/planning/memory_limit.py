@@ -1,0 +1,182 @@
+"""Settings that stay below a limit of memory, and what is given up for it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.planning.memory_estimate import (
+    PAIR_BYTES,
+    MemoryEstimate,
+    ProblemSizes,
+    available_bytes,
+    estimate_memory,
+    held_bytes,
+    sizes_of,
+)
+from g3r.planning.memory_size import gigabytes
+from g3r.planning.presets import ReconstructionSettings
+from g3r.run.allocator import can_give_back_at_once, give_back_at_once
+
+logger = logging.getLogger(__name__)
+
+LEAST_RECORD_BYTES = 20_000_000
+STAGES_WITH_RECORDS = ("fit to prior", "fit to slices", "prior share")
+PLANNED_HALO_VOXELS = 48
+PLANNED_TILES = (128, 96, 64, 48, 32, 16)
+"""Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """Settings that stay below a limit.
+
+    settings; their estimate; limit_bytes (None: no limit); what was changed, as sentences for run.json;
+    whether freed memory has to be given back at once (`give_back_at_once`).
+    """
+
+    settings: ReconstructionSettings
+    estimate: MemoryEstimate
+    limit_bytes: int | None
+    changes: list[str]
+    at_once: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """What run.json says."""
+        return {
+            "stated_bytes": self.estimate.peak,
+            "stage": self.estimate.stage,
+            "limit_bytes": self.limit_bytes,
+            "changes": self.changes,
+        }
+
+
+def plan_memory(
+    slices: Slices,
+    settings: ReconstructionSettings,
+    limit_bytes: int | None,
+    n_threads: int = 1,
+    process_bytes: int | None = None,
+) -> MemoryPlan:
+    """Settings that need no more than a limit: what costs seconds goes first, then what costs rounding.
+
+    Args:
+        slices: at their header poses.
+        settings: as they would be without a limit.
+        limit_bytes: None leaves them as they are.
+        n_threads: of the kernels.
+        process_bytes: what the process holds before; as it is now when None.
+
+    Raises:
+        InputError: nothing that may be given up brings it below the limit.
+    """
+    start = held_bytes() if process_bytes is None else process_bytes
+
+    def estimate(of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
+        return estimate_memory(slices, of, n_threads, start, at_once=at_once)
+
+    plan = _lowered(slices, settings, limit_bytes, estimate)
+    needed = plan.estimate
+    if limit_bytes is not None and needed.peak > limit_bytes:
+        remedy = "choose a coarser --resolution, crop the masks, or raise --max-memory"
+        if settings.use_prior:
+            without = _lowered(slices, replace(settings, use_prior=False), limit_bytes, estimate).estimate
+            if without.peak <= limit_bytes:
+                remedy = f"raise --max-memory, or take --no-prior ({gigabytes(without.peak)})"
+        raise InputError(
+            f"--max-memory: needs at least {gigabytes(needed.peak)} ({needed.stage}), the limit is "
+            f"{gigabytes(limit_bytes)}; {remedy}"
+        )
+    return plan
+
+
+def plan_for_stacks(
+    stacks: Sequence[Stack], settings: ReconstructionSettings, limit_bytes: int | None
+) -> MemoryPlan:
+    """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
+
+    Raises:
+        InputError: it does not fit, or the stacks cannot be used.
+    """
+    import numba
+
+    plan = plan_memory(slices_from_stacks(stacks), settings, limit_bytes, numba.get_num_threads())
+    if plan.at_once:
+        give_back_at_once()
+    logger.info(plan.estimate.line())
+    for change in plan.changes:
+        logger.info(change)
+    free, more = available_bytes(), plan.estimate.peak - held_bytes()
+    if limit_bytes is None and free is not None and more > free:
+        logger.warning(
+            "%s more of memory needed, %s available: choose a coarser --resolution or --max-memory",
+            gigabytes(more), gigabytes(free),
+        )  # fmt: skip
+    return plan
+
+
+class Estimator(Protocol):
+    """`estimate_memory` of one problem."""
+
+    def __call__(self, of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
+        """What settings need."""
+        ...
+
+
+def _lowered(
+    slices: Slices, settings: ReconstructionSettings, limit: int | None, estimate: Estimator
+) -> MemoryPlan:
+    """Settings changed until they need no more than the limit, or nothing is left to change."""
+    found = estimate(settings)
+    if limit is None or found.peak <= limit:
+        return MemoryPlan(settings, found, limit, [])
+    changes = []
+    at_once = can_give_back_at_once()
+    if at_once:
+        changes.append("memory limit: freed memory is given back at once (slower)")
+    stages = estimate(settings, at_once).stages
+    with_records = max(stages.get(name, 0) for name in STAGES_WITH_RECORDS)
+    less = _fewer_records(settings, sizes_of(slices, settings), with_records - limit)
+    if less is not settings:
+        kept = less.slice_stage.record_bytes
+        changes.append(f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)")
+    tiled = _smaller_tiles(less, lambda of: estimate(of, at_once).peak, limit)
+    if tiled is not less:
+        edge = tiled.prior_tile_voxels
+        changes.append(f"memory limit: prior network in tiles of {edge} voxels (slower; within 1e-3)")
+    return MemoryPlan(tiled, estimate(tiled, at_once), limit, changes, at_once)
+
+
+def _fewer_records(
+    settings: ReconstructionSettings, sizes: ProblemSizes, excess_bytes: int
+) -> ReconstructionSettings:
+    """Settings whose records of pairs take so many bytes less."""
+    own = round(min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes))
+    kept = max(own - max(excess_bytes, 0), LEAST_RECORD_BYTES)
+    if kept >= own:
+        return settings
+    return replace(
+        settings,
+        prior_stage=replace(settings.prior_stage, record_bytes=kept),
+        slice_stage=replace(settings.slice_stage, record_bytes=kept),
+    )
+
+
+def _smaller_tiles(
+    settings: ReconstructionSettings, peak: Callable[[ReconstructionSettings], int], limit: int
+) -> ReconstructionSettings:
+    best = settings
+    for edge in PLANNED_TILES:
+        if peak(best) <= limit:
+            break
+        tiled = replace(
+            settings, prior_whole_voxels=0, prior_tile_voxels=edge, prior_halo_voxels=PLANNED_HALO_VOXELS
+        )
+        if peak(tiled) < peak(best):
+            best = tiled
+    return best

@@ -1,0 +1,116 @@
+"""What the presets mean: one record of settings for the whole reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from g3r.fitting.adaptive_stage import AdaptiveSettings
+from g3r.fitting.prior_stage import PriorStageSettings
+from g3r.fitting.slice_stage import SliceStageSettings
+from g3r.prior.inference import HALO_VOXELS, MAX_WHOLE_VOXELS, TILE_VOXELS
+from g3r.registration import MotionSettings
+
+ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
+"""About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """Everything that decides a result, besides the data and the prior's weights.
+
+    Args:
+        resolution_mm: voxel size of the volume.
+        gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
+            (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
+        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the
+            whole lattice of that spacing.
+        motion: registration.
+        prior_stage: stage 1.
+        slice_stage: stage 2.
+        prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
+        prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
+        prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
+            tiles; see `estimate_prior`.
+        share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
+        use_prior: False seeds from V_sharp and leaves distillation out.
+        distillation: False uses the prior for the start alone.
+        seed: of every random choice.
+    """
+
+    resolution_mm: float = 0.8
+    gaussian_spacing_pixels: float = 2.14
+    adaptive: AdaptiveSettings | None = ADAPTIVE
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
+    slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
+    prior_views: int = 4
+    prior_voxel_mm: float = 0.8
+    prior_whole_voxels: int = MAX_WHOLE_VOXELS
+    prior_tile_voxels: int = TILE_VOXELS
+    prior_halo_voxels: int = HALO_VOXELS
+    share_probes: int = 2
+    use_prior: bool = True
+    distillation: bool = True
+    seed: int = 0
+
+
+_BALANCED = ReconstructionSettings()
+
+PRESETS: dict[str, ReconstructionSettings] = {
+    "draft": replace(
+        _BALANCED,
+        gaussian_spacing_pixels=2.85,
+        adaptive=None,
+        prior_views=1,
+        share_probes=1,
+        motion=replace(
+            _BALANCED.motion,
+            n_candidates=1200,
+            network_as_reserve=True,
+            stacks=False,
+            attempts=1,
+            n_rounds=5,
+            finest_voxel_mm=1.6,
+            pixels_at_most=200_000,
+        ),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=40),
+    ),
+    "fast": replace(
+        _BALANCED,
+        gaussian_spacing_pixels=2.5,
+        adaptive=None,
+        prior_views=1,
+        motion=replace(_BALANCED.motion, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
+    ),
+    "balanced": _BALANCED,
+    "accurate": replace(
+        _BALANCED,
+        gaussian_spacing_pixels=1.96,
+        adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
+        prior_views=8,
+        motion=replace(_BALANCED.motion, n_rounds=20),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=160),
+    ),
+}
+"""Settings by name, from quick to careful."""
+
+
+def changed(settings: Any, options: Mapping[str, Any]) -> Any:
+    """Settings with some fields replaced; `motion.n_rounds` names a field of a record inside.
+
+    Raises:
+        ValueError: no such field.
+    """
+    for path, value in options.items():
+        name, _, rest = path.partition(".")
+        if not is_dataclass(settings) or name not in {field.name for field in fields(settings)}:
+            raise ValueError(f"{type(settings).__name__} has no field {name!r}")
+        inner = changed(getattr(settings, name), {rest: value}) if rest else value
+        settings = replace(settings, **{name: inner})  # type: ignore[type-var]
+    return settings

@@ -1,0 +1,256 @@
+"""Settings for a time budget: what fits into the seconds that are left, decided stage by stage by the clock.
+
+Before registration only the budget is known, so that it alone decides how registration searches; its loops
+end by the clock. After it the slices are in place, one optimiser step has been timed, and the most careful
+preset is taken whose steps fit. Every loop has a deadline besides, so that an estimate that was wrong costs
+steps and not the time that was promised.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm
+from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
+from g3r.gaussians import GaussianCloud
+from g3r.gaussians.seeding import seed_cloud
+from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.run.deadline import Deadline, Pace
+
+logger = logging.getLogger(__name__)
+
+MOTION_FROM_S = {"draft": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
+"""Budget from which on registration searches as in a preset: about the whole command's own seconds on two
+cores, from one preset to the next."""
+
+MOTION_SHARE = 0.5
+"""Of the time left, the most that registration may take."""
+
+PRIOR_STAGE_SHARE = 0.35
+"""Of the time for both stages of the fit, the most that the first may take."""
+
+STEPS_ENOUGH = 0.7
+"""A preset is taken if so many of its steps fit: more Gaussians than can be fitted are worse than fewer."""
+
+COARSE_PER_VIEW = 1.2
+"""Seconds of one view of the prior network over those of V_coarse and V_sharp on the same voxels."""
+
+VIEWS_SHARE = 0.2
+"""Of the time left, the most that views of the prior beyond the first may take."""
+
+COARSE_AT_END = 0.9
+"""Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
+output of as many voxels; the picture and the files take `WRITING_S` besides."""
+
+WRITING_S = 1.5
+
+TOO_LITTLE = 4.0
+"""With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first."""
+
+SHARE_STEPS = 18
+"""A probe for the map of the prior's share costs as much as so many optimiser steps."""
+
+PROBE_EVERY = 4
+"""Every so many slices are rendered to time a step."""
+
+COST_EXPONENT = 0.6
+"""A step takes seconds as this power of the number of Gaussians in a head: smaller ones have fewer pixels."""
+
+
+@dataclass
+class TimeBudget:
+    """The seconds there are, and what they were spent on.
+
+    Args:
+        deadline: by which files are to be written.
+        given_s: for the record.
+    """
+
+    deadline: Deadline
+    given_s: float
+    choices: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, seconds: float, spent_s: float = 0.0) -> TimeBudget:
+        """A budget of which some seconds are spent already.
+
+        Raises:
+            ValueError: not a positive number.
+        """
+        if not (math.isfinite(seconds) and seconds > 0):
+            raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
+        return cls(replace(Deadline.after(seconds - spent_s), pace=Pace()), seconds)
+
+    @property
+    def missed(self) -> bool:
+        """Whether more was taken than promised: a tenth and two seconds over the budget."""
+        return self.deadline.remaining_s < -(0.1 * self.given_s + 2.0)
+
+    def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
+        """Settings with the registration of the preset that the budget allows, and its deadline."""
+        left = self.deadline.remaining_s
+        name = max((n for n, least in MOTION_FROM_S.items() if self.given_s >= least), key=MOTION_FROM_S.get)  # type: ignore[arg-type]
+        chosen = replace(
+            PRESETS[name].motion,
+            standard_orientation=settings.motion.standard_orientation,
+            seed=settings.motion.seed,
+        )
+        self.choices["motion"] = name
+        logger.info("time budget: %.0f s left, registration as in %s", left, name)
+        return replace(settings, motion=chosen), self.deadline.part(MOTION_SHARE)
+
+    def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
+        """Settings with as many views of the prior as fit, at most those of `accurate`.
+
+        Args:
+            settings: so far.
+            coarse_s: what V_coarse and V_sharp took.
+        """
+        view_s = COARSE_PER_VIEW * coarse_s
+        views = int(VIEWS_SHARE * max(0.0, self.deadline.remaining_s) / view_s) if view_s > 0 else 1
+        views = min(max(1, views), PRESETS["accurate"].prior_views)
+        self.choices["prior_views"] = views
+        return replace(settings, prior_views=views)
+
+    def for_fit(
+        self,
+        settings: ReconstructionSettings,
+        start: FitStart,
+        prior: NDArray[np.float32],
+        coarse_s: float,
+        n_output_voxels: int,
+        rng: np.random.Generator,
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        """Settings with the Gaussians and steps that fit, and the deadlines of both stages.
+
+        Args:
+            settings: so far.
+            start: posed slices and their volumes.
+            prior: [I, J, K] on the start's grid.
+            coarse_s: what making the start took.
+            n_output_voxels: of the volume to be written.
+            rng: for the steps that are timed.
+        """
+        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
+        if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
+            return self._hurried(settings, after_s + (coarse_s if settings.use_prior else 0.0))
+        probed = PRESETS["fast"].gaussian_spacing_pixels
+        cloud = seed_cloud(prior, start.mask, start.grid, gaussian_spacing_mm(start.slices, probed))
+        step_s = timed_step(cloud, start.slices, rng)
+        careful_first = [name for name in reversed(PRESETS) if name != "draft"]
+        for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
+            reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
+            left = max(0.0, self.deadline.remaining_s - reserve_s)
+            fitting = (
+                n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left
+            )
+            chosen = next(fitting, "draft")
+            if chosen != "draft":
+                break
+        self.choices |= {
+            "fit": chosen, "step_s": round(step_s, 4), "n_gaussians_timed": len(cloud),
+            "reserve_s": round(reserve_s, 2), "left_s": round(left, 2),
+        }  # fmt: skip
+        logger.info("time budget: %.0f s left for the fit, Gaussians as in %s", left, chosen)
+        return self._chosen(settings, chosen, probes, reserve_s)
+
+    def _hurried(
+        self, settings: ReconstructionSettings, reserve_s: float
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        """For when timing a step would take the time of the steps themselves."""
+        self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
+        logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
+        return self._chosen(settings, "draft", PRESETS["draft"].share_probes, reserve_s)
+
+    def _chosen(
+        self, settings: ReconstructionSettings, name: str, probes: int, reserve_s: float
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        preset = PRESETS[name]
+        settings = replace(
+            settings, gaussian_spacing_pixels=preset.gaussian_spacing_pixels, adaptive=preset.adaptive,
+            share_probes=probes,
+            prior_stage=replace(preset.prior_stage, record_bytes=settings.prior_stage.record_bytes),
+            slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
+        )  # fmt: skip
+        both = self.deadline.part(1.0, reserve_s)
+        return settings, both.part(PRIOR_STAGE_SHARE), both
+
+    def record(self) -> dict[str, Any]:
+        """For run.json."""
+        pace = self.deadline.pace
+        return {"seconds": self.given_s, **self.choices, "pace": pace.loops if pace else []}
+
+
+class RepeatedBudget(TimeBudget):
+    """A run with a time budget once more, without a clock: the settings are known, loops do what they did.
+
+    Args:
+        record: what `TimeBudget.record` said of the run.
+    """
+
+    def __init__(self, record: Mapping[str, Any]) -> None:
+        told = {name: value for name, value in record.items() if name not in ("seconds", "pace")}
+        deadline = Deadline(pace=Pace(record["pace"], repeating=True))
+        super().__init__(deadline, record["seconds"], told)
+
+    def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
+        """The settings as they are."""
+        return settings, self.deadline
+
+    def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
+        """The settings as they are."""
+        return settings
+
+    def for_fit(
+        self, settings: ReconstructionSettings, *known: Any
+    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
+        """The settings as they are."""
+        return settings, self.deadline, self.deadline
+
+
+def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:
+    """What both stages would take with the settings of a preset.
+
+    Args:
+        preset: whose spacing, rounds and steps.
+        step_s: seconds of a step of the slice stage on a lattice.
+        spacing_probed: of that lattice.
+    """
+    number = (spacing_probed / preset.gaussian_spacing_pixels) ** 3
+    step = step_s * number**COST_EXPONENT
+    adaptive = preset.adaptive
+    if adaptive is None:
+        first = PRIOR_STEP * (preset.prior_stage.n_steps + preset.prior_stage.peak_iterations)
+    else:
+        rounds = adaptive.n_rounds + 1
+        last = preset.prior_stage.n_steps if adaptive.last_steps is None else adaptive.last_steps
+        first = PRIOR_STEP * (adaptive.n_rounds * adaptive.round_steps + last)
+        first += PEAK_STEP * rounds * adaptive.peak_iterations
+    stage = preset.slice_stage
+    return step * (first + PEAK_STEP * stage.peak_iterations + stage.n_steps)
+
+
+PRIOR_STEP, PEAK_STEP = 0.35, 0.8
+"""Seconds of a step of stage 1, and of one conjugate-gradient step for the peaks, over a step of stage 2."""
+
+
+def timed_step(cloud: GaussianCloud, slices: Slices, rng: np.random.Generator) -> float:
+    """Seconds of one step of the slice stage, from a few steps on a part of the slices."""
+    part = slices.take(np.arange(0, len(slices), min(PROBE_EVERY, max(1, len(slices) // 4))))
+    ones = np.ones(len(part))
+    seconds = []
+    for n_steps in (1, 1, 4):  # the first loads the kernels; the last difference leaves out the set-up
+        settings = SliceStageSettings(n_steps=n_steps, peak_iterations=0)
+        start = time.perf_counter()
+        fit_slices(cloud, part, ones, ones, None, settings, rng)
+        seconds.append(time.perf_counter() - start)
+    return max(1e-6, (seconds[-1] - seconds[-2]) / 3) * len(slices) / len(part)

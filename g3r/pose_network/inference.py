@@ -1,0 +1,150 @@
+"""From slices to poses in the atlas frame with a trained pose network."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slice_images import SliceImages, slice_images
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import fit_rigid, orthonormal
+
+if TYPE_CHECKING:
+    from g3r.pose_network.checkpoint import PoseCheckpoint
+    from g3r.pose_network.network import PoseNetwork, SliceBatch
+
+SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0], [25, 25, 0]], dtype=float)
+"""Points of a slice over which a pose error is averaged."""
+N_REFINEMENTS = 2
+VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
+"""Turns by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
+
+The network sees all four and the answers are averaged, which takes a fifth off the error.
+"""
+VIEW_SCALE_MM = 3.0
+"""Views further than this from the mean count less in it, in proportion."""
+TURN_ARM_MM = 25.0
+"""At this distance from a slice's centre a turn is measured in mm."""
+ROBUST_SCALE_MM = 3.0
+"""Slices further than this from their stack's common motion count less in it, in proportion."""
+ROBUST_STEPS = 12
+
+
+def predict_poses(
+    network: "PoseNetwork",
+    meta: "PoseCheckpoint",
+    slices: Slices,
+    time_rank: NDArray[np.float64] | None = None,
+) -> RigidPose:
+    """Pose of each slice's own frame (as `slices.planes.pose`) in the atlas frame.
+
+    Args:
+        network: trained, in evaluation mode.
+        meta: what its file says about it.
+        slices: of all stacks; only their header poses are used.
+        time_rank: [K] order of acquisition in each stack from 0 to 1, if it is known.
+
+    Returns:
+        K poses. They do not change if all headers are moved by one rigid motion, and permuting slices or
+        stacks permutes them.
+    """
+    images = slice_images(slices, meta.pixel_mm, meta.image_size)
+    if time_rank is not None:
+        images = replace(images, time_rank=np.asarray(time_rank, dtype=float))
+    return poses_of(network, slice_batch([images])) @ images.frame_in_slice.inverse()
+
+
+def poses_of(network: "PoseNetwork", batch: "SliceBatch") -> RigidPose:
+    """Poses of the images of a batch in the atlas frame, averaged over four views of every slice."""
+    rotation, translation = [], []
+    for view in VIEWS:
+        turn = torch.diag(torch.tensor(view, dtype=batch["image"].dtype, device=batch["image"].device))
+        seen = dict(batch)
+        seen["image"] = batch["image"].flip([2 + axis for axis in (0, 1) if view[axis] < 0])
+        seen["header_rotation"] = batch["header_rotation"] @ turn
+        seen["position_mm"] = batch["position_mm"] * view[2]
+        with torch.no_grad():
+            last = network(seen, N_REFINEMENTS)[-1]
+        rotation.append((last.rotation @ turn).double().cpu().numpy())
+        translation.append(last.translation_mm.double().cpu().numpy())
+    return mean_pose(np.stack(rotation), np.stack(translation))
+
+
+def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]) -> RigidPose:
+    """The pose [K] that several estimates [V, K, 3, 3], [V, K, 3] agree on; far ones count little."""
+    weight = np.ones(rotation.shape[:2])
+    for _ in range(ROBUST_STEPS):
+        share = (weight / weight.sum(0))[..., None]
+        mean_rotation = orthonormal((share[..., None] * rotation).sum(0))
+        mean_translation = (share * translation_mm).sum(0)
+        turned = np.linalg.norm(rotation - mean_rotation, axis=(2, 3)) / np.sqrt(2) * TURN_ARM_MM
+        off = turned + np.linalg.norm(translation_mm - mean_translation, axis=2)
+        weight = 1 / np.maximum(off, VIEW_SCALE_MM)
+    return RigidPose(mean_rotation, mean_translation)
+
+
+def slice_batch(sets: Sequence[SliceImages]) -> "SliceBatch":
+    """The slices of several heads as one dict of tensors; stacks are numbered through all of them."""
+    n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
+    first = np.cumsum([0, *n_stacks])
+    batch = {
+        name: torch.from_numpy(np.concatenate([getattr(one, name) for one in sets]).astype(np.float32))
+        for name in ("image", "area_mm2", "position_mm", "thickness_mm", "time_rank", "header_rotation")
+    }
+    batch["image"] = batch["image"][:, None]
+    stack = np.concatenate([one.stack_id + first[k] for k, one in enumerate(sets)])
+    batch["stack"] = torch.from_numpy(stack)
+    batch["set_of_stack"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor(n_stacks))
+    return batch
+
+
+def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:
+    """A network's float32 motions as exact ones."""
+    return RigidPose(orthonormal(rotation.double().cpu().numpy()), translation_mm.double().cpu().numpy())
+
+
+def stack_motions(
+    atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]
+) -> RigidPose:
+    """One motion per stack, atlas frame from world, that most of its slices agree with.
+
+    The start is the slice whose own motion suits the others best in the median, so that a minority of
+    slices that are upside down has no say; then weighted least squares with weights 1 / distance.
+
+    Args:
+        atlas_from_slice: predicted poses [K].
+        world_from_slice: the headers' poses [K] of the same frames.
+        stack_id: [K] 0, 1, ... without gaps.
+    """
+    points = np.broadcast_to(SLICE_POINTS_MM, (len(stack_id), *SLICE_POINTS_MM.shape))
+    predicted, header = atlas_from_slice.apply(points), world_from_slice.apply(points)
+    own = atlas_from_slice @ world_from_slice.inverse()
+    rotation, translation = [], []
+    for stack in range(int(stack_id.max()) + 1):
+        rows = np.flatnonzero(stack_id == stack)
+        source, target = header[rows], predicted[rows]
+        candidates = own.take(rows)
+        moved = candidates.apply(np.broadcast_to(source.reshape(-1, 3), (len(rows), source[..., 0].size, 3)))
+        distance = np.linalg.norm(moved - target.reshape(-1, 3), axis=-1).reshape(len(rows), len(rows), -1)
+        best = int(np.median(distance.mean(-1), axis=1).argmin())
+        motion = candidates.take([best])
+        for _ in range(ROBUST_STEPS):
+            off = np.linalg.norm(motion.apply(source.reshape(1, -1, 3))[0] - target.reshape(-1, 3), axis=-1)
+            weight = 1 / np.maximum(off.reshape(len(rows), -1).mean(1), ROBUST_SCALE_MM)
+            motion = fit_rigid(
+                source.reshape(-1, 3), target.reshape(-1, 3), np.repeat(weight, len(SLICE_POINTS_MM))
+            )
+        rotation.append(motion.rotation[0])
+        translation.append(motion.translation_mm[0])
+    return RigidPose(np.array(rotation), np.array(translation))
+
+
+def pose_errors(predicted: RigidPose, true: RigidPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean distance (mm) of five slice points, and angle (degrees), of each of K poses."""
+    points = np.broadcast_to(SLICE_POINTS_MM, (len(true), *SLICE_POINTS_MM.shape))
+    distance_mm = np.linalg.norm(predicted.apply(points) - true.apply(points), axis=-1).mean(1)
+    return distance_mm, np.rad2deg(np.linalg.norm((predicted.inverse() @ true).rotvec_rad(), axis=1))

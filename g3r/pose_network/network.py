@@ -1,0 +1,323 @@
+"""The pose network: a set transformer over all slices of all stacks that puts each into the atlas frame."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from monai.networks.blocks import Convolution, ResidualUnit, TransformerBlock
+from torch import Tensor, nn
+
+from g3r.pose_network.geometry import (
+    best_age,
+    group_mean,
+    moved_points,
+    nearest_rotation,
+    pixel_points_mm,
+    rotation_from_vector,
+    sample_rows,
+    scattered,
+    smoothed,
+)
+
+WAVELENGTHS_MM = (200.0, 100.0, 50.0, 25.0)
+"""Of the codes of a slice's position along its stack."""
+TRANSLATION_SCALE_MM = 20.0
+RESIDUAL_SCALE_RAD = 0.3
+RESIDUAL_SCALE_MM = 8.0
+COARSE_SHAPE, COARSE_SPACING_MM = 28, 5.0
+N_CODES = 2 * len(WAVELENGTHS_MM) + 5
+N_POSE_CODES = 12
+SIDE_MM = 4.0
+"""How far beside the slice's plane a refinement also looks at the mean head."""
+N_SEEN = 7
+
+SliceBatch = Mapping[str, Tensor]
+"""`image` [S, 1, N, N], `area_mm2`, `position_mm`, `thickness_mm`, `time_rank` [S] (NaN: unknown),
+`stack` [S] (numbered through all sets), `set_of_stack` [G], `header_rotation` [S, 3, 3]: see `SliceImages`
+and `g3r.pose_network.inference.slice_batch`."""
+
+
+Disturbance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Takes rotations [S, 3, 3] and translations [S, 3] (mm) to others."""
+
+
+class PoseStep(NamedTuple):
+    """What one step of the network says: poses atlas frame from image frame, and the votes behind them.
+
+    Attributes:
+        rotation: [S, 3, 3].
+        translation_mm: [S, 3].
+        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less sure, the smaller.
+    """
+
+    rotation: Tensor
+    translation_mm: Tensor
+    vote: Tensor
+
+
+class Encoder(nn.Module):
+    """Slice image to token: MONAI's residual units, and a linear layer that still knows what lay where.
+
+    Args:
+        channels: of the three halvings of the image.
+        width: of the token.
+        image_size: pixels per edge, a multiple of 8.
+        extra_channels: further channels at half the image's resolution.
+    """
+
+    def __init__(self, channels: Sequence[int], width: int, image_size: int, extra_channels: int = 0) -> None:
+        super().__init__()
+        first, second, third = channels
+        self.stem = Convolution(2, 1, first, strides=2, kernel_size=3, act="relu", norm="batch")
+        self.extra = (
+            Convolution(2, extra_channels, first, kernel_size=3, act="relu", norm="batch")
+            if extra_channels
+            else None
+        )
+        into = first * (2 if extra_channels else 1)
+        self.body = nn.Sequential(
+            ResidualUnit(2, into, second, strides=2, subunits=2, act="relu", norm="batch"),
+            ResidualUnit(2, second, third, strides=2, subunits=2, act="relu", norm="batch"),
+        )
+        self.token = nn.Linear(third * (image_size // 8) ** 2, width)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, image: Tensor, extra: Tensor | None = None) -> Tensor:
+        """Tokens [S, width] of images [S, 1, N, N] and, if so built, [S, E, N / 2, N / 2]."""
+        # bfloat16 halves the time of a training step; the poses are always computed in float32
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.training):
+            # a convolution on a CPU is faster with channels innermost
+            features = self.stem(image.to(memory_format=torch.channels_last))
+            if self.extra is not None and extra is not None:
+                features = torch.cat([features, self.extra(extra)], 1)
+            token = self.token(self.body(features).flatten(1))
+        return token.float()
+
+
+class SetTransformer(nn.Module):
+    """Tokens of slices to votes: attention in turn among the slices of a stack and among those of a head.
+
+    Args:
+        width: of a token.
+        n_codes: numbers that describe a slice beside its image.
+        n_blocks: transformer blocks; the even ones see one stack, the odd ones all stacks of the head.
+        n_heads: attention heads.
+    """
+
+    def __init__(self, width: int, n_codes: int, n_blocks: int, n_heads: int) -> None:
+        super().__init__()
+        self.code = nn.Sequential(nn.Linear(n_codes, width), nn.ReLU(), nn.Linear(width, width))
+        self.blocks = nn.ModuleList(
+            TransformerBlock(width, 2 * width, n_heads, use_flash_attention=True) for _ in range(n_blocks)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.vote = nn.Linear(width, 18)
+        nn.init.normal_(self.vote.weight, std=0.01)
+        nn.init.zeros_(self.vote.bias)
+
+    def forward(self, token: Tensor, code: Tensor, same_stack: Tensor, same_set: Tensor) -> Tensor:
+        """Votes [S, 18]: rotation of the stack (9), its shift (3), the slice's own turn (3) and shift (3)."""
+        x = (token + self.code(code))[None]
+        for number, block in enumerate(self.blocks):
+            x = block(x, attn_mask=(same_set if number % 2 else same_stack)[None, None])
+        return self.vote(self.norm(x[0]))
+
+
+class PoseNetwork(nn.Module):
+    """Poses of slices in the atlas frame, by a first guess and refinements.
+
+    Nothing but rotations between stacks is taken from the headers, so turning all of them together changes
+    nothing, and neither does the order of slices or stacks. In each step every slice votes for a rotation and
+    shift of its stack; votes of a stack are summed, those of other stacks added through the header's
+    rotations between stacks (first step) or as they are (refinements), and the sum is made a rotation. Then
+    every slice moves a little on its own. Refinements see, at the current poses, the template's mean head of
+    the best age and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
+
+    Args:
+        template_shape: [A, I, J, K] of the template.
+        template_spacing_mm: its voxel size.
+        image_size: N, pixels per edge of a slice image.
+        pixel_mm: edge of these pixels.
+        channels: of the encoder.
+        width: of a token.
+        n_blocks: transformer blocks per step.
+        n_heads: attention heads.
+        n_refinements: refinements with the same weights.
+    """
+
+    template: Tensor
+
+    def __init__(
+        self,
+        template_shape: Sequence[int],
+        template_spacing_mm: float = 3.0,
+        image_size: int = 40,
+        pixel_mm: float = 3.0,
+        channels: Sequence[int] = (24, 48, 96),
+        width: int = 128,
+        n_blocks: int = 3,
+        n_heads: int = 4,
+        n_refinements: int = 1,
+    ) -> None:
+        super().__init__()
+        if (
+            len(template_shape) != 4
+            or image_size % 8
+            or len(channels) != 3
+            or width % n_heads
+            or n_refinements < 1
+        ):
+            raise ValueError(
+                f"got {template_shape=}, {image_size=}, {channels=}, {width=}, {n_heads=}, {n_refinements=}"
+            )
+        self._arguments: dict[str, Any] = {
+            "template_shape": [int(n) for n in template_shape],
+            "template_spacing_mm": float(template_spacing_mm),
+            "image_size": int(image_size),
+            "pixel_mm": float(pixel_mm),
+            "channels": [int(n) for n in channels],
+            "width": int(width),
+            "n_blocks": int(n_blocks),
+            "n_heads": int(n_heads),
+            "n_refinements": int(n_refinements),
+        }
+        self.pixel_mm, self.image_size, self.n_refinements = pixel_mm, image_size, n_refinements
+        self.template_spacing_mm = template_spacing_mm
+        ages, *shape = [int(n) for n in template_shape]
+        # [I, J, K, A]: all ages of a voxel side by side, as sampling wants them
+        self.register_buffer("template", torch.zeros(*shape, ages))
+        self.encoder = Encoder(channels, width, image_size)
+        self.transformer = SetTransformer(width, N_CODES, n_blocks, n_heads)
+        self.refining_encoder = Encoder(channels, width, image_size, N_SEEN)
+        self.refining_transformer = SetTransformer(width, N_CODES + N_POSE_CODES, n_blocks, n_heads)
+        # how much the votes of all stacks count beside the stack's own, in the first step and in refinements
+        self.log_share = nn.Parameter(torch.zeros(2))
+
+    def arguments(self) -> dict[str, Any]:
+        """Constructor arguments, in plain values."""
+        return dict(self._arguments)
+
+    def set_template(self, volume: Tensor) -> None:
+        """Take over mean heads [A, I, J, K] on a grid about the origin; only A is built into the network.
+
+        Raises:
+            ValueError: another number of heads.
+        """
+        if len(volume) != self._arguments["template_shape"][0]:
+            raise ValueError(f"{len(volume)} mean heads; expected {self._arguments['template_shape'][0]}")
+        self._arguments["template_shape"] = list(volume.shape)
+        self.template = volume.permute(1, 2, 3, 0).contiguous().to(self.template)
+
+    def forward(
+        self, batch: SliceBatch, n_refinements: int | None = None, disturb: Disturbance | None = None
+    ) -> list[PoseStep]:
+        """The first guess and what each refinement makes of it.
+
+        Args:
+            batch: slices of one or more heads.
+            n_refinements: None takes the constructor's.
+            disturb: changes the poses that a refinement starts from, in training.
+        """
+        # mixed precision is the encoder's own affair: around it, poses and points keep float32
+        with torch.autocast(batch["image"].device.type, enabled=False):
+            return self._steps(batch, n_refinements, disturb)
+
+    def _steps(
+        self, batch: SliceBatch, n_refinements: int | None, disturb: Disturbance | None
+    ) -> list[PoseStep]:
+        stack, set_of_stack = batch["stack"], batch["set_of_stack"]
+        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
+        same_stack = stack[:, None] == stack
+        of_set = set_of_stack[stack]
+        same_set = of_set[:, None] == of_set
+        code = slice_codes(batch)
+        header = group_mean(batch["header_rotation"].to(code.dtype), stack, n_stacks)
+
+        vote = self.transformer(self.encoder(batch["image"]), code, same_stack, same_set)
+        votes = vote[:, :9].reshape(-1, 3, 3)
+        matrix = group_mean(votes, stack, n_stacks)
+        # each stack's vote, carried over to the others of its head by the headers
+        carried = group_mean(matrix @ header.transpose(1, 2), set_of_stack, n_sets)[set_of_stack] @ header
+        rotation = nearest_rotation(matrix + self.log_share[0].exp() * carried)[stack]
+        shift = group_mean(vote[:, 9:12], stack, n_stacks)[stack] * TRANSLATION_SCALE_MM
+        along = batch["position_mm"].to(code.dtype)[:, None]
+        steps = [PoseStep(*_with_residual(rotation, shift + rotation[:, :, 2] * along, vote[:, 12:]), votes)]
+
+        for _ in range(self.n_refinements if n_refinements is None else n_refinements):
+            rotation, translation = steps[-1].rotation.detach(), steps[-1].translation_mm.detach()
+            if disturb is not None:
+                rotation, translation = disturb(rotation, translation)
+            seen = self._seen_at(rotation, translation, batch)
+            pose_code = torch.cat([rotation.flatten(1), translation / 50.0], 1)
+            token = self.refining_encoder(batch["image"], seen)
+            vote = self.refining_transformer(token, torch.cat([code, pose_code], 1), same_stack, same_set)
+            # the pose that a refinement starts from has a vote of its own
+            votes = torch.eye(3, dtype=code.dtype, device=code.device) + vote[:, :9].reshape(-1, 3, 3)
+            matrix = group_mean(votes, stack, n_stacks)
+            shared = group_mean(matrix, set_of_stack, n_sets)[set_of_stack]
+            turn = nearest_rotation(matrix + self.log_share[1].exp() * shared)[stack]
+            shift = group_mean(vote[:, 9:12], stack, n_stacks)[stack] * TRANSLATION_SCALE_MM
+            moved = (turn @ translation[..., None])[..., 0] + shift
+            steps.append(PoseStep(*_with_residual(turn @ rotation, moved, vote[:, 12:]), votes @ rotation))
+        return steps
+
+    @torch.no_grad()
+    def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
+        """What the template and the other stacks show at the slices' poses, [S, N_SEEN, N / 2, N / 2].
+
+        The mean head of the age that suits a set's slices best, in the slice's plane and beside it, and a
+        coarse volume of the other stacks; both also as differences from the slice.
+        """
+        half = self.image_size // 2
+        value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
+        plane = pixel_points_mm(half, 2 * self.pixel_mm, value)
+        stack, set_of_stack = batch["stack"], batch["set_of_stack"]
+        heads = smoothed(self.template.permute(3, 0, 1, 2))
+        points = moved_points(rotation, translation_mm, plane)
+        # a quarter of the pixels is enough to tell an age
+        some = sample_rows(heads.permute(1, 2, 3, 0), points[:, ::4], self.template_spacing_mm)
+        age = best_age(some, value[:, ::4], set_of_stack[stack], int(set_of_stack.max()) + 1)
+        head = [
+            sample_rows(
+                heads[..., None],
+                moved_points(rotation, translation_mm, plane + plane.new_tensor([0.0, 0.0, side_mm])),
+                self.template_spacing_mm,
+                age[set_of_stack[stack]],
+            )
+            for side_mm in (-SIDE_MM, 0.0, SIDE_MM)
+        ]
+        mean, known = self._others_at(points, value, stack, set_of_stack)
+        slice_ = value[..., None]
+        seen = torch.cat([*head, slice_ - head[1], mean, (slice_ - mean) * known, known], -1)
+        return seen.reshape(len(value), half, half, -1).permute(0, 3, 1, 2)
+
+    def _others_at(
+        self, points_mm: Tensor, value: Tensor, stack: Tensor, set_of_stack: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Coarse volume of the head's other stacks at the pixels [S, P, 1], and where it is known, 0 to 1."""
+        n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
+        weight = (value > 0).to(value.dtype)
+        sums = scattered(points_mm, value, weight, stack, n_stacks, COARSE_SHAPE, COARSE_SPACING_MM)
+        per_set = sums.new_zeros(n_sets, *sums.shape[1:]).index_add(0, set_of_stack, sums)
+        others = per_set[set_of_stack] - sums
+        coarse = sample_rows(others, points_mm, COARSE_SPACING_MM, stack)
+        weight = coarse[..., 1:].clamp_min(0)
+        return coarse[..., :1] / (weight + 0.02), weight / (weight + 0.1)
+
+
+def slice_codes(batch: SliceBatch) -> Tensor:
+    """What is known of a slice beside its image [S, N_CODES]: position, thickness, area, rank in time."""
+    image = batch["image"]
+    position, thickness, area, rank = (
+        batch[name].to(image.dtype) for name in ("position_mm", "thickness_mm", "area_mm2", "time_rank")
+    )
+    phase = position[:, None] * (2 * torch.pi / position.new_tensor(WAVELENGTHS_MM))
+    known = torch.isfinite(rank)
+    plain = [position / 50.0, thickness / 5.0, area / 5000.0, torch.where(known, 2 * rank - 1, 0.0), known]
+    return torch.cat([torch.sin(phase), torch.cos(phase), torch.stack([p.to(phase) for p in plain], 1)], 1)
+
+
+def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:
+    """A stack's pose of each slice, followed by the slice's own turn and shift in its own frame."""
+    shift = (rotation @ (vote[:, 3:] * RESIDUAL_SCALE_MM)[..., None])[..., 0]
+    return rotation @ rotation_from_vector(vote[:, :3] * RESIDUAL_SCALE_RAD), translation_mm + shift

@@ -1,0 +1,166 @@
+"""Runs of slices between jerks: the most likely sequence of motions in time, among candidates.
+
+A fetus lies still, jerks, and lies still again. So the motions of a stack's slices, in the order of their
+acquisition, are a few constant runs with small changes inside. Given what each slice costs under each
+candidate motion, dynamic programming finds the sequence with the least sum of these costs and of a price for
+every change, which grows with how far the head would have moved (Viterbi 1967). It needs no threshold for
+what a jerk is, and says at the same time how the stack was interleaved: the order in which the motions
+change least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.interleave import acquisition_order
+from g3r.geometry import RigidPose
+
+INTERLEAVES = (1, 2, 3)
+"""Acquisition orders that are tried; the first of equals is taken."""
+
+HEAD_RADIUS_MM = 30.0
+"""Half of a typical head's diameter, by which turns are compared with shifts."""
+
+CHANGE_PRICE = 6.0
+"""Cost (a logarithm of odds) of any change of motion from one slice in time to the next."""
+DISTANCE_PRICE = 8.0
+"""Further cost of a change by d mm: this times log(1 + (d / STEADY_MM)^2); heavy-tailed, as jerks are."""
+STEADY_MM = 4.0
+"""Below about this, movement between slices is ordinary."""
+
+SAME_PLACE_MM = 1e-3
+"""Motions nearer to each other than this are one."""
+
+WINDOW = 5
+"""Slices in time that are looked at together when candidates are chosen."""
+BEST_PER_WINDOW = 6
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The chosen candidate of each slice.
+
+    Args:
+        choice: [K] candidate of each slice, in the order of the slices given.
+        interleave: the acquisition order under which that was cheapest.
+        cost: of the whole sequence.
+        n_runs: constant pieces of it.
+    """
+
+    choice: NDArray[np.int64]
+    interleave: int
+    cost: float
+    n_runs: int = 1
+
+
+def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
+    """For each interleave the slices of one stack [K] in the order of their acquisition.
+
+    Args:
+        slice_index: [K] numbers of the slices in their stack, of which some may be missing.
+    """
+    place = {int(number): k for k, number in enumerate(slice_index)}
+    n = int(slice_index.max()) + 1
+    return {
+        interleave: np.array([place[q] for q in acquisition_order(n, interleave).tolist() if q in place])
+        for interleave in INTERLEAVES
+    }
+
+
+def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square distance [A, B] between where motions a and b take a ball of `HEAD_RADIUS_MM`.
+
+    For a ball of radius r about the center, mean |(R_a - R_b) x|^2 = 2 (3 - trace(R_a^T R_b)) r^2 / 5.
+    """
+    place_a = a.rotation @ center_mm + a.translation_mm
+    place_b = b.rotation @ center_mm + b.translation_mm
+    shift = ((place_a[:, None] - place_b[None]) ** 2).sum(-1)
+    trace = np.einsum("aij,bij->ab", a.rotation, b.rotation, optimize=True)
+    return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+
+
+def best_runs(
+    cost: NDArray[np.float64],
+    motion: RigidPose,
+    slice_index: NDArray[np.int64],
+    center_mm: NDArray[np.float64],
+    keep: NDArray[np.int64] | None = None,
+) -> Runs:
+    """The cheapest sequence of candidate motions for one stack.
+
+    Args:
+        cost: [K, J] of slice k under candidate j (negative log likelihood).
+        motion: J candidate motions of the world.
+        slice_index: [K] numbers of the slices in their stack.
+        center_mm: [3] centre of the head before the motions.
+        keep: candidates that must be considered besides those that `promising` picks.
+    """
+    orders = time_orders(slice_index)
+    chosen = promising(cost, orders)
+    if keep is not None:
+        chosen = np.union1d(chosen, keep)
+    motion, cost = motion.take(chosen), cost[:, chosen]
+    price = _price(head_distance_mm(motion, motion, center_mm))
+    np.fill_diagonal(price, 0.0)
+    best: Runs | None = None
+    for interleave, order in orders.items():
+        path, total = cheapest_path(cost[order], price)
+        if best is None or total < best.cost:
+            choice = np.empty(len(cost), np.int64)
+            choice[order] = chosen[path]
+            best = Runs(choice, interleave, total, 1 + int((np.diff(path) != 0).sum()))
+    assert best is not None
+    return best
+
+
+def _price(distance_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    return CHANGE_PRICE + DISTANCE_PRICE * np.log1p((distance_mm / STEADY_MM) ** 2)
+
+
+def changes_in_time(
+    motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64], interleave: int
+) -> NDArray[np.float64]:
+    """How far the head moved [K - 1] (mm) between slices of a stack that were taken one after the other."""
+    ordered = motion.take(time_orders(slice_index)[interleave])
+    place = ordered.rotation @ center_mm + ordered.translation_mm
+    shift = (np.diff(place, axis=0) ** 2).sum(1)
+    trace = np.einsum("tij,tij->t", ordered.rotation[:-1], ordered.rotation[1:])
+    return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+
+
+def price_of_changes(distance_mm: NDArray[np.float64]) -> float:
+    """Price of all movements [K - 1] (mm) of a stack; none costs nothing."""
+    return float(_price(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
+
+
+def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Candidates that are among the best of some window of slices in time, or of some slice alone."""
+    n = len(cost)
+    width = min(WINDOW, n)
+    count = min(BEST_PER_WINDOW, cost.shape[1])
+    found = [cost.argmin(1)]
+    for order in orders.values():
+        running = np.concatenate([np.zeros((1, cost.shape[1])), np.cumsum(cost[order], axis=0)])
+        for first in {*range(0, n - width + 1, 2), n - width}:
+            window = running[first + width] - running[first]
+            found.append(np.argpartition(window, count - 1)[:count])
+    return np.unique(np.concatenate(found))
+
+
+def cheapest_path(cost: NDArray[np.float64], price: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+    """The path [T] with the least sum of costs [T, J] and prices [J, J] of changes, and that sum."""
+    n, n_states = cost.shape
+    total = cost[0].astype(np.float64)
+    came_from = np.zeros((n, n_states), np.int64)
+    for t in range(1, n):
+        through = total[:, None] + price
+        came_from[t] = through.argmin(0)
+        total = through[came_from[t], np.arange(n_states)] + cost[t]
+    path = np.empty(n, np.int64)
+    path[-1] = total.argmin()
+    for t in range(n - 1, 0, -1):
+        path[t - 1] = came_from[t, path[t]]
+    return path, float(total.min())

@@ -1,0 +1,214 @@
+"""Slice-to-volume registration: batched damped Gauss-Newton of all slices, robust, with gain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import orthonormal, rotation_matrix
+from g3r.registration.normal_equations import NormalEquations, SliceModel
+
+LARGEST_TURN_RAD, LARGEST_SHIFT_MM = 0.06, 2.0
+"""Trust region of one step of a slice."""
+
+GAIN_PRIOR_SIGMA = 0.3
+"""Spread of the logarithm of slice gains before the image speaks (a prior; keeps dark slices finite)."""
+
+NEIGHBOURS = (-2, -1, 1, 2)
+
+TIE_SHARE = 0.01
+"""Stiffness of the tie between neighbours, as a share of the median slice's own stiffness: a slice through
+the middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
+
+TIE_REACH_MM = 3.0
+"""Neighbours that would put a slice further away than this count less: after a jerk, and between the passes
+of an interleaved stack, neighbours lie elsewhere for good reason."""
+
+
+def register_slices(
+    model: SliceModel,
+    slices: Slices,
+    gain: NDArray[np.float64],
+    *,
+    n_steps: int,
+    width: float,
+) -> tuple[Slices, NDArray[np.float64], NormalEquations]:
+    """Levenberg-Marquardt steps for every slice at once, each with a damping of its own.
+
+    Args:
+        model: the slices' pixels and the volume.
+        slices: K slices at their present poses.
+        gain: [K] present intensity factors.
+        n_steps: number of evaluations.
+        width: residual at which the Cauchy loss bends.
+
+    Returns:
+        Slices in new poses, new gains, and the statistics at them.
+    """
+    pose = slices.planes.pose
+    log_gain = np.log(gain)
+    damping = np.full(len(slices), 1e-2)
+    current = model.evaluate(slices.planes, gain, width)
+    tie = NeighbourTie.of(slices, current)
+    for _ in range(n_steps):
+        step = _solve(current, log_gain, damping, width, tie, pose)
+        trial_pose = RigidPose(
+            orthonormal(pose.rotation @ rotation_matrix(step[:, :3])),
+            pose.translation_mm + np.einsum("kij,kj->ki", pose.rotation, step[:, 3:6]),
+        )
+        trial_log_gain = log_gain + step[:, 6]
+        trial = model.evaluate(slices.planes.with_pose(trial_pose), np.exp(trial_log_gain), width)
+        better = _objective(trial, width) + tie.cost(trial_pose) < _objective(current, width) + tie.cost(pose)
+        pose = _choose(better, trial_pose, pose)
+        log_gain = np.where(better, trial_log_gain, log_gain)
+        current = _choose_equations(better, trial, current)
+        damping = np.where(better, np.maximum(damping / 3, 1e-4), damping * 6)
+    return slices.with_pose(pose), np.exp(log_gain - log_gain.mean()), current
+
+
+def try_neighbours(
+    model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, width: float
+) -> tuple[Slices, int]:
+    """Offer every slice the motions of its neighbours in the stack, and keep what fits clearly better.
+
+    A slice that locked on wrongly sees no gradient towards its place; its neighbours mostly lie there.
+
+    Returns:
+        The slices, and how many took another motion.
+    """
+    motion = slices.world_from_header()
+    best_pose = slices.planes.pose
+    current = model.evaluate(slices.planes, gain, width).loss
+    best = current.copy()
+    for step in NEIGHBOURS:
+        source = np.arange(len(slices)) + step
+        valid = (source >= 0) & (source < len(slices))
+        source = np.where(valid, source, np.arange(len(slices)))
+        valid &= slices.stack_id[source] == slices.stack_id
+        source = np.where(valid, source, np.arange(len(slices)))
+        candidate = motion.take(source) @ slices.header_pose
+        loss = model.evaluate(slices.planes.with_pose(candidate), gain, width).loss
+        # a margin, because each slice helped to make the volume and so prefers its present place
+        better = valid & (loss < 0.97 * best)
+        best_pose = _choose(better, candidate, best_pose)
+        best = np.where(better, loss, best)
+    return slices.with_pose(best_pose), int((best < current).sum())
+
+
+@dataclass(frozen=True)
+class NeighbourTie:
+    """A spring from every slice to where its neighbours in the stack would put it.
+
+    target [K]: mean of the neighbours' motions, weighted by how well each is determined, applied to the
+    slice's header pose; precision [K, 6] of the spring for turns (1/rad^2) and shifts (1/mm^2), in the units
+    of the squared residuals.
+    """
+
+    target: RigidPose
+    precision: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, slices: Slices, equations: NormalEquations) -> NeighbourTie:
+        """Ties for the present poses."""
+        n = len(slices)
+        motion = slices.world_from_header()
+        pose = slices.planes.pose
+        information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
+        # a turn is judged by how far it moves the slice's rim; slices of a few pixels have hardly any
+        half_mm = slices.planes.shape * slices.planes.spacing_mm / 2
+        radius_mm = np.maximum(np.sqrt((half_mm**2).mean(1)), 10.0)
+        rotation = np.zeros((n, 3, 3))
+        translation, total = np.zeros((n, 3)), np.zeros(n)
+        for step in NEIGHBOURS:
+            source = np.arange(n) + step
+            valid = (source >= 0) & (source < n)
+            source = np.clip(source, 0, n - 1)
+            valid &= slices.stack_id[source] == slices.stack_id
+            candidate = motion.take(source) @ slices.header_pose
+            turn = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
+            away_mm = np.hypot(
+                np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1), radius_mm * turn
+            )
+            weight = np.where(valid, information[source] / (1 + (away_mm / TIE_REACH_MM) ** 2), 0.0)
+            rotation += weight[:, None, None] * candidate.rotation
+            translation += weight[:, None] * candidate.translation_mm
+            total += weight
+        alone = total <= 0
+        safe = np.where(alone, 1.0, total)
+        target = RigidPose(
+            orthonormal(np.where(alone[:, None, None], pose.rotation, rotation / safe[:, None, None])),
+            np.where(alone[:, None], pose.translation_mm, translation / safe[:, None]),
+        )
+        stiffness = np.where(alone, 0.0, TIE_SHARE * float(np.median(information)))
+        precision = np.stack([stiffness * radius_mm**2, stiffness], axis=1)
+        return cls(target, np.repeat(precision, 3, axis=1))
+
+    def twist(self, pose: RigidPose) -> NDArray[np.float64]:
+        """Body-frame turn and shift [K, 6] from poses to the target."""
+        back = pose.rotation.transpose(0, 2, 1)
+        turn = Rotation.from_matrix(back @ self.target.rotation).as_rotvec()
+        shift = np.einsum("kij,kj->ki", back, self.target.translation_mm - pose.translation_mm)
+        return np.concatenate([turn, shift], axis=1)
+
+    def cost(self, pose: RigidPose) -> NDArray[np.float64]:
+        """Energy of the springs [K]."""
+        return 0.5 * (self.precision * self.twist(pose) ** 2).sum(1)
+
+
+def _objective(equations: NormalEquations, width: float) -> NDArray[np.float64]:
+    """Cauchy loss of each slice [K] as half a sum of squares where residuals are small."""
+    return 0.5 * width**2 * equations.loss * equations.moments[:, 0]
+
+
+def _solve(
+    equations: NormalEquations,
+    log_gain: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    width: float,
+    tie: NeighbourTie,
+    pose: RigidPose,
+) -> NDArray[np.float64]:
+    hessian, gradient = equations.hessian.copy(), equations.gradient.copy()
+    precision = (width / GAIN_PRIOR_SIGMA) ** 2
+    hessian[:, 6, 6] += precision
+    gradient[:, 6] -= precision * log_gain
+    gradient[:, :6] += tie.precision * tie.twist(pose)
+    hessian[:, np.arange(6), np.arange(6)] += tie.precision
+    diagonal = np.einsum("kii->ki", hessian)
+    # relative to the largest turn or shift, so that an edge slice without contrast stays where it is
+    floor = np.repeat([1e-3, 1e-3, 1.0], [3, 3, 1]) * np.repeat(
+        np.stack([diagonal[:, :3].max(1), diagonal[:, 3:6].max(1), diagonal[:, 6]], 1), [3, 3, 1], axis=1
+    )
+    hessian += np.eye(7) * (damping[:, None] * diagonal + floor * 1e-2 + 1e-20)[:, None, :]
+    step = np.asarray(np.linalg.solve(hessian, gradient[..., None])[..., 0], dtype=np.float64)
+    step[:, :3] *= _limit(step[:, :3], LARGEST_TURN_RAD)
+    step[:, 3:6] *= _limit(step[:, 3:6], LARGEST_SHIFT_MM)
+    step[:, 6] = np.clip(step[:, 6], -0.3, 0.3)
+    return step
+
+
+def _limit(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.minimum(1.0, longest / np.maximum(length, 1e-30))
+
+
+def _choose(take_first: NDArray[np.bool_], first: RigidPose, second: RigidPose) -> RigidPose:
+    return RigidPose(
+        np.where(take_first[:, None, None], first.rotation, second.rotation),
+        np.where(take_first[:, None], first.translation_mm, second.translation_mm),
+    )
+
+
+def _choose_equations(
+    take_first: NDArray[np.bool_], first: NormalEquations, second: NormalEquations
+) -> NormalEquations:
+    chosen = []
+    for name in ("hessian", "gradient", "loss", "moments"):
+        a, b = getattr(first, name), getattr(second, name)
+        chosen.append(np.where(take_first.reshape(-1, *(1,) * (a.ndim - 1)), a, b))
+    return NormalEquations(*chosen)

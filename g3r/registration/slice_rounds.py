@@ -1,0 +1,157 @@
+"""Volume and slices in turns: every slice a rigid body of its own, coarse to fine."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.least_squares import solve_volume
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import VolumeGrid
+from g3r.registration.normal_equations import SliceModel
+from g3r.registration.slice_registration import register_slices, try_neighbours
+from g3r.run.deadline import Deadline, paced
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SliceRounds:
+    """How long slices are registered.
+
+    Args:
+        n_rounds: alternations of volume and slices.
+        steps_per_round: Gauss-Newton steps of the slices in a round.
+        finest_voxel_mm: voxel of the last rounds.
+        pixels_at_most: masked pixels in use; larger subjects are thinned on coarse levels.
+    """
+
+    n_rounds: int
+    steps_per_round: int
+    finest_voxel_mm: float
+    pixels_at_most: int
+
+
+LEAST_ROUNDS = 3
+"""One round for each voxel size, however little time there is."""
+
+
+@dataclass(frozen=True)
+class FittedSlices:
+    """Slices at their last poses with gain, weight and correlation [K], and a line of figures a round."""
+
+    slices: Slices
+    gain: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    ncc: NDArray[np.float64]
+    history: list[dict[str, float]]
+
+
+def refine_slices(
+    slices: Slices,
+    rounds: SliceRounds,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    deadline: Deadline | None = None,
+) -> FittedSlices:
+    """Register every slice to the volume of all, which is made anew in each round.
+
+    Args:
+        slices: at poses right to a few millimetres.
+        rounds: how long.
+        progress: called with (rounds done, rounds in all).
+        deadline: fewer rounds if they would end after it.
+    """
+    gain = np.ones(len(slices))
+    weight = np.ones(len(slices))
+    volume: NDArray[np.float32] | None = None
+    grid: VolumeGrid | None = None
+    history: list[dict[str, float]] = []
+    for number, done in paced(rounds.n_rounds, deadline, least=LEAST_ROUNDS):
+        progress(number, rounds.n_rounds)
+        # the last round has 1; rounded, so that the steps below do not hang on the last digit
+        fraction = round(min(1.0, done * rounds.n_rounds / max(1, rounds.n_rounds - 1)), 9)
+        # coarse to fine: the capture range is about a voxel of the volume's blur
+        voxel = rounds.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
+        smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
+        if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
+            grid, volume = grid_around(slices, voxel), None
+        n_wanted = rounds.pixels_at_most / (voxel / rounds.finest_voxel_mm)
+        stride = max(1, round(len(slices.pixel_index) / n_wanted))
+        volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
+        model = SliceModel(slices, volume, grid, stride=stride)
+        residual = model.residuals(slices.planes, gain)
+        width = 2 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+        moved = 0
+        if 0.1 < fraction < 0.8:
+            slices, moved = try_neighbours(model, slices, gain, width=width)
+        slices, gain, fit = register_slices(model, slices, gain, n_steps=rounds.steps_per_round, width=width)
+        weight = slice_weights(fit.loss)
+        history.append(
+            {"round": number, "voxel_mm": voxel, "residual": width / 2,
+             "median_ncc": float(np.median(fit.ncc)), "moved": moved}
+        )  # fmt: skip
+        logger.info(
+            "slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved
+        )
+    progress(rounds.n_rounds, rounds.n_rounds)
+    ncc = correlation_with_all(slices, gain, weight, rounds.finest_voxel_mm)
+    return FittedSlices(slices, gain, weight, ncc, history)
+
+
+LARGEST_DROPPED_SHARE = 0.2
+"""At most so many slices may weigh less than `DROPPED_WEIGHT`; where more do not fit, poses are at fault."""
+DROPPED_WEIGHT = 0.1
+
+
+def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Trust in each slice [K], going down smoothly where its mean robust loss stands out.
+
+    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
+    `DROPPED_WEIGHT` for at most `LARGEST_DROPPED_SHARE` of the slices.
+    """
+    median = np.median(loss)
+    spread = 1.4826 * np.median(np.abs(loss - median)) + 0.05 * median + 1e-12
+    excess = np.maximum(0.0, (loss - median) / spread - 2.0)
+    weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
+    n_dropped = int(LARGEST_DROPPED_SHARE * len(weight))
+    by_weight = np.argsort(weight, kind="stable")
+    kept = by_weight[n_dropped:]
+    weight[kept] = np.maximum(weight[kept], DROPPED_WEIGHT)
+    return weight
+
+
+def _volume_of(
+    slices: Slices,
+    grid: VolumeGrid,
+    gain: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    start: NDArray[np.float32] | None,
+    smoothness: float,
+    stride: int,
+) -> NDArray[np.float32]:
+    index = slices.pixel_index[::stride]
+    operator = VoxelOperator(slices.planes, grid, index, (1, 1, 5))
+    value = slices.value[index] / gain[operator.plane]
+    pixel_weight = weight[operator.plane].astype(np.float32)
+    if start is not None:  # pixels far from the present volume (spikes, signal loss) count less
+        residual = value - operator.forward(start)
+        width = 3 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+        pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
+    return solve_volume(
+        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
+    )
+
+
+def correlation_with_all(
+    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
+) -> NDArray[np.float64]:
+    """Correlation of each slice [K] with a volume made of all of them."""
+    grid = grid_around(slices, voxel_mm)
+    volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
+    return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc

@@ -1,0 +1,281 @@
+"""Training of the pose network."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from g3r.errors import InputError
+from g3r.geometry import RigidPose
+from g3r.pose_network.geometry import moved_points, pixel_points_mm, rotation_from_vector, sample_rows
+from g3r.pose_network.inference import SLICE_POINTS_MM, as_pose, pose_errors, poses_of, stack_motions
+from g3r.pose_network.network import PoseNetwork, PoseStep
+from g3r.training.annealed_module import AnnealedModule, describe_data
+
+logger = logging.getLogger(__name__)
+
+Batch = Mapping[str, Tensor]
+"""A `SliceBatch` with `true_rotation` [S, 3, 3] and `true_translation_mm` [S, 3]."""
+
+POSE_EXPORT_KEY = "g3r_pose"
+"""Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
+FULL_AREA_MM2 = 600.0
+"""Slices of less area count less in the loss."""
+SECOND_REFINEMENT_SHARE = 0.2
+"""Share of training batches that refine twice, so that a refinement also knows good poses."""
+DISTURBED_SHARE = 0.6
+"""Share of heads whose poses are disturbed before a refinement, by at most these deviations per axis."""
+STACK_TURN_RAD, STACK_SHIFT_MM = 0.3, 6.0
+SLICE_TURN_RAD, SLICE_SHIFT_MM = 0.1, 2.5
+VOTE_WEIGHT_MM = 10.0
+"""Weight of the votes' squared error (0 to 3, no unit) beside the distances."""
+N_PANEL_SLICES = 12
+RIGHT_WITHIN_DEG = 20.0
+
+
+class PoseModule(AnnealedModule):
+    """Supervised training of the pose network against the slices' true poses.
+
+    Loss: mean distance in mm of five points of a slice (its centre and (+-25, +-25) mm) between predicted and
+    true pose, over all steps of the network; slices with little in their mask count less. To it comes the
+    squared error of every slice's vote, which teaches a vote to be the mean over what the slice may be: long
+    where it is sure, short where it is not.
+
+    The poses that a refinement starts from are disturbed: on heads that it is trained on, the first guess is
+    better than it will be on others.
+
+    The template of mean heads comes from the data module's `template()`.
+
+    Args:
+        channels: see `PoseNetwork`.
+        width: see `PoseNetwork`.
+        n_blocks: see `PoseNetwork`.
+        n_heads: see `PoseNetwork`.
+        learning_rate: peak rate of AdamW.
+        weight_decay: of AdamW.
+        warmup_steps: steps of linear warm-up.
+        n_ages: number of mean heads in the data module's template.
+        start_from: training checkpoint whose weights to begin with.
+
+    Raises:
+        ValueError: a rate out of range, or from the network.
+    """
+
+    network: PoseNetwork
+
+    def __init__(
+        self,
+        channels: Sequence[int] = (24, 48, 96),
+        width: int = 128,
+        n_blocks: int = 3,
+        n_heads: int = 4,
+        learning_rate: float = 1e-3,
+        weight_decay: float = 1e-3,
+        warmup_steps: int = 200,
+        n_ages: int = 6,
+        start_from: str | None = None,
+    ) -> None:
+        super().__init__(learning_rate, weight_decay, warmup_steps)
+        self.save_hyperparameters()
+        self.network = PoseNetwork(
+            (n_ages, 2, 2, 2), channels=channels, width=width, n_blocks=n_blocks, n_heads=n_heads
+        )
+        if start_from is not None:
+            self._take_weights(Path(start_from))
+        self.weeks: list[float] = []
+        self._training_data = "not recorded"
+        self._scores: list[dict[str, np.ndarray]] = []
+        self._panel: Tensor | None = None
+
+    def forward(self, batch: Batch) -> list[PoseStep]:
+        """Poses after each step; see `PoseNetwork.forward`."""
+        return self.network(batch)
+
+    def n_samples(self, batch: Batch) -> int:
+        """Heads of a batch."""
+        return int(batch["set_of_stack"].max()) + 1
+
+    # ---- training -------------------------------------------------------------------------------------
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the mean point distance of one batch over all steps, and log it for each."""
+        n_refinements = 2 if torch.rand(()) < SECOND_REFINEMENT_SHARE else 1
+
+        def disturb(rotation: Tensor, translation_mm: Tensor) -> tuple[Tensor, Tensor]:
+            return disturbed(rotation, translation_mm, batch["stack"], batch["set_of_stack"])
+
+        steps = self.network(batch, n_refinements, disturb)
+        losses = [point_loss(step, batch) for step in steps]
+        votes = [vote_loss(step, batch) for step in steps]
+        for number in range(2):
+            n_samples = self.n_samples(batch)
+            self.log(f"train/mm_step{number}", losses[number], prog_bar=True, batch_size=n_samples)
+            self.log(f"train/vote_step{number}", votes[number], batch_size=n_samples)
+        return torch.stack(losses).mean() + VOTE_WEIGHT_MM * torch.stack(votes).mean()
+
+    # ---- validation -----------------------------------------------------------------------------------
+
+    def on_validation_epoch_start(self) -> None:
+        """Forget the last epoch's scores."""
+        self._scores = []
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Score one head: errors of slices, as inference finds them, and of stacks after the robust fit."""
+        steps = self.network(batch)
+        self._scores.append(scores_of(as_pose(*steps[0][:2]), poses_of(self.network, batch), batch))
+        self.log("val/mm_loss", point_loss(steps[-1], batch), batch_size=1)
+        if batch_idx == 0:
+            self._panel = panel(steps[-1], batch, self.network)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log medians over all slices and stacks, and by the number of stacks; send the row of images."""
+        for name, value in summary(self._scores).items():
+            self.log(f"val/{name}", value, prog_bar=name == "slice_mm")
+        for board in self.loggers:
+            if isinstance(board, TensorBoardLogger) and self._panel is not None:
+                board.experiment.add_image(
+                    "val/slices, and the template where they are put",
+                    self._panel,
+                    global_step=self.global_step,
+                    dataformats="HW",
+                )
+
+    # ---- what an export needs -------------------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        """Take the template and a description from the data module.
+
+        Raises:
+            InputError: the data module makes images of another size, or mean heads of another number of ages.
+        """
+        data: Any = getattr(self.trainer, "datamodule", None)
+        settings = dict(getattr(data, "hparams", None) or {})
+        for name in ("pixel_mm", "image_size"):
+            mine, theirs = getattr(self.network, name), settings.get(name)
+            if theirs is not None and theirs != mine:
+                raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
+        self._training_data = describe_data(data, settings)
+        if hasattr(data, "template"):
+            template = data.template()
+            n_ages = self.network.arguments()["template_shape"][0]
+            if len(template) != n_ages:
+                raise InputError(
+                    f"model.n_ages: {n_ages}, but the data have mean heads of {len(template)} ages; "
+                    f"pass --model.n_ages {len(template)}"
+                )
+            self.network.set_template(torch.from_numpy(template.volume))
+            self.weeks = [float(week) for week in template.weeks]
+
+    def _take_weights(self, path: Path) -> None:
+        """Begin with the weights of another run where they fit; the template comes from the data module."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+            own = self.network.state_dict()
+            taken = {name.removeprefix("network."): value for name, value in state.items()}
+            taken = {name: v for name, v in taken.items() if name in own and v.shape == own[name].shape}
+            fresh = sorted(own.keys() - taken.keys() - {"template"})
+            if fresh:
+                logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
+            self.network.load_state_dict({**own, **taken, "template": own["template"]})
+        except Exception as error:  # torch.load says "damaged" in many types
+            raise InputError(
+                f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
+                "checkpoint of a pose network"
+            ) from error
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the description from which `g3r-export` makes a pose checkpoint, in plain values only."""
+        metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
+        checkpoint[POSE_EXPORT_KEY] = {
+            "network_arguments": self.network.arguments(),
+            "weeks": self.weeks,
+            "training_data": self._training_data,
+            "optimiser_steps": int(self.global_step),
+            "validation": {name: value for name, value in metrics.items() if name.startswith("val/")},
+        }
+
+
+def point_loss(step: PoseStep, batch: Batch) -> Tensor:
+    """Mean distance (mm) of five slice points from where they truly are, a scalar."""
+    rotation, translation_mm, _ = step
+    points = torch.as_tensor(SLICE_POINTS_MM, dtype=rotation.dtype, device=rotation.device)
+    true = moved_points(batch["true_rotation"], batch["true_translation_mm"], points)
+    distance = ((moved_points(rotation, translation_mm, points) - true).square().sum(-1) + 1e-4).sqrt()
+    weight = (batch["area_mm2"] / FULL_AREA_MM2).clamp(0.1, 1.0)
+    return (weight[:, None] * distance).mean() / weight.mean()
+
+
+def disturbed(
+    rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Poses with errors of a random size for each head: common to a stack, and of each slice."""
+    n_stacks, n_sets, n = len(set_of_stack), int(set_of_stack.max()) + 1, len(stack)
+
+    def normal(rows: int) -> Tensor:
+        return torch.randn(rows, 3, dtype=rotation.dtype, device=rotation.device)
+
+    chosen = torch.rand(2, n_sets, 1, dtype=rotation.dtype, device=rotation.device)
+    size = chosen[0] * (chosen[1] < DISTURBED_SHARE)
+    of_stack, of_slice = size[set_of_stack], size[set_of_stack[stack]]
+    turn = rotation_from_vector(normal(n_stacks) * of_stack * STACK_TURN_RAD)[stack]
+    shift = (normal(n_stacks) * of_stack * STACK_SHIFT_MM)[stack]
+    moved = (turn @ translation_mm[..., None])[..., 0] + shift
+    own = rotation_from_vector(normal(n) * of_slice * SLICE_TURN_RAD)
+    return turn @ rotation @ own, moved + normal(n) * of_slice * SLICE_SHIFT_MM
+
+
+def vote_loss(step: PoseStep, batch: Batch) -> Tensor:
+    """Mean squared distance (Frobenius) of the slices' votes from their true rotations, a scalar."""
+    weight = (batch["area_mm2"] / FULL_AREA_MM2).clamp(0.1, 1.0)
+    squared = (step.vote - batch["true_rotation"]).square().sum((1, 2))
+    return (weight * squared).mean() / weight.mean()
+
+
+def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.ndarray]:
+    """Errors of one head's slices (mm, degrees) after the first step and at last, and of its stacks."""
+    true = as_pose(batch["true_rotation"], batch["true_translation_mm"])
+    stack = batch["stack"].cpu().numpy()
+    rotation = batch["header_rotation"].double().cpu().numpy()
+    header = as_pose(
+        batch["header_rotation"],
+        torch.from_numpy(rotation[:, :, 2] * batch["position_mm"].double().cpu().numpy()[:, None]),
+    )
+    fitted, ideal = stack_motions(last, header, stack), stack_motions(true, header, stack)
+    middle = RigidPose(rotation[np.unique(stack, return_index=True)[1]], np.zeros((stack.max() + 1, 3)))
+    slice_mm, slice_deg = pose_errors(last, true)
+    stack_mm, stack_deg = pose_errors(fitted @ middle, ideal @ middle)
+    return {
+        "slice_mm": slice_mm,
+        "slice_deg": slice_deg,
+        "slice_mm_first": pose_errors(first, true)[0],
+        "stack_mm": stack_mm,
+        "stack_deg": stack_deg,
+    }
+
+
+def summary(scores: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
+    """Medians over all heads, and of slices and stacks for each number of stacks."""
+    result = {name: float(np.median(np.concatenate([s[name] for s in scores]))) for name in scores[0]}
+    angles = np.concatenate([s["stack_deg"] for s in scores])
+    result["stacks_within_20deg"] = float((angles <= RIGHT_WITHIN_DEG).mean())
+    for n_stacks in sorted({len(s["stack_deg"]) for s in scores}):
+        some = [s for s in scores if len(s["stack_deg"]) == n_stacks]
+        for name in ("slice_mm", "slice_deg", "stack_mm", "stack_deg"):
+            result[f"{name}_{n_stacks}"] = float(np.median(np.concatenate([s[name] for s in some])))
+    return result
+
+
+def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
+    """Slices of the first head above what a mean head shows at their poses, [H, W] in [0, 1]."""
+    rows = torch.linspace(0, len(batch["image"]) - 1, N_PANEL_SLICES).round().long().unique()
+    image = batch["image"][rows, 0].float().cpu()
+    points = pixel_points_mm(network.image_size, network.pixel_mm, pose[0])
+    where = moved_points(pose[0][rows], pose[1][rows], points)
+    heads = sample_rows(network.template, where, network.template_spacing_mm)
+    shown = heads[..., heads.shape[-1] // 2].reshape(image.shape).float().cpu()
+    return torch.cat([torch.cat(list(image), 1), torch.cat(list(shown), 1)], 0).clamp(0.0, 1.0)

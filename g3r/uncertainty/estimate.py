@@ -1,0 +1,144 @@
+"""uncertainty.nii.gz: the expected absolute error of each voxel of the volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.fitting.slice_stage import SliceFit
+from g3r.geometry import VolumeGrid
+from g3r.uncertainty.error_model import ErrorModel, load_calibration
+from g3r.uncertainty.predictors import gather_evidence, mean_residual
+from g3r.uncertainty.prior_share import on_grid
+
+CALIBRATION = Path(__file__).parent / "calibration.json"
+
+WITH_PRIOR, WITHOUT_PRIOR = "with prior", "without prior"
+"""Names of the two calibrations: for reconstructions that used a prior, and for those that did not."""
+
+MEANING = "expected absolute error of volume.nii.gz, in its intensity units"
+
+MOSTLY_PRIOR = 0.5
+"""A voxel whose prior share is larger shows more of the prior than of the slices."""
+
+DOUBTED_NOTE = (
+    "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
+)
+UNCHECKED_NOTE = "a single stack: nothing but the prior checks where its slices lie"
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The map and what run.json says about it.
+
+    Attributes:
+        expected_error: [I, J, K] in the volume's intensities; zero outside the mask.
+        record: median and 90th percentile in the mask, units, calibration, doubts.
+    """
+
+    expected_error: NDArray[np.float32]
+    record: dict[str, Any]
+
+
+def estimate_uncertainty(
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    grid: VolumeGrid,
+    fit: SliceFit,
+    *,
+    prior: NDArray[np.float32],
+    density: NDArray[np.float32],
+    prior_grid: VolumeGrid,
+    prior_share: NDArray[np.float32] | None = None,
+    with_prior: bool = True,
+    intensity: float = 1.0,
+    trusted: bool | None = True,
+) -> Uncertainty:
+    """The expected absolute error of every voxel of the mask.
+
+    A product of powers of what is known without the truth, with coefficients fitted to simulated subjects
+    (`python -m studies.uncertainty.calibration fit`). It is a mean over voxels that look alike to the pipeline, not a
+    bound: errors of single voxels scatter around it about as an exponential distribution does.
+
+    Args:
+        volume: [I, J, K] normalised intensities.
+        mask: [I, J, K].
+        grid: of both.
+        fit: Gaussians and slices as the fit left them, in the volume's intensities.
+        prior: on `prior_grid`, normalised intensities; what the fit started from where no network was used.
+        density: M_rho on `prior_grid`.
+        prior_grid: of these two.
+        prior_share: [I, J, K] on `grid`; None where no network was used.
+        with_prior: whether one was used: there is a calibration for each.
+        intensity: what 1 stands for; the map is multiplied by it.
+        trusted: whether the registration is; None where nothing checks it.
+    """
+    evidence = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
+    name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
+    found = uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
+    if prior_share is not None:
+        found.record["prior_share"] = prior_share_summary(prior_share[mask])
+    return found
+
+
+def collect(
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    grid: VolumeGrid,
+    fit: SliceFit,
+    prior: NDArray[np.float32],
+    density: NDArray[np.float32],
+    prior_grid: VolumeGrid,
+    prior_share: NDArray[np.float32] | None,
+) -> dict[str, NDArray[np.float64]]:
+    """The evidence on the voxels of the mask; see `estimate_uncertainty` for the arguments."""
+    return gather_evidence(
+        volume, mask, grid,
+        residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.shading, grid),
+        density=on_grid(density, prior_grid, grid, outside=0.0),
+        prior=on_grid(prior, prior_grid, grid, outside=0.0),
+        prior_share=prior_share,
+    )  # fmt: skip
+
+
+def uncertainty_of(
+    evidence: dict[str, NDArray[np.float64]],
+    model: ErrorModel,
+    name: str,
+    mask: NDArray[np.bool_],
+    intensity: float,
+    trusted: bool | None,
+) -> Uncertainty:
+    """The map of one model, and its record."""
+    error = model.expected(evidence)
+    expected = np.zeros(mask.shape, np.float32)
+    expected[mask] = error * intensity
+    record: dict[str, Any] = {
+        "meaning": MEANING,
+        "median_in_mask": float(np.median(error)) * intensity,
+        "p90_in_mask": float(np.percentile(error, 90)) * intensity,
+        "median_over_brightest": float(np.median(error)),
+        "calibration": name,
+        "registration_trusted": trusted,
+    }
+    if trusted is not True:
+        record["note"] = UNCHECKED_NOTE if trusted is None else DOUBTED_NOTE
+    return Uncertainty(expected, record)
+
+
+def prior_share_summary(share: NDArray[np.float32]) -> dict[str, float]:
+    """What run.json says of prior_share.nii.gz: its mean over the mask's voxels, and how many rest on it."""
+    if not share.size:
+        return {"mean_in_mask": 0.0, "mask_mostly_prior": 0.0}
+    return {"mean_in_mask": float(share.mean()), "mask_mostly_prior": float((share > MOSTLY_PRIOR).mean())}
+
+
+@cache
+def calibration() -> dict[str, ErrorModel]:
+    """The models that ship with the package."""
+    return load_calibration(CALIBRATION)[0]

@@ -1,0 +1,1 @@
+"""Whether lesions survive the prior (docs/prior.md)."""

@@ -1,0 +1,1 @@
+"""Registration measured: the tables of docs/motion.md."""

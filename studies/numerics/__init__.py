@@ -1,0 +1,1 @@
+"""Errors at the extremes: the tables of docs/numerics.md."""

@@ -1,0 +1,172 @@
+"""`python -m studies.numerics.tables`: errors at the extremes, as the tables of docs/numerics.md."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from g3r.bench.record import machine, markdown_table, put_between_markers, write_json
+from studies.command import run_command
+from studies.numerics.errors import (
+    THICKNESSES_MM,
+    distance_rows,
+    gradient_rows,
+    gradient_tolerance,
+    pixel_rows,
+    shape_rows,
+    shape_tolerance,
+    size_rows,
+)
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.numerics.tables", description="Errors at the extremes, swept and tabulated.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
+    parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "numerics")
+    parser.add_argument("--only", choices=TABLES, nargs="+", help="some of the tables (None: all)")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command("numerics", _run, build_parser().parse_args(argv))
+
+
+def _run(options: argparse.Namespace) -> int:
+    logging.getLogger("g3r.fitting.divergence_guard").setLevel(logging.ERROR)  # its table says it
+    record: dict[str, Any] = {"machine": machine(), "tables": {}}
+    for name in options.only or TABLES:
+        make, table = TABLES[name]
+        rows = make()
+        record["tables"][name] = rows
+        text = table(rows)
+        print(f"{name}\n\n{text}\n", flush=True)
+        if options.docs:
+            put_between_markers(options.docs, f"numerics-{name}", text)
+    write_json(options.output / "numerics.json", record)
+    return 0
+
+
+def shown(value: float) -> str:
+    """Two digits; what is not finite in words."""
+    return f"{value:.1e}" if math.isfinite(value) else "not finite"
+
+
+def shape_table(rows: Rows) -> str:
+    """Errors of values by axis ratio."""
+    names = (
+        "float64", "reference float32", "numba", "naive float32", "naive float32, epsilon", "naive float64"
+    )  # fmt: skip
+    return markdown_table(
+        ["", "axis ratio", *names, "bound for float32"],
+        [[_place(row), f"{row['ratio']:g}", *(shown(row[name]) for name in names),
+          shown(shape_tolerance(row["ratio"]))] for row in rows],
+    )  # fmt: skip
+
+
+def gradient_table(rows: Rows) -> str:
+    """Errors of gradients by axis ratio."""
+    names = ("centre", "shape", "peak", "turn", "shift", "gain")
+    return markdown_table(
+        ["", "axis ratio", *names, "bound"],
+        [[_place(row), f"{row['ratio']:g}", *(shown(row[name]) for name in names),
+          shown(gradient_tolerance(row["ratio"]))] for row in rows],
+    )  # fmt: skip
+
+
+def size_table(rows: Rows) -> str:
+    """Errors of values by size and thickness."""
+    thick = [f"{t:g}" for t in (0.0, *THICKNESSES_MM)]
+    head = ["sigma, mm", "V(x)", *(f"slices of {t} mm" for t in thick[1:]), "V(x) with 1e-8 mm^6"]
+    return markdown_table(
+        head, [[f"{row['sigma_mm']:g}", *(shown(row[t]) for t in (*thick, "epsilon"))] for row in rows]
+    )
+
+
+def pixel_table(rows: Rows) -> str:
+    """Mass that samples show, by sigma over pixel."""
+
+    def pair(row: Mapping[str, Any], name: str, low: str, high: str) -> str:
+        return f"{row[f'{name} {low}']:.3g} to {row[f'{name} {high}']:.3g}"
+
+    return markdown_table(
+        ["sigma over pixel", "volume", "by the formula", "slices", "by the formula"],
+        [[f"{row['ratio']:g}",
+          *(pair(row, name, low, high) for name in ("volume", "slices")
+            for low, high in (("least", "most"), ("lower bound", "upper bound")))] for row in rows],
+    )  # fmt: skip
+
+
+def distance_table(rows: Rows) -> str:
+    """Errors of values by distance from the world's origin."""
+    names = ("reference float64", "reference float32", "numba", "naive float32")
+    return markdown_table(
+        ["distance, m", *names],
+        [[f"{row['distance_m']:g}", *(shown(row[name]) for name in names)] for row in rows],
+    )
+
+
+def change_rows() -> Rows:
+    """See `volume_changes`; imported late, because it brings the whole pipeline."""
+    from studies.numerics.fits import volume_changes
+
+    return volume_changes()
+
+
+def change_table(rows: Rows) -> str:
+    """What whole reconstructions make of changes that ought to change nothing."""
+    return markdown_table(
+        ["change of the input", "mean change", "largest change", "mean error against the truth"],
+        [[row["change"], *(shown(row[name]) for name in ("mean", "largest")), f"{row['error']:.4f}"]
+         for row in rows],
+    )  # fmt: skip
+
+
+def step_rows() -> Rows:
+    """See `step_size_rows`."""
+    from studies.numerics.fits import step_size_rows
+
+    return step_size_rows()
+
+
+def step_table(rows: Rows) -> str:
+    """Fits whose step sizes are too large."""
+
+    def number(value: float) -> str:
+        return f"{value:.4f}" if math.isfinite(value) else "no result"
+
+    return markdown_table(
+        ["step sizes", "safeguard", "steps back", "loss at the start", "largest loss", "residual at the end"],
+        [[f"x {row['factor']:g}", "on" if row["guarded"] else "off", row["back"],
+          *(number(row[name]) for name in ("first", "most", "residual"))] for row in rows],
+    )  # fmt: skip
+
+
+def _place(row: Mapping[str, Any]) -> str:
+    return "slices" if row["psf"] else "V(x)"
+
+
+TABLES: dict[str, tuple[Any, Any]] = {
+    "shape": (shape_rows, shape_table),
+    "gradient": (gradient_rows, gradient_table),
+    "size": (size_rows, size_table),
+    "pixel": (pixel_rows, pixel_table),
+    "distance": (distance_rows, distance_table),
+    "steps": (step_rows, step_table),
+    "changes": (change_rows, change_table),
+}
+"""Rows and their table, by the name of the markers in docs/numerics.md."""
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

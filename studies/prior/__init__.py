@@ -1,0 +1,1 @@
+"""The prior measured: the tables of docs/prior.md."""

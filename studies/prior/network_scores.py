@@ -1,0 +1,109 @@
+"""How trained variants of the prior network are judged: errors by number of stacks, seconds, size."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import TYPE_CHECKING, Any
+
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+LEFT_OUT = ("sta24", "sta30", "sta34")
+VALIDATED_ON = ("*-operated",)
+"""Subjects of the atlas: the first are for judging, the second choose, the rest train."""
+
+SPEED_SHAPE = (129, 152, 130)
+"""Voxels of a 36-week brain at 0.8 mm with its margin (`studies.prior.alone`)."""
+
+REPEATS = 3
+EXPORTED = "prior.pt"
+
+
+def validation_volumes(
+    source: Path, cache: Path, val_subjects: int, config: Mapping[str, Any]
+) -> list[dict[str, Tensor]]:
+    """The volumes that every variant is compared on: those that its training validated on."""
+    from data_synth.prior_data import StackSynthesisDataModule
+
+    settings = {
+        **config["data"]["init_args"], "source": str(source), "cache": str(cache),
+        "val_subjects": val_subjects, "exclude": list(LEFT_OUT), "val_include": list(VALIDATED_ON),
+    }  # fmt: skip
+    return list(StackSynthesisDataModule(**settings).val_dataloader())
+
+
+def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
+    """Export a variant and score it: errors by number of stacks, seconds for a whole brain, its size."""
+    import torch
+
+    from g3r.cli import export
+    from g3r.prior.checkpoint import load_prior
+
+    exported = run / EXPORTED
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = export.main([str(checkpoint), str(exported), "--force"])
+    if code != 0:
+        raise InputError(f"{checkpoint}: cannot be exported; remove {run} and train again")
+    network, _ = load_prior(exported)
+    with torch.inference_mode():
+        priors = [network(one["coarse"], one["density"], one["sharp"]) for one in volumes]
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    return {
+        "steps": int(content["global_step"]),
+        "parameters": sum(value.numel() for value in network.parameters()),
+        "seconds": inference_seconds(exported),
+        "scores": scores_by_stacks(priors, volumes),
+    }
+
+
+def inference_seconds(exported: Path) -> float:
+    """Wall seconds of one view of a whole brain, the least of a few runs."""
+    import numpy as np
+
+    from g3r.prior.checkpoint import load_prior
+    from g3r.prior.inference import estimate_prior
+
+    network, _ = load_prior(exported)
+    rng = np.random.default_rng(0)
+    inputs = [rng.random(SPEED_SHAPE, dtype=np.float32) for _ in range(3)]
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        estimate_prior(network, *inputs)
+        seconds.append(time.perf_counter() - start)
+    return round(min(seconds), 2)
+
+
+def baseline_scores(volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
+    """What the network starts from, scored alike."""
+    return {
+        name: scores_by_stacks([one[key] for one in volumes], volumes)
+        for name, key in (("V_coarse", "coarse"), ("V_sharp", "sharp"))
+    }
+
+
+def scores_by_stacks(
+    made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]
+) -> dict[str, dict[str, float]]:
+    """Mean L1, PSNR (dB) and SSIM in the mask, for each number of stacks and over all ("all")."""
+    from g3r.training.prior_module import scores_in_mask
+
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for volume, one in zip(made, volumes, strict=True):
+        inside = one["mask"] > 0.5
+        scores = scores_in_mask(volume, one["truth"], inside)
+        l1 = float((volume - one["truth"])[inside].abs().mean())
+        row = (l1, mean(scores["psnr"]), mean(scores["ssim"]))
+        for key in (str(int(one["n_stacks"][0])), "all"):
+            rows.setdefault(key, []).append(row)
+    return {
+        key: {name: mean(row[n] for row in found) for n, name in enumerate(("l1", "psnr_db", "ssim"))}
+        for key, found in sorted(rows.items())
+    }

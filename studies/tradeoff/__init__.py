@@ -1,0 +1,1 @@
+"""Time, memory and number of Gaussians against accuracy: docs/tradeoff.md."""

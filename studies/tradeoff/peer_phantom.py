@@ -1,0 +1,107 @@
+"""`python -m studies.tradeoff.peer_phantom`: a small phantom case of the size that other methods were timed on.
+
+A truth of 64^3 voxels of 0.8 mm and three stacks of 58 x 58 x 18 pixels of 0.8 x 0.8 x 2.4 mm, every slice at
+a pose of its own: the built-in phantom, shrunk until it fits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_synth.atlas import TruthVolume
+from data_synth.export import check_output, save_simulation
+from data_synth.phantom import fetal_brain_phantom
+from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
+from studies.command import run_command
+from studies.subjects import BRIGHT
+
+WEEKS = 18.0
+"""The youngest that there is: heads of this size are as young, and as smooth."""
+
+VOXELS, VOXEL_MM = 64, 0.8
+STACK_SHAPE, PIXEL_MM, THICKNESS_MM = (58, 58, 18), 0.8, 2.4
+LENGTH_MM = 42.0
+"""Longest axis of the head: it fits the stacks with two pixels to spare."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.tradeoff.peer_phantom", description=__doc__.splitlines()[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "peer-phantom")
+    parser.add_argument("--seed", type=int, default=61000)
+    parser.add_argument("--force", action="store_true", help="replace an earlier case in --output")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command("peer_phantom", _run, build_parser().parse_args(argv))
+
+
+def _run(options: argparse.Namespace) -> int:
+    check_output(options.output, replace=options.force)
+    truth = small_head(options.seed)
+    settings = orthogonal_settings(3, "moderate", resolution_mm=PIXEL_MM, thickness_mm=THICKNESS_MM)
+    rng = np.random.default_rng(options.seed)
+    taken = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
+    stacks = [in_shape(one) for one in taken]
+    record = {"phantom": WEEKS, "seed": options.seed, "thickness_mm": THICKNESS_MM, "length_mm": LENGTH_MM}
+    save_simulation(options.output, truth, stacks, record, replace=options.force)
+    shapes = ", ".join("x".join(map(str, one.stack.image.shape)) for one in stacks)
+    print(f"{options.output}: truth {'x'.join(map(str, truth.data.shape))}, stacks {shapes}")
+    return 0
+
+
+def small_head(seed: int) -> TruthVolume:
+    """The phantom with its longest axis as long as wanted, on a cube of voxels."""
+    wide = fetal_brain_phantom(WEEKS, VOXEL_MM, seed)
+    extent_mm = (np.ptp(np.argwhere(wide.mask), axis=0) + 1).max() * VOXEL_MM
+    # made with voxels so large that, called small ones, they make a small head: nothing is resampled
+    made = fetal_brain_phantom(WEEKS, VOXEL_MM * extent_mm / LENGTH_MM, seed)
+    low = [(n - VOXELS) // 2 for n in made.mask.shape]
+    bright = np.float32(BRIGHT / np.percentile(made.t2[made.mask], 99.5))
+    affine = np.diag([VOXEL_MM, VOXEL_MM, VOXEL_MM, 1.0])
+    affine[:3, 3] = -VOXEL_MM * (VOXELS - 1) / 2
+    shape = (VOXELS, VOXELS, VOXELS)
+    return TruthVolume(
+        "phantom", _window(made.t2 * bright, low, shape), _window(made.mask, low, shape), affine
+    )
+
+
+def in_shape(one: SimulatedStack) -> SimulatedStack:
+    """A stack cut or filled with zeros, about its middle, to the wanted number of pixels."""
+    stack = one.stack
+    low = [(n - wanted) // 2 for n, wanted in zip(stack.image.shape, STACK_SHAPE, strict=True)]
+    first, last = max(0, low[2]), min(stack.image.shape[2], low[2] + STACK_SHAPE[2])
+    affine = stack.affine.copy()
+    affine[:3, 3] = stack.grid.world(np.array([low[0], low[1], first]))
+    shape = (*STACK_SHAPE[:2], last - first)
+    low[2] = first
+    cut = replace(
+        stack, image=_window(stack.image, low, shape), mask=_window(stack.mask, low, shape), affine=affine
+    )
+    kept = slice(first, last)
+    return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.is_void[kept])
+
+
+def _window(data: NDArray, low: Sequence[int], shape: Sequence[int]) -> NDArray:
+    """The box [low, low + shape) of an array, zero where it reaches beyond."""
+    out = np.zeros(shape, data.dtype)
+    inner = [slice(max(0, a), min(n, a + m)) for a, n, m in zip(low, data.shape, shape, strict=True)]
+    there = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, low, strict=True))
+    out[there] = data[tuple(inner)]
+    return out
+
+
+if __name__ == "__main__":
+    sys.exit(main())

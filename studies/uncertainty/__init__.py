@@ -1,0 +1,1 @@
+"""Stated uncertainty against error: calibration and check (docs/prior.md)."""

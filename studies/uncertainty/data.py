@@ -1,0 +1,176 @@
+"""Simulated subjects that calibrate and check uncertainty.nii.gz: evidence and error of each voxel."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.images import Volume
+from g3r.evaluation.align import resample
+from g3r.evaluation.case import SimulatedCase, load_case
+from g3r.evaluation.metrics import score
+from g3r.fitting.slice_stage import SliceFit
+from g3r.output.result import ReconstructionResult
+from g3r.reconstruct import GaussianReconstructor
+from g3r.registration import MotionEstimate
+from g3r.uncertainty.estimate import collect
+from studies.prior.volumes import refined_pose
+from studies.subjects import SubjectRecipe, simulated_subject
+
+FIT_VOLUMES = (
+    ("spina-bifida/sb26-operated", 3, "mild", 51_200), ("spina-bifida/sb33-operated", 1, "mild", 51_209),
+    ("spina-bifida/sb28-operated", 3, "moderate", 51_201), ("spina-bifida/sb25-operated", 1, "mild", 51_205),
+    ("spina-bifida/sb30-operated", 3, "mild", 51_202), ("spina-bifida/sb27-operated", 1, "none", 51_206),
+    ("spina-bifida/sb32-operated", 3, "moderate", 51_203), ("spina-bifida/sb29-operated", 1, "mild", 51_207),
+    ("spina-bifida/sb34-operated", 3, "mild", 51_204), ("spina-bifida/sb31-operated", 1, "mild", 51_208),
+)  # fmt: skip
+"""Volume, stacks, motion and seed of the subjects that the coefficients are fitted to. No prior was
+trained on these volumes (checkpoints are chosen by them)."""
+
+CHECK_VOLUMES = (
+    ("crl-sta/sta24", 3, "mild", 52_200), ("crl-sta/sta30", 1, "mild", 52_201),
+    ("crl-sta/sta34", 3, "moderate", 52_202), ("crl-sta/sta24", 1, "mild", 52_203),
+    ("crl-sta/sta30", 3, "mild", 52_204), ("crl-sta/sta34", 1, "mild", 52_205),
+    ("crl-sta/sta24", 3, "moderate", 52_206), ("crl-sta/sta30", 1, "none", 52_207),
+    ("crl-sta/sta34", 3, "mild", 52_208), ("crl-sta/sta24", 1, "mild", 52_209),
+)  # fmt: skip
+"""The same of the subjects that they are checked on: weeks left out of every training and choice."""
+
+UNREGISTERED = ("crl-sta/sta24", 3, "moderate", 52_250)
+"""One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
+
+NO_REGISTRATION = {
+    "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
+    "motion.n_rounds": 0, "motion.standard_orientation": False,
+}  # fmt: skip
+
+VOXELS_PER_SUBJECT = 40_000
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One reconstruction, voxel by voxel.
+
+    Attributes:
+        recipe: the subject.
+        n_stacks: how many of its stacks were used.
+        evidence: [n] by name, a random choice of the voxels inside both masks.
+        error: [n] volume minus truth, in normalised intensities.
+        psnr_db: of the volume.
+        median_mm: error of the poses.
+        trusted: whether the record trusts the registration.
+        registered: whether there was one.
+        seconds: of reconstruction and judgement; registration comes from the cache.
+        map_seconds: of the map alone, processor time.
+    """
+
+    recipe: SubjectRecipe
+    n_stacks: int
+    evidence: dict[str, NDArray[np.float64]]
+    error: NDArray[np.float64]
+    psnr_db: float
+    median_mm: float
+    trusted: bool | None
+    seconds: float
+    map_seconds: float
+    registered: bool = True
+
+    @property
+    def label(self) -> str:
+        """Subject and number of stacks."""
+        name = f"{self.recipe.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+        return name if self.registered else f"{name}, not registered"
+
+
+def fit_recipes() -> list[tuple[SubjectRecipe, int]]:
+    """Subjects of the fit with their number of stacks; always the same."""
+    return [_recipe(*one) for one in FIT_VOLUMES]
+
+
+def check_recipes() -> list[tuple[SubjectRecipe, int]]:
+    """Subjects of the check with their number of stacks; always the same."""
+    return [_recipe(*one) for one in CHECK_VOLUMES]
+
+
+def unregistered_recipe() -> tuple[SubjectRecipe, int]:
+    """The subject that the check leaves unregistered."""
+    return _recipe(*UNREGISTERED)
+
+
+def _recipe(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectRecipe, int]:
+    name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
+    return SubjectRecipe(name, volume, motion, seed), n_stacks
+
+
+def judged(
+    recipe: SubjectRecipe,
+    n_stacks: int,
+    reconstructor: GaussianReconstructor,
+    atlas: Path,
+    cache: Path,
+    *,
+    registered: bool = True,
+) -> Judged:
+    """Simulate, register (or take that from the cache), reconstruct and compare with the truth."""
+    case = load_case(simulated_subject(recipe, atlas, cache))
+    motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
+    start = time.perf_counter()
+    result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
+    pose_error = case.pose_error(result.slices)
+    truth_from_result = refined_pose(
+        result.volume, result.grid, case.truth, case.truth_mask, pose_error.common
+    )
+    truth = resample(case.truth, result.grid, truth_from_result)
+    mask = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
+    both = result.mask & (resample(mask, result.grid, truth_from_result) > 0.5)
+    error = relative_error(result.volume, truth, both) / result.intensity_scale
+    rng = np.random.default_rng(recipe.seed)
+    inside = np.flatnonzero(both[result.mask])
+    chosen = np.sort(rng.choice(inside, min(VOXELS_PER_SUBJECT, len(inside)), replace=False))
+    return Judged(
+        recipe, n_stacks, {name: one[chosen] for name, one in evidence_of(result).items()},
+        error[result.mask][chosen], score(result.volume, truth, both).psnr_db, pose_error.median_mm,
+        result.record["registration"]["trusted"], time.perf_counter() - start,
+        result.record["cpu_seconds"]["uncertainty"], registered,
+    )  # fmt: skip
+
+
+def relative_error(
+    volume: NDArray[np.float32], truth: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Volume minus truth, the truth brought to the volume's mean in the mask.
+
+    One factor, since the scale of a reconstruction is arbitrary. The gain and offset that `g3r-evaluate` fits
+    would hide errors: of a volume that has nothing to do with the truth they leave its mean.
+    """
+    factor = float(volume[mask].mean()) / float(truth[mask].mean())
+    return volume.astype(np.float64) - factor * truth
+
+
+def evidence_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
+    """What the map of a result was made of."""
+    scale = np.float32(result.intensity_scale)
+    fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record["shading"])
+    return collect(
+        result.volume / scale, result.mask, result.grid, fit, result.prior / scale, result.density,
+        result.prior_grid, result.prior_share,
+    )  # fmt: skip
+
+
+def cached_registration(
+    case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
+) -> MotionEstimate:
+    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
+    path = cache / f"{case.name}-{n_stacks}.motion.pkl"
+    if path.is_file():
+        with path.open("rb") as stream:
+            return pickle.load(stream)
+    motion = reconstructor.register_stacks(case.stacks[:n_stacks])
+    with path.open("wb") as stream:
+        pickle.dump(motion, stream)
+    return motion

@@ -1,0 +1,145 @@
+"""g3r-bench: usage, refusals, and small runs from end to end."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from data_synth import cli as simulate
+from g3r.bench.scaling import GROWING, measured_growth
+from g3r.bench.scaling_tables import draw_scaling, scaling_tables
+from g3r.bench.trade_figure import draw_trade
+from g3r.bench.trade_tables import trade_tables
+from g3r.cli import bench
+from studies.tradeoff import peer_phantom
+
+MACHINE = {
+    "processor": "made up", "cores": 2, "threads": 2, "python": "3", "torch": "2", "numba": "0", "g3r": "0",
+    "commit": None,
+}  # fmt: skip
+
+
+def test_names_its_commands(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        bench.main(["--help"])
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("kernels", "scaling", "trade"))
+    with pytest.raises(SystemExit, match="2"):
+        bench.main(["nothing"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["trade"],
+        ["trade", "nowhere"],
+        ["trade", "nowhere", "--repeats", "0"],
+        ["trade", "--redraw", "--output", "nowhere"],
+        ["scaling", "--sizes", "1"],
+    ],
+)
+def test_bad_input_is_one_line(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert bench.main(words) == 3
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert said.err.startswith(f"g3r-bench {words[0]}: ")
+    assert not said.out
+
+
+def preset(seconds, psnr):
+    return {
+        "seconds": seconds, "cpu_seconds": 2 * seconds, "peak_bytes": 1_500_000_000, "n_gaussians": 12345,
+        "stages": {"motion": seconds - 5, "fit to slices": 5.0}, "ssim": 0.9, "tre_mm": 0.5, "psnr_db": psnr,
+        "stages_cpu": {"motion": seconds - 5, "fit to slices": 5.0},
+    }  # fmt: skip
+
+
+def variant(seconds, psnr, *, same=False):
+    return {
+        "seconds": seconds, "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1}, "psnr_db": psnr,
+        "ssim": 0.9, "tre_mm": 0.5, "n_gaussians": 100, "same_as_base": same,
+    }  # fmt: skip
+
+
+def made_record():
+    fit = {"curve": {"step": [1, 2], "seconds_before_end": [2.0, 0.0], "psnr_db": [20.0, 24.0]}}
+    presets = {"draft": preset(16.0, 20.0), "balanced": preset(60.0, 24.0), "accurate": preset(200.0, 24.6)}
+    case = {
+        "presets": presets,
+        "sweeps": {"cut-off": {"2 sigma": variant(10.0, 23.0), "3.2 sigma": variant(20.0, 24.0, same=True)}},
+        "fits": {"balanced": fit},
+    }  # fmt: skip
+    return {"machine": MACHINE, "repeats": 3, "base": "balanced", "cases": {"made": case}}
+
+
+def test_trade_tables_and_figure(tmp_path):
+    text = trade_tables(made_record())
+    assert "| made | `draft` | 16.0 (!) | 15 | 4.60 (!) | 4 |" in text
+    assert "| made | `balanced` | 60.0 | 75 | 0.60 (!) | 0.5 |" in text
+    assert "| made | `accurate` | 200.0 | 240 |  |  |" in text
+    assert "| cut-off | 2 sigma | 50.0 | 10.0 | 100 | 23.00 |" in text  # 60 - 20 + 10 seconds
+    assert "| cut-off | 3.2 sigma (`balanced`) | 60.0 |" in text
+    assert "medians of 3 runs" in text
+    draw_trade(made_record(), tmp_path / "made" / "trade.png")
+    assert (tmp_path / "made" / "trade.png").stat().st_size > 10_000
+
+
+def test_scaling_measures_what_grows(tmp_path):
+    rows = measured_growth("output voxels", 2)
+    assert [row["size"] for row in rows] == [30**3, 38**3]
+    assert rows[1]["evaluations"] > 1.5 * rows[0]["evaluations"]
+    assert all(row[key]["volume"] > 0 for row in rows for key in ("seconds", "setup_seconds"))
+    record = {"machine": MACHINE, "growing": {"output voxels": rows}}
+    assert "volume, output voxels" in scaling_tables(record)
+    draw_scaling(record, tmp_path / "scaling.png")
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+
+def test_work_is_proportional_to_what_grows():
+    from dataclasses import replace
+
+    from g3r.bench.scenes import SceneSize, made_cloud, made_slices, pixel_evaluations
+    from g3r.gaussians import find_pairs
+
+    base = SceneSize(n_gaussians=400, n_slices=12, n_pixels=256)
+    for field in ("n_gaussians", "n_slices", "n_pixels"):
+        work = []
+        for factor in (1, 4):
+            size = replace(base, **{field: factor * getattr(base, field)})
+            cloud = made_cloud(size)
+            planes = made_slices(size, cloud).planes
+            work.append(pixel_evaluations(cloud, planes, find_pairs(cloud, planes, 3.2), 3.2))
+        assert work[1] / work[0] == pytest.approx(4, rel=0.1), field
+    assert {field for field, *_ in GROWING.values()} == {"n_gaussians", "n_slices", "n_pixels", "n_voxels"}
+
+
+def test_the_small_phantom_has_the_size_of_the_other_methods(tmp_path, capsys):
+    assert peer_phantom.main(["--output", str(tmp_path / "small")]) == 0
+    said = capsys.readouterr().out
+    assert "truth 64x64x64, stacks 58x58x18, 58x58x18, 58x58x18" in said
+    truth = peer_phantom.small_head(1)
+    extent_mm = (np.ptp(np.argwhere(truth.mask), axis=0) + 1) * peer_phantom.VOXEL_MM
+    assert extent_mm.max() == pytest.approx(peer_phantom.LENGTH_MM, abs=2)
+
+
+@pytest.mark.slow
+def test_trade_from_end_to_end(tmp_path, capsys):
+    words = ["--phantom", "20", "--resolution", "1.5", "--thickness", "4", "--seed", "61009"]
+    assert simulate.main([*words, "--output", str(tmp_path / "case")]) == 0
+    page = tmp_path / "page.md"
+    page.write_text("<!-- trade:begin -->\n<!-- trade:end -->\n", encoding="utf-8")
+    words = ["trade", str(tmp_path / "case"), "--repeats", "1", "--presets", "draft", "--base", "draft"]
+    words += ["--sweeps", "--output", str(tmp_path), "--docs", str(page), "--figure", str(tmp_path / "t.png")]
+    assert bench.main(words) == 0
+    case = json.loads((tmp_path / "trade.json").read_text())["cases"]["case"]
+    row = case["presets"]["draft"]
+    assert row["seconds"] == pytest.approx(sum(row["stages"].values()), abs=0.1)
+    assert row["peak_bytes"] > 1e8
+    assert case["fits"]["draft"]["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.5)
+    assert case["fits"]["draft"]["curve"]["psnr_db"][-1] == pytest.approx(row["psnr_db"], abs=0.5)
+    assert set(case["sweeps"]) == {"Gaussians", "iterations", "cut-off", "resolution"}
+    assert "`draft`" in page.read_text(encoding="utf-8")
+    assert (tmp_path / "t.png").is_file()

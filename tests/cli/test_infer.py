@@ -1,0 +1,417 @@
+"""`g3r-simulate` and `g3r-infer` as processes: outputs, refusals, exit codes; the same from Python."""
+
+import csv
+import gzip
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from g3r import GaussianReconstructor, load_stack
+from g3r.acquisition.images import load_volume
+from g3r.errors import InputError
+from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
+from g3r.gaussians import GaussianCloud
+from g3r.output.result import OUTPUT_NAMES, SLICE_COLUMNS
+from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.reconstruct import DEFAULT_CHECKPOINT
+
+OUTPUTS = {
+    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
+    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
+}  # fmt: skip
+QUICK = (
+    "--preset",
+    "draft",
+    "--resolution",
+    "1.5",
+    "--no-prior",
+    "--thickness",
+    "4",
+    "--threads",
+    "1",
+    "--quiet",
+)
+
+
+def run(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", f"g3r.cli.{command}", *map(str, arguments)]
+    return subprocess.run(line, capture_output=True, text=True, check=False)
+
+
+def files(subject: Path, kind: str) -> list[Path]:
+    return [subject / f"{kind}-{n}.nii.gz" for n in range(3)]
+
+
+def inputs(subject: Path) -> list[object]:
+    return ["--stacks", *files(subject, "stack"), "--masks", *files(subject, "mask")]
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three stacks of a small phantom that moves a little, written by g3r-simulate."""
+    folder = tmp_path_factory.mktemp("simulated") / "subject"
+    done = run(
+        "simulate",
+        "--phantom",
+        22,
+        "--resolution",
+        1.5,
+        "--thickness",
+        4,
+        "--motion",
+        "mild",
+        "--output",
+        folder,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that g3r-infer wrote for the subject."""
+    folder = tmp_path_factory.mktemp("reconstructed") / "deep" / "out"
+    before = {path: path.read_bytes() for path in subject.iterdir()}
+    done = run("infer", *inputs(subject), *QUICK, "--output", folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert str(folder / "volume.nii.gz") in done.stdout
+    assert {path: path.read_bytes() for path in subject.iterdir()} == before  # inputs are never written to
+    return folder
+
+
+def test_every_output_is_there_and_nothing_else(reconstructed: Path):
+    assert (
+        {path.name for path in reconstructed.iterdir()}
+        == OUTPUTS
+        == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
+    )
+    assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
+
+
+def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path):
+    volume, mask = (nib.load(reconstructed / f"{name}.nii.gz") for name in ("volume", "mask"))
+    np.testing.assert_allclose(volume.header.get_zooms(), 1.5, rtol=1e-6)
+    np.testing.assert_allclose(volume.affine, mask.affine)
+    data, inside = np.asarray(volume.dataobj), np.asarray(mask.dataobj) > 0
+    assert data.dtype == np.float32
+    assert np.isfinite(data).all()
+    assert (data[~inside] == 0).all()
+    truth_mask = load_volume(subject / "truth-mask.nii.gz")
+    true_mm3 = truth_mask.data.sum() * truth_mask.grid.voxel_volume_mm3
+    assert inside.sum() * 1.5**3 == pytest.approx(true_mm3, rel=0.25)
+    # the stacks' own intensities: the truth's bright end is 1000
+    assert 500 < np.percentile(data[inside], 99) < 1500
+    maps = [load_volume(reconstructed / f"{name}.nii.gz") for name in ("prior", "coarse", "density")]
+    assert len({one.data.shape for one in maps}) == 1
+    # without a network the Gaussians start from V_sharp: the same head as V_coarse, with more contrast
+    sharp, coarse = (one.data[maps[2].data > 1] for one in maps[:2])
+    assert np.corrcoef(sharp, coarse)[0, 1] > 0.9
+    assert sharp.std() > 1.02 * coarse.std()
+    assert 2 < np.median(maps[2].data[maps[2].data > 0.5]) < 4  # three gapless stacks
+
+
+def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, reconstructed: Path):
+    with (reconstructed / "slices.tsv").open() as file:
+        rows = list(csv.DictReader(file, delimiter="\t"))
+    assert tuple(rows[0]) == SLICE_COLUMNS
+    assert tuple(SLICE_COLUMNS) == tuple(
+        ["stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason"]
+    )
+    keys = [(int(row["stack"]), int(row["slice"])) for row in rows]
+    masks = [np.asarray(nib.load(path).dataobj) > 0 for path in files(subject, "mask")]
+    assert keys == [(s, k) for s, m in enumerate(masks) for k in np.flatnonzero(m.sum((0, 1)) >= 12)]
+    for row in rows:
+        assert 0 < float(row["weight"]) <= 1
+        assert 0.3 < float(row["gain"]) < 3
+        assert -1 <= float(row["ncc"]) <= 1
+        assert (row["reason"] != "-") == (float(row["weight"]) < 0.5)
+    points = slice_points(files(subject, "mask"))
+    error = target_registration_error(
+        points, read_poses(subject / "poses.tsv"), read_poses(reconstructed / "slices.tsv")
+    )
+    assert error.median_mm < 1.5
+
+
+def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
+    text = (reconstructed / "run.json").read_text()
+    record = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    for path in (subject, reconstructed, Path.home(), Path(sys.prefix)):
+        assert str(path) not in text
+    assert record["n_gaussians"] == len(GaussianCloud.load(reconstructed / "gaussians.npz"))
+    assert record["settings"]["resolution_mm"] == 1.5
+    assert [stack["name"] for stack in record["stacks"]] == [path.name for path in files(subject, "stack")]
+    assert all(seconds >= 0 for seconds in record["seconds"].values())
+    assert record["peak_memory_bytes"] > 1e7
+    assert record["command"]["preset"] == "draft"
+    for key in ("versions", "warnings", "notes", "loss", "motion", "registration"):
+        assert key in record
+    assert record["registration"]["trusted"] is True
+    assert record["motion"]["orientation"] in ("standard", "scanner")
+    for stack in record["stacks"]:
+        assert stack["pose_confidence"]["sure"] is True
+        assert stack["interleave"] in ((None,) if stack["n_runs"] == 1 else (1, 2, 3))
+        assert 1 <= stack["n_runs"] <= stack["n_slices"]
+
+
+def test_the_picture_is_a_picture(reconstructed: Path):
+    from matplotlib.image import imread
+
+    assert imread(reconstructed / "sections.png").std() > 0.05
+
+
+def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: Path, tmp_path: Path):
+    (tmp_path / "volume.nii.gz").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine too")
+    refused = run("infer", *inputs(subject), *QUICK, "--output", tmp_path)
+    assert refused.returncode == 3
+    assert "--force" in refused.stderr
+    assert (tmp_path / "volume.nii.gz").read_text() == "mine"
+    forced = run("infer", *inputs(subject), *QUICK, "--output", tmp_path, "--force")
+    assert forced.returncode == 0, forced.stderr
+    assert {path.name for path in tmp_path.iterdir()} == OUTPUTS | {"notes.txt"}
+    # the same seed on one thread gives the same volume
+    np.testing.assert_array_equal(
+        load_volume(tmp_path / "volume.nii.gz").data, load_volume(reconstructed / "volume.nii.gz").data
+    )
+
+
+def test_from_python_in_three_lines(subject: Path, tmp_path: Path):
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    result = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
+    result.save(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
+    assert result.volume.shape == result.grid.shape
+
+
+def quick_settings() -> ReconstructionSettings:
+    """Without the prior and with a short registration and fit."""
+    draft = PRESETS["draft"]
+    return replace(
+        draft, resolution_mm=1.5, use_prior=False,
+        motion=replace(draft.motion, n_rounds=2), slice_stage=replace(draft.slice_stage, n_steps=5),
+    )  # fmt: skip
+
+
+def test_one_registration_serves_several_fits(subject: Path):
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    reconstructor = GaussianReconstructor(settings=quick_settings())
+    motion = reconstructor.register_stacks(stacks)
+    whole, again = reconstructor.reconstruct(stacks), reconstructor.reconstruct(stacks, motion)
+    np.testing.assert_array_equal(again.volume, whole.volume)
+    assert any("motion was given" in note for note in again.record["notes"])
+    with pytest.raises(InputError, match="motion of"):
+        reconstructor.reconstruct(stacks[:2], motion)
+
+
+@pytest.mark.parametrize("power", [-20, 20])
+def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int):
+    """A power of two (about 1e-6 and 1e6) rounds nothing: no constant may have a hidden unit."""
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    plain = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
+    factor = np.float32(2.0**power)
+    scaled = GaussianReconstructor(settings=quick_settings()).reconstruct(
+        [replace(stack, image=stack.image * factor) for stack in stacks]
+    )
+    np.testing.assert_array_equal(scaled.volume, plain.volume * factor)
+    np.testing.assert_array_equal(scaled.slices.planes.center_mm, plain.slices.planes.center_mm)
+
+
+@pytest.mark.parametrize("standard", [False, True])
+def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path, standard: bool):
+    """All slices stay in line; as a whole they are turned only where the standard orientation is wanted."""
+    stack = load_stack(files(subject, "stack")[0], files(subject, "mask")[0], 4.0)
+    settings = quick_settings()
+    settings = replace(settings, motion=replace(settings.motion, standard_orientation=standard))
+    result = GaussianReconstructor(settings=settings).reconstruct([stack])
+    assert any("single stack" in note for note in result.record["notes"])
+    motion = result.slices.world_from_header()
+    relative = motion.take([0]).inverse() @ motion if standard else motion
+    np.testing.assert_allclose(relative.translation_mm, 0, atol=1e-6)
+    np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=1e-7)
+    assert result.record["motion"]["orientation"] == ("standard" if standard else "scanner")
+    assert result.record["stacks"][0]["pose_confidence"]["held_out_correlation"] is None
+    assert np.isfinite(result.volume).all()
+    assert result.volume[result.mask].std() > 0
+
+
+def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Path):
+    stacks = [
+        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
+    ]
+    few = np.zeros_like(stacks[0].mask)
+    few[20:23, 20:23, 5] = True
+    settings = quick_settings()
+    motion = replace(
+        settings.motion, template=False, network=False, stacks=False, runs=False, n_rounds=1
+    )  # fmt: skip
+    settings = replace(settings, resolution_mm=2.5, motion=motion)
+    result = GaussianReconstructor(settings=settings).reconstruct(
+        [replace(stacks[0], mask=few), stacks[1], stacks[2]]
+    )
+    record = result.record
+    assert [one["n_slices"] > 0 for one in record["stacks"]] == [False, True, True]
+    assert record["stacks"][0]["interleave"] is None
+    assert record["stacks"][0]["pose_confidence"]["sure"] is False
+    assert record["stacks"][2]["n_runs"] == 1
+    assert any(stacks[0].name in line for line in record["warnings"])
+
+
+def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):
+    done = run("infer", *inputs(subject), *QUICK, "--output", tmp_path / "out", "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("thickness 4 mm") == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not DEFAULT_CHECKPOINT.exists(), reason="the shipped weights are not there yet")
+def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path):
+    quick = [option for option in QUICK if option != "--no-prior"]
+    done = run("infer", *inputs(subject), *quick, "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["prior"] is not None
+    prior, coarse = (load_volume(tmp_path / "out" / f"{name}.nii.gz").data for name in ("prior", "coarse"))
+    assert np.isfinite(prior).all()
+    assert not np.array_equal(prior, coarse)
+    share, mask = (load_volume(tmp_path / "out" / f"{name}.nii.gz").data for name in ("prior_share", "mask"))
+    assert 0 <= share.min() < share[mask > 0].mean() < 0.6  # three stacks leave it little
+    assert share.max() == 1
+    # a later result without the prior leaves no map of another behind
+    done = run("infer", *inputs(subject), *QUICK, "--force", "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
+
+
+# -- refusals --------------------------------------------------------------------------------------
+
+
+def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], str]:
+    """Arguments that must be refused, and the name that the message must hold."""
+    stacks, masks = files(subject, "stack"), files(subject, "mask")
+    image = nib.load(stacks[0])
+    data, bad = np.asarray(image.dataobj), folder / "bad.nii.gz"
+    options: list[object] = ["--no-prior", "--thickness", "4", "--output", folder / "out"]
+    if kind == "missing file":
+        return ["--stacks", stacks[0], bad, *options], "bad.nii.gz"
+    if kind == "text file":
+        bad.write_text("hello\n")
+    elif kind == "cut off":
+        bad.write_bytes(stacks[0].read_bytes()[: stacks[0].stat().st_size // 2])
+    elif kind == "cut off after the header":
+        bad.write_bytes(gzip.compress(gzip.decompress(stacks[0].read_bytes())[:1000]))
+    elif kind == "one slice":
+        nib.save(nib.Nifti1Image(data[:, :, :1], image.affine), bad)
+    elif kind == "NaN volume":
+        nib.save(nib.Nifti1Image(np.full(data.shape, np.nan, np.float32), image.affine), bad)
+    elif kind == "mask of another grid":
+        return ["--stacks", stacks[0], "--masks", masks[1], *options], "mask-1.nii.gz"
+    elif kind == "empty mask":
+        nib.save(nib.Nifti1Image(np.zeros(data.shape, np.uint8), image.affine), bad)
+        return [
+            "--stacks",
+            *stacks,
+            "--masks",
+            masks[0],
+            masks[1],
+            _like(bad, stacks[2]),
+            *options,
+        ], "bad.nii.gz"
+    elif kind == "thickness zero":
+        return [*inputs(subject), *options[:1], "--thickness", "0", *options[3:]], "stack-0.nii.gz"
+    elif kind == "checkpoint is text":
+        (folder / "prior.pt").write_text("not a checkpoint\n")
+        return [*inputs(subject), "--ckpt", folder / "prior.pt", *options[1:]], "prior.pt"
+    elif kind == "output is a file":
+        (folder / "out").write_text("mine")
+        return [*inputs(subject), *options], "out"
+    elif kind == "prior of another voxel size":
+        expected = "prior.pt: was trained on voxels of 0.8 mm, expected 1.2 mm"
+        return [*inputs(subject), *options[1:], "--prior-voxel", "1.2"], expected
+    elif kind == "resolution":
+        return [*inputs(subject), *options, "--resolution", "0"], "resolution 0 mm"
+    whole = kind in ("one slice", "NaN volume")
+    return ["--stacks", bad, *([] if whole else ["--masks", masks[0]]), *options], "bad.nii.gz"
+
+
+def _like(path: Path, image_path: Path) -> Path:
+    """An empty mask on the grid of an image."""
+    image = nib.load(image_path)
+    nib.save(nib.Nifti1Image(np.zeros(image.shape, np.uint8), image.affine), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "missing file", "text file", "cut off", "cut off after the header", "one slice", "NaN volume",
+        "mask of another grid", "empty mask", "thickness zero", "checkpoint is text",
+        "output is a file", "resolution", "prior of another voxel size",
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path):
+    arguments, name = bad_command(kind, subject, tmp_path)
+    before = {path.name for path in tmp_path.iterdir()}
+    done = run("infer", *arguments)
+    assert done.returncode == 3, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("g3r-infer: ")
+    assert name in lines[0]
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--stacks", "a.nii.gz"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--preset", "best"],
+        ["--stacks", "a.nii.gz", "b.nii.gz", "--masks", "m.nii.gz", "--output", "o"],
+        ["--stacks", "a.nii.gz", "b.nii.gz", "c.nii.gz", "--thickness", "1", "2", "--output", "o"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--threads", "0"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "0"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "nan"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "20", "--preset", "draft"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--ckpt", "p.pt", "--no-prior"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--resolution", "fine"],
+    ],
+)
+def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    from g3r.cli.infer import main
+
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: g3r-infer" in capsys.readouterr().err
+
+
+def test_a_missing_checkpoint_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match=r"absent\.pt"):
+        GaussianReconstructor(tmp_path / "absent.pt")
+
+
+@pytest.mark.parametrize("settings", ["best", replace(PRESETS["draft"], resolution_mm=5.0, use_prior=False)])
+def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str):
+    with pytest.raises(InputError, match="expected"):
+        GaussianReconstructor(settings=settings)
+
+
+def test_a_usage_error_as_a_process():
+    done = run("infer", "--stacks")
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: g3r-infer")

@@ -1,0 +1,242 @@
+"""--max-memory: what is needed, said beforehand; a plan that keeps below a limit, or one line of refusal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+import g3r.planning.memory_estimate
+import g3r.planning.memory_limit
+from data_synth.cli import main as simulate
+from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.stacks import Stack, load_stack
+from g3r.bench.command_run import CommandRun, run_infer
+from g3r.cli import infer
+from g3r.errors import InputError
+from g3r.fitting.initial_volumes import FitStart
+from g3r.planning.memory_estimate import estimate_memory
+from g3r.planning.memory_limit import LEAST_RECORD_BYTES, PLANNED_HALO_VOXELS, plan_memory
+from g3r.planning.memory_size import gigabytes, parsed_size
+from g3r.planning.presets import PRESETS
+from g3r.planning.time_budget import TimeBudget
+
+DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
+PROCESS = 500_000_000
+MB = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated") / "subject"
+    options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
+    assert simulate([*options, "--output", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stacks(subject: Path) -> list[Stack]:
+    return [load_stack(subject / f"stack-{n}.nii.gz", subject / f"mask-{n}.nii.gz", 4.0) for n in range(3)]
+
+
+@pytest.fixture(scope="module")
+def slices(stacks: list[Stack]) -> Slices:
+    return slices_from_stacks(stacks)
+
+
+def arguments(subject: Path, output: Path, *more: str) -> list[str]:
+    return [
+        "--stacks", *[str(subject / f"stack-{n}.nii.gz") for n in range(3)],
+        "--masks", *[str(subject / f"mask-{n}.nii.gz") for n in range(3)], "--thickness", "4",
+        "--resolution", "1.5", "--output", str(output), *more,
+    ]  # fmt: skip
+
+
+QUIETLY = ("--preset", "draft", "--threads", "1", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def unlimited(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CommandRun, np.ndarray]:
+    output = tmp_path_factory.mktemp("unlimited") / "out"
+    return run_infer(arguments(subject, output, *QUIETLY), output), volume_in(output)
+
+
+def volume_in(folder: Path) -> np.ndarray:
+    return np.asarray(nib.load(folder / "volume.nii.gz").dataobj)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1000000", MB), ("1500M", 1500 * MB), ("2G", 2000 * MB), ("2.5GB", 2500 * MB), (" 3 g ", 3000 * MB),
+     ("750K", 750_000), ("0.5t", 500_000 * MB)],
+)  # fmt: skip
+def test_sizes_as_people_write_them(text: str, size: int):
+    assert parsed_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "G", "-2G", "2Gi", "2 4G", "0", "0.1", "1e9", "nan", "inf", "2P"])
+def test_what_is_no_size(text: str):
+    with pytest.raises(ValueError, match="expected a number of bytes"):
+        parsed_size(text)
+
+
+def test_sizes_for_people_are_rounded_up():
+    assert [gigabytes(n) for n in (1, 1.1e9, 1.101e9, 2.345e10)] == [
+        "0.01 GB",
+        "1.10 GB",
+        "1.11 GB",
+        "23.45 GB",
+    ]
+    assert parsed_size(gigabytes(987_654_321)) >= 987_654_321  # what is said can be typed
+
+
+def test_more_of_anything_needs_more(slices: Slices):
+    def peak(**changed: object) -> int:
+        return estimate_memory(slices, replace(DRAFT, **changed), 1, PROCESS).peak  # type: ignore[arg-type]
+
+    assert peak(resolution_mm=0.3) > peak(resolution_mm=0.4) > peak()
+    assert peak() > peak(use_prior=False) > PROCESS
+    few = slices.take(np.arange(0, len(slices), 2))
+    assert (
+        estimate_memory(few, DRAFT, 1, PROCESS).stages["motion"]
+        < estimate_memory(slices, DRAFT, 1, PROCESS).stages["motion"]
+    )
+    threads = [estimate_memory(slices, DRAFT, n, PROCESS).stages["motion"] for n in (1, 2, 4, 64)]
+    assert threads == sorted(threads)
+    assert threads[2] == threads[3]  # scattering takes four at most
+
+
+def test_without_a_limit_nothing_changes(slices: Slices):
+    plan = plan_memory(slices, DRAFT, None, process_bytes=PROCESS)
+    assert plan.settings == DRAFT
+    assert (plan.changes, plan.at_once) == ([], False)
+    same = plan_memory(slices, DRAFT, plan.estimate.peak, process_bytes=PROCESS)
+    assert same.settings == DRAFT
+    assert same.changes == []
+
+
+def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices):
+    free = plan_memory(slices, DRAFT, None, process_bytes=PROCESS).estimate.peak
+    refused = []
+    for limit in range(free, PROCESS - 10 * MB, -10 * MB):
+        try:
+            plan = plan_memory(slices, DRAFT, limit, process_bytes=PROCESS)
+        except InputError as error:
+            refused.append(str(error))
+            continue
+        assert not refused  # less never fits again
+        assert plan.estimate.peak <= limit
+        assert plan.settings.resolution_mm == DRAFT.resolution_mm  # nobody asked for another volume
+        assert bool(plan.changes) == (limit < free)
+        if plan.settings.prior_whole_voxels == 0:
+            assert plan.settings.prior_halo_voxels == PLANNED_HALO_VOXELS
+    assert "--no-prior (" in refused[0]  # which needs less than the network
+    assert "--no-prior" not in refused[-1]
+    assert all("choose a coarser --resolution" in line for line in refused if "--no-prior" not in line)
+
+
+def test_records_are_given_up_where_the_fit_needs_most(slices: Slices):
+    """Many Gaussians: the records of their pairs lead."""
+    many = replace(DRAFT, gaussian_spacing_pixels=0.3, use_prior=False)
+    free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
+    assert free.stage == "fit to slices"
+    plan = plan_memory(slices, many, free.peak - 60 * MB, process_bytes=PROCESS)
+    kept = plan.settings.slice_stage.record_bytes
+    assert LEAST_RECORD_BYTES <= kept < many.slice_stage.record_bytes
+    assert plan.settings.prior_stage.record_bytes == kept
+    assert any("pairs kept in" in change for change in plan.changes)
+
+
+@pytest.fixture
+def fixed_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Statements that do not depend on what this process holds."""
+    for module in (g3r.planning.memory_estimate, g3r.planning.memory_limit):
+        monkeypatch.setattr(module, "held_bytes", lambda: PROCESS)
+
+
+@pytest.mark.usefixtures("fixed_process")
+def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def stated(*more: str) -> str:
+        assert infer.main([*arguments(subject, tmp_path / "out", *more), "--dry-run", "--quiet"]) == 0
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if "of memory" in line]
+        return line
+
+    assert stated("--preset", "draft").startswith("needs about 0.")
+    assert "most of it in uncertainty" in stated("--preset", "draft", "--resolution", "0.3")
+    # memory for a time budget is planned for the most that it may take
+    fine = ("--resolution", "0.3", "--no-prior")
+    assert stated("--time-budget", "5", *fine) == stated("--preset", "accurate", *fine)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_small_limit_is_refused_in_one_line(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    given = arguments(subject, tmp_path / "out")
+    assert infer.main([*given, "--max-memory", "200M"]) == 3
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert line.startswith("g3r-infer: --max-memory: needs at least ")
+    assert line.endswith(
+        "the limit is 0.20 GB; choose a coarser --resolution, crop the masks, or raise --max-memory"
+    )
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(SystemExit, match="2"):
+        infer.main([*given, "--max-memory", "plenty"])
+    assert "expected a number of bytes" in capsys.readouterr().err
+
+
+def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRun, np.ndarray]):
+    run, _ = unlimited
+    said = run.record["memory"]
+    assert said["limit_bytes"] is None
+    assert said["changes"] == []
+    assert run.peak_bytes <= said["stated_bytes"] <= 1.5 * run.peak_bytes
+
+
+def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
+    subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path
+):
+    run, volume = unlimited
+    limit = round(0.93 * run.record["memory"]["stated_bytes"])
+    output = tmp_path / "out"
+    less = run_infer(arguments(subject, output, *QUIETLY, "--max-memory", str(limit)), output)
+    assert less.peak_bytes < limit
+    said = less.record["memory"]
+    assert said["limit_bytes"] == limit
+    assert said["stated_bytes"] <= limit
+    assert said["changes"]
+    assert set(said["changes"]) <= set(less.record["notes"])
+    difference = np.abs(volume_in(output) - volume)
+    assert difference.max() < 1e-3 * volume.max()
+
+
+def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path):
+    limit = round(0.93 * unlimited[0].record["memory"]["stated_bytes"])
+    output = tmp_path / "out"
+    given = arguments(subject, output, "--time-budget", "0.1", "--threads", "1", "--quiet")
+    run = run_infer([*given, "--max-memory", str(limit)], output)
+    assert run.peak_bytes < limit
+    assert run.record["memory"]["stated_bytes"] <= limit
+    assert run.record["memory"]["changes"]
+    assert run.record["time_budget"]["seconds"] == 0.1
+
+
+def test_a_time_budget_keeps_what_was_planned(slices: Slices):
+    planned = replace(
+        PRESETS["accurate"], use_prior=False, prior_whole_voxels=0, prior_tile_voxels=32,
+        prior_stage=replace(DRAFT.prior_stage, record_bytes=30 * MB),
+        slice_stage=replace(DRAFT.slice_stage, record_bytes=30 * MB),
+    )  # fmt: skip
+    ones = np.ones(len(slices))
+    start = FitStart.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
+    budget = TimeBudget.of(30.0)
+    settings, _ = budget.for_motion(planned)
+    settings = budget.for_prior(settings, 0.1)
+    settings, _, _ = budget.for_fit(settings, start, start.sharp, 0.1, 1000, np.random.default_rng(0))
+    assert settings.prior_stage.record_bytes == settings.slice_stage.record_bytes == 30 * MB
+    assert (settings.prior_whole_voxels, settings.prior_tile_voxels) == (0, 32)

@@ -1,0 +1,223 @@
+"""From slices to poses: what may not matter does not, and stacks are fitted against bad slices."""
+
+import dataclasses
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.slice_images import slice_images
+from g3r.acquisition.stacks import Stack
+from g3r.geometry import RigidPose
+from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid
+from g3r.pose_network.inference import (
+    VIEWS,
+    mean_pose,
+    pose_errors,
+    poses_of,
+    predict_poses,
+    slice_batch,
+    stack_motions,
+)
+from g3r.pose_network.network import PoseNetwork
+
+SHAPE = (2, 9, 9, 9)
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(3)
+    network = PoseNetwork(SHAPE, channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2).eval()
+    for part in (network.transformer, network.refining_transformer):
+        torch.nn.init.normal_(part.vote.weight, std=0.3)
+    network.set_template(torch.rand(SHAPE))
+    return network
+
+
+@pytest.fixture(scope="module")
+def meta(network):
+    template = AtlasTemplate(
+        np.zeros(SHAPE, np.float32), centred_grid(SHAPE, 3.0).affine, np.array([25.0, 31])
+    )
+    return PoseCheckpoint(network.arguments(), template, "nothing")
+
+
+def blob_stack(rotation, seed, shape=(50, 46, 12)):
+    """A stack of an egg with a bright spot, turned in the scanner."""
+    rng = np.random.default_rng(seed)
+    affine = np.eye(4)
+    affine[:3, :3] = rotation * [1.2, 1.2, 4.0]
+    affine[:3, 3] = -affine[:3, :3] @ ((np.array(shape) - 1) / 2)
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+    world = index @ affine[:3, :3].T + affine[:3, 3]
+    mask = ((world / [22, 26, 18]) ** 2).sum(-1) < 1
+    spot = np.exp(-((world - [8, 10, 5]) ** 2).sum(-1) / 50)
+    image = (1 + spot + 0.02 * rng.standard_normal(shape)).astype(np.float32)
+    return Stack(image, mask, affine, 4.0, f"stack-{seed}")
+
+
+@pytest.fixture(scope="module")
+def slices() -> Slices:
+    turns = Rotation.random(3, random_state=1).as_matrix()
+    return slices_from_stacks([blob_stack(turn, seed) for seed, turn in enumerate(turns)])
+
+
+def moved_headers(slices: Slices, motion: RigidPose) -> Slices:
+    header = motion @ slices.header_pose
+    return Slices(
+        slices.planes.with_pose(header), slices.value, slices.mask, slices.stack_id, slices.slice_index,
+        slices.thickness_mm, header,
+    )  # fmt: skip
+
+
+def assert_same(one: RigidPose, other: RigidPose, tolerance_mm: float) -> None:
+    distance_mm, _ = pose_errors(one, other)
+    assert distance_mm.max() < tolerance_mm
+
+
+@pytest.mark.parametrize("angle_deg", [(0, 0, 90), (180, 0, 0), (20, -50, 130)])
+def test_moving_all_headers_changes_nothing(network, meta, slices, angle_deg):
+    motion = RigidPose.from_rotvec(np.deg2rad([angle_deg]), np.array([[30.0, -200.0, 7.0]]))
+    before = predict_poses(network, meta, slices)
+    assert len(before) == len(slices)
+    assert_same(before, predict_poses(network, meta, moved_headers(slices, motion)), 1e-3)
+
+
+def test_present_poses_do_not_matter(network, meta, slices):
+    other = slices.with_pose(RigidPose.identity(len(slices)))
+    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, other), 1e-6)
+
+
+def test_the_order_does_not_matter(network, meta, slices):
+    order = np.random.default_rng(0).permutation(len(slices))
+    before = predict_poses(network, meta, slices).take(order)
+    assert_same(before, predict_poses(network, meta, slices.take(order)), 1e-2)  # sums in another order
+
+
+def test_numbers_of_stacks_do_not_matter(network, meta, slices):
+    renamed = Slices(
+        slices.planes, slices.value, slices.mask, 7 - 2 * slices.stack_id, slices.slice_index,
+        slices.thickness_mm, slices.header_pose,
+    )  # fmt: skip
+    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, renamed), 1e-3)
+
+
+def test_cropping_does_not_matter(network, meta, slices):
+    """The pose is that of the slice's own frame, wherever the cropping put its centre."""
+    planes = slices.planes
+    parts = [slice(*planes.offset[k : k + 2]) for k in range(len(slices))]
+    width = planes.shape[:, 1]
+
+    def padded(values):
+        blank = [np.zeros(2 * n, values.dtype) for n in width]  # two rows more on one side, not in the mask
+        return np.concatenate([np.concatenate([values[at], b]) for at, b in zip(parts, blank, strict=True)])
+
+    shift_mm = np.stack([planes.spacing_mm[:, 0], 0 * width, 0 * width], 1)
+    frame = RigidPose.from_rotvec(np.zeros((len(slices), 3)), shift_mm)
+    header = slices.header_pose @ frame
+    wider = dataclasses.replace(planes, shape=planes.shape + np.array([2, 0])).with_pose(header)
+    other = dataclasses.replace(
+        slices, planes=wider, value=padded(slices.value), mask=padded(slices.mask), header_pose=header
+    )
+    assert_same(predict_poses(network, meta, slices) @ frame, predict_poses(network, meta, other), 1e-3)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_slice_turned_over_is_the_same_slice(network, slices, view):
+    """Other signs of a slice's own axes: the same pixels, so the same place."""
+    images = slice_images(slices, 3.0, 40)
+    flips = tuple(slice(None, None, sign) for sign in view[:2])
+    turned = dataclasses.replace(
+        images,
+        image=np.ascontiguousarray(images.image[:, flips[0], flips[1]]),
+        position_mm=images.position_mm * view[2],
+        header_rotation=images.header_rotation * np.array(view),
+    )
+    one, other = (poses_of(network, slice_batch([some])) for some in (images, turned))
+    turn = RigidPose(np.broadcast_to(np.diag(view), (len(slices), 3, 3)), np.zeros((len(slices), 3)))
+    assert_same(one @ turn, other, 1e-2)
+
+
+def test_mean_pose_leaves_one_wrong_view_aside(rng):
+    true = RigidPose(Rotation.random(7, random_state=0).as_matrix(), rng.normal(0, 20, (7, 3)))
+    views = [
+        RigidPose.from_rotvec(rng.normal(0, 0.02, (7, 3)), rng.normal(0, 0.5, (7, 3))) @ true
+        for _ in range(3)
+    ]
+    wrong = RigidPose.from_rotvec(np.full((7, 3), [0, 0, 2.5]), np.full((7, 3), 9.0)) @ true
+    mean = mean_pose(
+        np.stack([p.rotation for p in (*views, wrong)]), np.stack([p.translation_mm for p in (*views, wrong)])
+    )
+    _, angle_deg = pose_errors(mean, true)
+    assert angle_deg.max() < 8
+
+
+def test_scale_of_intensities_does_not_matter(network, meta, slices):
+    assert_same(
+        predict_poses(network, meta, slices), predict_poses(network, meta, slices.scaled(1000.0)), 0.01
+    )
+
+
+def test_a_single_slice(network, meta, slices):
+    assert len(predict_poses(network, meta, slices.take([4]))) == 1
+
+
+def test_time_is_used_if_known(network, meta, slices):
+    known = predict_poses(network, meta, slices, np.linspace(0, 1, len(slices)))
+    distance_mm, _ = pose_errors(known, predict_poses(network, meta, slices))
+    assert distance_mm.max() > 1e-3
+
+
+def test_quick_enough():
+    network = PoseNetwork((6, 39, 45, 43)).eval()
+    template = AtlasTemplate(
+        np.zeros((6, 39, 45, 43), np.float32), centred_grid((6, 39, 45, 43), 3.0).affine, np.arange(6.0)
+    )
+    meta = PoseCheckpoint(network.arguments(), template, "nothing")
+    stacks = [
+        blob_stack(turn, seed, (70, 70, 44))
+        for seed, turn in enumerate(Rotation.random(6, random_state=1).as_matrix())
+    ]
+    slices = slices_from_stacks(stacks)
+    start = time.process_time()
+    predict_poses(network, meta, slices)
+    assert time.process_time() - start < 3.0 * max(len(slices) / 130, 1)
+
+
+def test_stack_motions_ignore_a_minority(rng):
+    stack_id = np.repeat([0, 1], 12)
+    header = RigidPose(Rotation.random(2, random_state=2).as_matrix()[stack_id], rng.normal(0, 20, (24, 3)))
+    motion = RigidPose(Rotation.random(2, random_state=3).as_matrix(), rng.normal(0, 30, (2, 3)))
+    noise = RigidPose.from_rotvec(rng.normal(0, 0.02, (24, 3)), rng.normal(0, 0.5, (24, 3)))
+    predicted = noise @ motion.take(stack_id) @ header
+    wrong = np.array([1, 4, 7, 10, 13, 16, 19])  # upside down
+    flipped = RigidPose.from_rotvec(np.full((7, 3), [np.pi, 0, 0]), np.zeros((7, 3)))
+    rotation, shift = predicted.rotation.copy(), predicted.translation_mm.copy()
+    rotation[wrong] = (flipped @ predicted.take(wrong)).rotation
+    shift[wrong] = (flipped @ predicted.take(wrong)).translation_mm
+    fitted = stack_motions(RigidPose(rotation, shift), header, stack_id)
+    _, angle_deg = pose_errors(fitted, motion)
+    assert angle_deg.max() < 2.0
+
+
+def test_pose_errors():
+    pose = RigidPose.from_rotvec(np.zeros((2, 3)), np.zeros((2, 3)))
+    other = RigidPose.from_rotvec([[0, 0, 0.1], [0, 0, 0]], [[0, 0, 0], [3, 4, 0]])
+    distance_mm, angle_deg = pose_errors(pose, other)
+    np.testing.assert_allclose(distance_mm, [0.8 * 25 * np.sqrt(2) * 2 * np.sin(0.05), 5.0], rtol=1e-6)
+    np.testing.assert_allclose(angle_deg, [np.rad2deg(0.1), 0.0], atol=1e-9)
+
+
+def test_inference_needs_no_training_packages():
+    code = (
+        "import sys, g3r.pose_network.inference, g3r.pose_network.network, g3r.pose_network.checkpoint\n"
+        "assert not {'lightning', 'torchio', 'pytorch_lightning'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,51 @@
+"""Heads that the tests of registration share; making them takes longer than most of the tests."""
+
+import pytest
+from moving_heads import Moving, as_slices, simulated
+
+from data_synth.heads import PhantomSubject
+from data_synth.motion import LEVELS
+from data_synth.phantom import Phantom, fetal_brain_phantom
+from data_synth.simulator import SimulatedStack
+from data_synth.template import mean_heads
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose
+from g3r.registration import MotionSettings, estimate_motion
+
+
+@pytest.fixture(scope="session")
+def head() -> Phantom:
+    return fetal_brain_phantom(24, 1.2)
+
+
+@pytest.fixture(scope="session")
+def still(head: Phantom) -> list[SimulatedStack]:
+    """Three stacks of a head that lies still, clean."""
+    return simulated(head)
+
+
+@pytest.fixture(scope="session")
+def still_slices(still: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
+    """The same as slices, and their true motions: none."""
+    return as_slices(still)
+
+
+@pytest.fixture(scope="session")
+def template() -> AtlasTemplate:
+    """Mean heads of other phantoms, about as old and older."""
+    subjects = [PhantomSubject(f"week-{w}-{seed}", w, seed) for w in (24.0, 31.0) for seed in (1, 2, 3)]
+    return mean_heads(subjects, 3.0, weeks=(24, 31))
+
+
+@pytest.fixture(scope="session")
+def moving(head: Phantom, template: AtlasTemplate) -> Moving:
+    """Severe motion with every layer on: walks, four jerks a stack, stacks 25 degrees per axis apart."""
+    stacks = simulated(head, LEVELS["severe"], seed=2)
+    slices, truth = as_slices(stacks)
+    calls: list[tuple[int, int]] = []
+    estimate = estimate_motion(
+        slices, MotionSettings(n_rounds=4, finest_voxel_mm=1.8),
+        lambda done, total: calls.append((done, total)), template=template,
+    )  # fmt: skip
+    return Moving(stacks, slices, truth, estimate, calls)

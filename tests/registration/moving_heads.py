@@ -1,0 +1,112 @@
+"""Small moving heads whose true poses are known, for the tests of registration."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_synth.motion import MotionLevel
+from data_synth.phantom import Phantom
+from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
+from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import fit_rigid
+from g3r.registration import MotionEstimate
+
+STILL = MotionLevel()
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A head that moved, the truth, and one estimate of it with every layer on."""
+
+    stacks: list[SimulatedStack]
+    slices: Slices
+    truth: RigidPose
+    estimate: MotionEstimate
+    progress: list[tuple[int, int]]
+
+
+def simulated(
+    head: Phantom,
+    level: MotionLevel | Sequence[MotionLevel] = STILL,
+    *,
+    n_stacks: int = 3,
+    seed: int = 0,
+    interleave: int = 2,
+) -> list[SimulatedStack]:
+    """Clean thick stacks of a head; a level for all of them, or one for each."""
+    settings = orthogonal_settings(
+        n_stacks, resolution_mm=1.5, thickness_mm=4.0, snr=60.0, bias=0.0, gain_deviation=0.0
+    )
+    levels = [level] * n_stacks if isinstance(level, MotionLevel) else level
+    settings = [
+        replace(one, motion=of_stack, interleave=interleave)
+        for one, of_stack in zip(settings, levels, strict=True)
+    ]
+    return simulate_stacks(head.t2, head.mask, head.affine, settings, np.random.default_rng(seed))
+
+
+def as_slices(stacks: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
+    """Slices with intensities of order one, and where a point by the header truly lies."""
+    slices = slices_from_stacks([one.stack for one in stacks])
+    slices = slices.scaled(1 / float(np.percentile(slices.masked_value, 99)))
+    poses = [one.true_pose for one in stacks]
+    chosen = [
+        (poses[s].rotation[k], poses[s].translation_mm[k])
+        for s, k in zip(slices.stack_id, slices.slice_index, strict=True)
+    ]
+    return slices, RigidPose(np.array([c[0] for c in chosen]), np.array([c[1] for c in chosen]))
+
+
+def pixel_errors_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
+    """Distance of every masked pixel from its true place once one global motion is taken out [P'].
+
+    The global motion is fitted robustly, so that slices that went astray do not tilt it.
+    """
+    found, true = slices.planes.pixel_world_mm(slices.pixel_index), true_places_mm(slices, truth)
+    weight = np.ones(len(found))
+    for _ in range(8):
+        error = np.linalg.norm(fit_rigid(found, true, weight).apply(found[None])[0] - true, axis=1)
+        weight = 1 / (1 + error**2)
+    return error
+
+
+def true_places_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
+    """Where every masked pixel truly lies [P', 3]."""
+    header = slices.planes.with_pose(slices.header_pose).pixel_world_mm(slices.pixel_index)
+    plane = slices.pixel_plane
+    return np.einsum("pij,pj->pi", truth.rotation[plane], header) + truth.translation_mm[plane]
+
+
+def slices_disturbed(slices: Slices, degrees: float, mm: float, seed: int = 0) -> Slices:
+    """Every slice turned and shifted at random about its own middle."""
+    rng = np.random.default_rng(seed)
+    turn = RigidPose.from_rotvec(
+        np.deg2rad(rng.normal(0, degrees, (len(slices), 3))), np.zeros((len(slices), 3))
+    )
+    pose = slices.planes.pose @ turn
+    return slices.with_pose(
+        RigidPose(pose.rotation, pose.translation_mm + rng.normal(0, mm, (len(slices), 3)))
+    )
+
+
+def stack_moved(motion: RigidPose, slices: Slices, stack: int, by: RigidPose) -> RigidPose:
+    """Motions [K] of which those of one stack are followed by one more."""
+    rows = slices.stack_id == stack
+    after = by @ motion
+    return RigidPose(
+        np.where(rows[:, None, None], after.rotation, motion.rotation),
+        np.where(rows[:, None], after.translation_mm, motion.translation_mm),
+    )
+
+
+def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, shift_mm: np.ndarray) -> RigidPose:
+    """One motion: a turn about a point, then a shift."""
+    turn = RigidPose.from_rotvec([rotvec_rad], np.zeros((1, 3)))
+    return RigidPose(turn.rotation, (center_mm - turn.rotation[0] @ center_mm + shift_mm)[None])
+
+
+def turn_angle_deg(rotation: np.ndarray) -> float:
+    """Angle of a rotation [3, 3]."""
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

@@ -1,0 +1,99 @@
+"""Shading is taken out of stacks before they are registered; a single stack's slices follow the prior."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from moving_heads import STILL, as_slices, pixel_errors_mm, simulated, turned_about
+from scipy.ndimage import gaussian_filter
+
+from data_synth.motion import MotionLevel
+from data_synth.phantom import Phantom
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.coarse_volume import coarse_and_density
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.bias_correction import LENGTH_MM, flattened
+from g3r.registration.prior_registration import register_to_prior
+
+
+def shaded(slices: Slices, strength: float) -> Slices:
+    """A smooth factor across each stack, another for each, and none across its slices."""
+    planes = slices.planes.with_pose(slices.header_pose)
+    plane, world_mm = planes.plane_id(), planes.pixel_world_mm()
+    value = slices.value.copy()
+    for stack in range(3):
+        rows = (slices.stack_id == stack)[plane]
+        axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
+        x, y = (world_mm[rows] @ axes / LENGTH_MM).T
+        a, b, c = strength * np.random.default_rng(stack).normal(size=3)
+        value[rows] *= np.exp(a * x + b * y + c * x * y).astype(np.float32)
+    return replace(slices, value=value)
+
+
+def log_ratio_spread(a: Slices, b: Slices) -> float:
+    """How far two versions of the slices differ by more than a factor for each stack."""
+    ratio = np.log(np.maximum(a.masked_value, 1e-3) / np.maximum(b.masked_value, 1e-3))
+    stack = a.stack_id[a.pixel_plane]
+    return float(np.mean([ratio[stack == s].std() for s in range(3)]))
+
+
+def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, RigidPose]):
+    slices, _ = still_slices
+    dark = shaded(slices, 1.0)
+    before, after = log_ratio_spread(dark, slices), log_ratio_spread(flattened(dark), flattened(slices))
+    assert before > 0.1
+    assert after < 0.15 * before
+
+
+def test_slices_keep_their_gains_and_everything_else(still_slices: tuple[Slices, RigidPose]):
+    slices, _ = still_slices
+    gain = np.exp(np.random.default_rng(0).normal(0, 0.1, len(slices)))[slices.planes.plane_id()]
+    flat = flattened(slices)
+    gained = flattened(replace(slices, value=(slices.value * gain).astype(np.float32)))
+    ratio = np.log(gained.masked_value / flat.masked_value)
+    plane = slices.pixel_plane
+    within = np.mean([ratio[plane == k].std() for k in range(len(slices))])
+    assert within < 0.3 * np.log(gain).std()
+    np.testing.assert_array_equal(flat.mask, slices.mask)
+    np.testing.assert_array_equal(flat.planes.center_mm, slices.planes.center_mm)
+    assert not np.shares_memory(flat.value, slices.value)
+
+
+def test_the_scanners_frame_and_the_present_poses_do_not_matter(still_slices: tuple[Slices, RigidPose]):
+    slices, _ = still_slices
+    turn = turned_about(np.zeros(3), np.array([1.0, -2.0, 0.5]), np.array([30.0, 0, -60]))
+    turned = replace(slices, header_pose=turn @ slices.header_pose)
+    np.testing.assert_allclose(flattened(turned).value, flattened(slices).value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("constant", [0.0, -1.0, 2.0])
+def test_stacks_without_contrast_stay_as_they_are(still_slices: tuple[Slices, RigidPose], constant: float):
+    slices, _ = still_slices
+    flat = flattened(replace(slices, value=np.full_like(slices.value, constant)))
+    np.testing.assert_allclose(flat.value, constant, rtol=1e-3)
+
+
+# -- a single stack against the prior --------------------------------------------------------------
+
+
+def test_slices_that_moved_come_nearer_to_a_good_prior(head: Phantom):
+    slices, truth = as_slices(simulated(head, MotionLevel(walk_deg=1.2, walk_mm=0.8), n_stacks=1))
+    bright = np.percentile(head.t2[head.mask], 99)
+    prior = (gaussian_filter(head.t2 * head.mask, 0.8) / bright).astype(np.float32)
+    grid = VolumeGrid(head.t2.shape, head.affine)
+    found, gain, believed = register_to_prior(slices, np.ones(len(slices)), prior, grid)
+    assert believed
+    assert np.median(pixel_errors_mm(found, truth)) < 0.4 * np.median(pixel_errors_mm(slices, truth))
+    assert gain.shape == (len(slices),)
+
+
+def test_slices_in_line_stay_there_against_a_prior_that_says_nothing_new(head: Phantom):
+    slices, _ = as_slices(simulated(head, STILL, n_stacks=1))
+    grid = grid_around(slices, 1.5)
+    coarse, _ = coarse_and_density(slices, grid)
+    gain = np.full(len(slices), 1.05)
+    found, same, believed = register_to_prior(slices, gain, coarse, grid)
+    assert not believed
+    assert found is slices
+    assert same is gain

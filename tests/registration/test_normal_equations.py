@@ -1,0 +1,153 @@
+"""Gradient and Gauss-Newton matrix of the slice model against finite differences of the voxel operator."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry.rigid import rotation_matrix
+from g3r.registration.normal_equations import SliceModel, correlation
+
+AFFINE = np.eye(4)
+AFFINE[:3, :3] = Rotation.from_rotvec([0.4, -0.2, 0.3]).as_matrix() * [1.0, -1.1, 0.9]
+AFFINE[:3, 3] = [-20, 25, -20]
+GRID = VolumeGrid((44, 40, 46), AFFINE)
+
+
+def smooth_volume() -> np.ndarray:
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1)
+    x = GRID.world(index) - GRID.center_mm
+    wave = np.sin(0.21 * x[..., 0] + 0.1 * x[..., 1]) * np.cos(0.17 * x[..., 2] - 0.08 * x[..., 1])
+    return (1 + 0.5 * wave).astype(np.float32)
+
+
+def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
+    """Planes well inside the grid; pixels with a gain and noise of their own."""
+    rng = np.random.default_rng(seed)
+    spacing = np.full((n, 2), 1.3)
+    planes = Planes(
+        Rotation.random(n, rng=rng).as_matrix(), GRID.center_mm + rng.normal(0, 1.5, (n, 3)), spacing,
+        np.full((n, 2), 9), psf_variance_mm2(spacing, np.full(n, 3.0)),
+    )  # fmt: skip
+    volume = smooth_volume()
+    gain = rng.uniform(0.7, 1.4, n)
+    value = VoxelOperator(planes, GRID).forward(volume) * gain[planes.plane_id()]
+    value = value + rng.normal(0, 0.05, planes.n_pixels)
+    mask = rng.random(planes.n_pixels) < 0.8
+    stack = np.zeros(n, np.int64)
+    slices = Slices(planes, value.astype(np.float32), mask, stack, np.arange(n), np.full(n, 3.0), planes.pose)
+    # not at the optimum, where the gradient would vanish
+    start = RigidPose(
+        planes.rotation @ rotation_matrix(rng.normal(0, 0.05, (n, 3))),
+        planes.center_mm + rng.normal(0, 0.5, (n, 3)),
+    )
+    return slices.with_pose(start), rng.uniform(0.8, 1.2, n)
+
+
+def stepped(pose: RigidPose, gain: np.ndarray, parameter: int, size: float) -> tuple[RigidPose, np.ndarray]:
+    """Body-frame turn (0-2), body-frame shift (3-5) or log-gain (6) of every slice."""
+    change = np.zeros((len(pose), 7))
+    change[:, parameter] = size
+    turned = pose.rotation @ rotation_matrix(change[:, :3])
+    moved = pose.translation_mm + np.einsum("kij,kj->ki", pose.rotation, change[:, 3:6])
+    return RigidPose(turned, moved), gain * np.exp(change[:, 6])
+
+
+def model_pixels(slices: Slices, pose: RigidPose, gain: np.ndarray) -> np.ndarray:
+    operator = VoxelOperator(slices.planes.with_pose(pose), GRID, slices.pixel_index)
+    return gain[operator.plane] * operator.forward(smooth_volume().astype(np.float64))
+
+
+def jacobian(slices: Slices, gain: np.ndarray, size: float = 1e-6) -> np.ndarray:
+    """d model / d parameter of every masked pixel [P', 7], central differences."""
+    pose = slices.planes.pose
+
+    def at(parameter: int, step: float) -> np.ndarray:
+        return model_pixels(slices, *stepped(pose, gain, parameter, step))
+
+    return np.stack([(at(a, size) - at(a, -size)) / (2 * size) for a in range(7)], 1)
+
+
+@pytest.mark.parametrize("width", [0.05, 1e6])
+def test_gradient_and_hessian_against_finite_differences(width: float):
+    slices, gain = make_slices()
+    equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, width)
+    derivative = jacobian(slices, gain)
+    residual = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
+    factor = 1 / (1 + (residual / width) ** 2)
+    for k in range(len(slices)):
+        of_slice = slices.pixel_plane == k
+        j, f = derivative[of_slice], factor[of_slice]
+        gradient, hessian = j.T @ (f * residual[of_slice]), j.T @ (f[:, None] * j)
+        # volumes are float32; a step of 1e-6 seldom crosses a voxel's border, where the derivative jumps
+        assert np.linalg.norm(equations.gradient[k] - gradient) < 1e-4 * np.linalg.norm(gradient)
+        assert np.linalg.norm(equations.hessian[k] - hessian) < 1e-4 * np.linalg.norm(hessian)
+
+
+def test_the_gradient_is_that_of_the_cauchy_loss():
+    slices, gain = make_slices(1)
+    width, size = 0.1, 1e-5
+    model = SliceModel(slices, smooth_volume(), GRID)
+
+    def energy(pose: RigidPose, gain: np.ndarray) -> np.ndarray:
+        equations = model.evaluate(slices.planes.with_pose(pose), gain, width)
+        return 0.5 * width**2 * equations.loss * equations.moments[:, 0]
+
+    pose = slices.planes.pose
+    found = model.evaluate(slices.planes, gain, width).gradient
+    for a in range(7):
+        down = (energy(*stepped(pose, gain, a, -size)) - energy(*stepped(pose, gain, a, size))) / (2 * size)
+        np.testing.assert_allclose(found[:, a], down, atol=2e-3 * np.abs(found).max())
+
+
+def test_statistics_are_those_of_the_pixels():
+    slices, gain = make_slices(2)
+    equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
+    model = model_pixels(slices, slices.planes.pose, np.ones(len(slices)))
+    for k in range(len(slices)):
+        y, m = slices.masked_value[slices.pixel_plane == k].astype(float), model[slices.pixel_plane == k]
+        assert equations.ncc[k] == pytest.approx(np.corrcoef(y, m)[0, 1], abs=1e-5)
+        assert equations.moments[k, 0] == len(y)
+        assert equations.loss[k] == pytest.approx(np.log1p(((y - gain[k] * m) / 0.1) ** 2).mean(), rel=1e-4)
+
+
+def test_stride_takes_every_nth_pixel_and_residuals_match():
+    slices, gain = make_slices(3)
+    model = SliceModel(slices, smooth_volume(), GRID, stride=3)
+    expected = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
+    np.testing.assert_allclose(model.residuals(slices.planes, gain), expected[::3], atol=1e-5)
+    assert model.evaluate(slices.planes, gain, 1.0).moments[:, 0].sum() == len(expected[::3])
+
+
+def test_pixel_weights_count():
+    slices, gain = make_slices(4)
+    weight = np.where(slices.pixel_plane == 1, 0.0, 2.0).astype(np.float32)
+    plain = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
+    weighted = SliceModel(slices, smooth_volume(), GRID, weight=weight).evaluate(slices.planes, gain, 0.1)
+    assert (weighted.hessian[1] == 0).all()
+    assert weighted.loss[1] == 0
+    np.testing.assert_allclose(weighted.hessian[0], 2 * plain.hessian[0], rtol=1e-6)
+    np.testing.assert_allclose(weighted.loss[0], plain.loss[0], rtol=1e-6)
+
+
+def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero():
+    slices, gain = make_slices(5)
+    away = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + 500))
+    equations = SliceModel(away, smooth_volume(), GRID).evaluate(away.planes, gain, 0.1)
+    assert (equations.hessian == 0).all()
+    assert (equations.ncc == 0).all()
+    assert np.isfinite(equations.loss).all()
+
+
+def test_correlation_of_constants_is_zero():
+    n = 10.0
+    moments = np.array([
+        [n, n, 2 * n, n, 4 * n, 2 * n],  # both constant
+        [0, 0, 0, 0, 0, 0],
+        [2, 3, 3, 5, 5, 5],  # (1, 2) with itself
+        [2, 3, 3, 5, 5, 4],  # (1, 2) with (2, 1)
+    ])  # fmt: skip
+    np.testing.assert_allclose(correlation(moments), [0, 0, 1, -1])

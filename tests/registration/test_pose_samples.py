@@ -1,0 +1,226 @@
+"""Candidate motions and how well slices fit under them, against plain numpy and scipy."""
+
+import numpy as np
+import pytest
+from moving_heads import slices_disturbed
+from scipy.ndimage import map_coordinates
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.planes import Planes, Slices
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.placement import own_moments
+from g3r.registration.pose_samples import (
+    GAIN_RANGE,
+    SearchPixels,
+    angle_deg,
+    distinct,
+    mean_square_residual,
+    perturbed,
+    rotations_within,
+    turns_about,
+    uniform_rotations,
+)
+
+CENTER_MM = np.array([10.0, -20.0, 30.0])
+
+
+def few_slices(n: int = 7) -> Slices:
+    """Slices of unlike sizes and masks with random values, in arbitrary poses."""
+    rng = np.random.default_rng(5)
+    shape = rng.integers(3, 40, (n, 2))
+    planes = Planes(
+        Rotation.random(n, rng=rng).as_matrix(), rng.normal(0, 8, (n, 3)) + CENTER_MM,
+        rng.uniform(0.7, 1.5, (n, 2)), shape, np.zeros((n, 3)),
+    )  # fmt: skip
+    value = rng.random(planes.n_pixels).astype(np.float32)
+    mask = rng.random(planes.n_pixels) < 0.7
+    return Slices(planes, value, mask, np.arange(n) % 2, np.arange(n), np.full(n, 3.0), planes.pose)
+
+
+def test_uniform_rotations_are_rotations_that_cover_the_sphere(rng: np.random.Generator):
+    rotation = uniform_rotations(4000)
+    np.testing.assert_allclose(
+        rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+    asked = Rotation.random(400, rng=rng).as_matrix()
+    nearest = np.array([angle_deg(rotation, one).min() for one in asked])
+    assert nearest.max() < 20
+    assert np.median(nearest) < 11
+    # no two of them say the same
+    assert min(np.partition(angle_deg(rotation, one), 1)[1] for one in rotation[::40]) > 5
+
+
+def test_rotations_within_a_limit_are_the_share_that_the_sphere_has_there():
+    near = rotations_within(20_000, 70.0)
+    assert angle_deg(near, np.eye(3)).max() < 70
+    limit = np.deg2rad(70)
+    assert len(near) / 20_000 == pytest.approx((limit - np.sin(limit)) / np.pi, rel=0.05)
+
+
+def test_angles_between_rotations():
+    turn = Rotation.from_rotvec(np.deg2rad([[0, 0, 0], [0, 30, 0], [180, 0, 0], [0, 1e-3, 0]])).as_matrix()
+    np.testing.assert_allclose(angle_deg(turn, np.eye(3)), [0, 30, 180, 1e-3], atol=1e-5)
+    base = Rotation.random(1, rng=np.random.default_rng(3)).as_matrix()[0]
+    np.testing.assert_allclose(angle_deg(turn @ base, base), [0, 30, 180, 1e-3], atol=1e-4)
+
+
+@pytest.mark.parametrize("target", [np.array([1.0, 2, 3]), np.arange(12.0).reshape(4, 3)])
+def test_turns_about_a_point_take_it_to_the_target(target: np.ndarray):
+    motion = turns_about(uniform_rotations(4), CENTER_MM, target)
+    np.testing.assert_allclose(
+        motion.apply(np.tile(CENTER_MM, (4, 1))), np.broadcast_to(target, (4, 3)), atol=1e-12
+    )
+
+
+def test_perturbed_keeps_what_it_was_given_and_spreads_as_stated(rng: np.random.Generator):
+    given = turns_about(uniform_rotations(3), CENTER_MM, CENTER_MM + rng.normal(0, 9, (3, 3)))
+    found = perturbed(given, CENTER_MM, 2000, 6.0, 2.5, rng)
+    assert len(found) == 3 * 2001
+    np.testing.assert_array_equal(found.rotation[:3], given.rotation)
+    np.testing.assert_array_equal(found.translation_mm[:3], given.translation_mm)
+    for k in range(3):  # in blocks, each around its own
+        block = found.take(np.arange(3 + 2000 * k, 3 + 2000 * (k + 1)))
+        turn = Rotation.from_matrix(block.rotation @ given.rotation[k].T).as_rotvec(degrees=True)
+        shift = block.apply(np.tile(CENTER_MM, (2000, 1))) - given.apply(np.tile(CENTER_MM, (3, 1)))[k]
+        np.testing.assert_allclose(turn.std(0), 6.0, rtol=0.08)
+        np.testing.assert_allclose(shift.std(0), 2.5, rtol=0.08)
+        assert np.abs(turn.mean(0)).max() < 0.5
+        assert np.abs(shift.mean(0)).max() < 0.25
+
+
+def test_distinct_motions_are_kept_once_in_their_order(rng: np.random.Generator):
+    three = turns_about(uniform_rotations(3), CENTER_MM, CENTER_MM + rng.normal(0, 9, (3, 3)))
+    again = three.take([2, 0, 2, 1, 0, 1, 1])
+    found = distinct(again, CENTER_MM)
+    np.testing.assert_array_equal(found.translation_mm, three.translation_mm[[2, 0, 1]])
+    shifted = RigidPose(three.rotation, three.translation_mm + 0.1)
+    both = RigidPose(
+        np.concatenate([three.rotation, shifted.rotation]),
+        np.concatenate([three.translation_mm, shifted.translation_mm]),
+    )
+    assert len(distinct(both, CENTER_MM)) == 6
+    turned = RigidPose.from_rotvec([[0, 0, 0], np.deg2rad([0, 0, 0.3])], np.zeros((2, 3)))
+    assert len(distinct(turned, np.zeros(3))) == 2
+
+
+def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
+    slices = few_slices()
+    pixels = SearchPixels.of(slices, pixels_per_slice=60)
+    assert len(pixels) == len(slices)
+    assert pixels.start[0] == 0
+    assert pixels.start[-1] == len(pixels.point_mm) == len(pixels.value)
+    for k in range(len(slices)):
+        points = pixels.point_mm[pixels.start[k] : pixels.start[k + 1]]
+        values = pixels.value[pixels.start[k] : pixels.start[k + 1]]
+        own = np.arange(slices.planes.offset[k], slices.planes.offset[k + 1])
+        n = slices.planes.shape[k].prod()
+        assert min(n, 60) / 2.5 < len(points) <= 3 * 60
+        distance = np.linalg.norm(points[:, None] - slices.planes.pixel_world_mm(own)[None], axis=2)
+        assert distance.min(1).max() < 1e-9
+        nearest = own[distance.argmin(1)]
+        assert len(set(nearest.tolist())) == len(nearest)
+        np.testing.assert_array_equal(values, np.where(slices.mask[nearest], slices.value[nearest], 0))
+        size_mm = slices.planes.shape[k] * slices.planes.spacing_mm[k]
+        assert pixels.area_mm2[k] == pytest.approx(size_mm.prod())
+
+
+def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too():
+    planes = Planes(
+        np.tile(np.eye(3), (2, 1, 1)),
+        np.zeros((2, 3)),
+        np.ones((2, 2)),
+        [[1, 50], [20, 20]],
+        np.zeros((2, 3)),
+    )
+    mask = np.zeros(450, bool)
+    pixels = SearchPixels.of(
+        Slices(
+            planes, np.ones(450, np.float32), mask, np.zeros(2, int), np.arange(2), np.ones(2), planes.pose
+        ),
+        16,
+    )
+    assert (np.diff(pixels.start) >= 10).all()
+    assert (pixels.value == 0).all()
+    assert np.isfinite(pixels.center_mm).all()
+
+
+def plain_moments(
+    pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose
+) -> np.ndarray:
+    """The six sums by scipy; outside of the voxels' centres the volume is 0."""
+    out = np.zeros((len(motion), len(pixels), 6))
+    for j in range(len(motion)):
+        moved = pixels.point_mm @ motion.rotation[j].T + motion.translation_mm[j]
+        index = grid.index(moved)
+        inside = ((index >= 0) & (index < np.array(grid.shape) - 1)).all(1)
+        model = np.where(inside, map_coordinates(volume.astype(float), index.T, order=1), 0)
+        for k in range(len(pixels)):
+            rows = slice(pixels.start[k], pixels.start[k + 1])
+            y, m = pixels.value[rows].astype(float), model[rows]
+            out[j, k] = len(y), y.sum(), m.sum(), y @ y, m @ m, y @ m
+    return out
+
+
+def oblique_volume(rng: np.random.Generator) -> tuple[np.ndarray, VolumeGrid]:
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix() * [-1.5, 2.0, 1.7]
+    grid = VolumeGrid((14, 17, 12), affine)
+    affine[:3, 3] = CENTER_MM - grid.center_mm
+    return rng.random(grid.shape).astype(np.float32), VolumeGrid(grid.shape, affine)
+
+
+def test_moments_are_those_of_plain_trilinear_reading(rng: np.random.Generator):
+    pixels = SearchPixels.of(few_slices())
+    volume, grid = oblique_volume(rng)
+    motion = perturbed(RigidPose.identity(1), CENTER_MM, 5, 30.0, 6.0, rng)
+    expected = plain_moments(pixels, volume, grid, motion)
+    found = pixels.moments(volume, grid, motion)
+    assert (expected[..., 4] > 0).any()  # some pixels fall inside, some outside
+    assert (expected[..., 2] < 0.4 * expected[..., 0]).any()
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_outside_of_the_volume_there_is_nothing(rng: np.random.Generator):
+    pixels = SearchPixels.of(few_slices())
+    volume, grid = oblique_volume(rng)
+    far = RigidPose(np.eye(3)[None], np.array([[500.0, 0, 0]]))
+    found = pixels.moments(volume, grid, far)
+    assert (found[..., [2, 4, 5]] == 0).all()
+    assert (found[..., 3] > 0).all()
+
+
+def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generator):
+    slices = few_slices()
+    pixels = SearchPixels.of(slices)
+    volume, grid = oblique_volume(rng)
+    disturbed = slices_disturbed(slices, 20.0, 3.0)
+    motion = disturbed.world_from_header()
+    every = pixels.moments(volume, grid, motion)
+    own = own_moments(pixels, volume, grid, motion)
+    np.testing.assert_allclose(
+        own, every[np.arange(len(slices)), np.arange(len(slices))], rtol=1e-6, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("gain", [0.1, 0.6, 0.97, 1.6, 5.0])
+def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.random.Generator):
+    m = rng.random((4, 50))
+    y = gain * m + 0.1 * rng.normal(size=m.shape)
+    moments = np.stack(
+        [np.full(4, 50.0), y.sum(1), m.sum(1), (y * y).sum(1), (m * m).sum(1), (y * m).sum(1)], axis=1
+    )
+    expected = [
+        minimize_scalar(
+            lambda g, a=a, b=b: ((a - g * b) ** 2).mean(), bounds=GAIN_RANGE, method="bounded"
+        ).fun
+        for a, b in zip(y, m, strict=True)
+    ]
+    np.testing.assert_allclose(mean_square_residual(moments), expected, rtol=1e-4)
+
+
+def test_the_residual_of_an_empty_model_is_the_image_and_never_negative():
+    moments = np.array([[10.0, 5, 0, 4, 0, 0], [10, 5, 5, 4, 4, 4 + 1e-13], [0, 0, 0, 0, 0, 0]])
+    np.testing.assert_allclose(mean_square_residual(moments), [0.4, 0, 0], atol=1e-12)
+    assert (mean_square_residual(moments) >= 0).all()

@@ -1,0 +1,259 @@
+"""Where an unknown head lies, whichever way it was scanned; and its standard orientation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from moving_heads import Moving, as_slices, pixel_errors_mm, simulated, turn_angle_deg, turned_about
+from scipy.spatial.transform import Rotation
+
+from data_synth.phantom import Phantom
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration import MotionSettings, estimate_motion
+from g3r.registration.atlas_frame import standard_orientation
+from g3r.registration.candidates import moved
+from g3r.registration.placement import StackPixels
+from g3r.registration.pose_samples import angle_deg, turns_about, uniform_rotations
+from g3r.registration.so3_search import PEAK_MARGIN, peaks, place_around, stack_orientations
+from g3r.registration.template_search import (
+    fitted_head,
+    head_orientations,
+    head_volume_mm3,
+    near_heads,
+    place_in_template,
+    template_fits,
+)
+
+TURNS = {"180 x": [np.pi, 0, 0], "180 z": [0, 0, np.pi], "oblique": [2.0, -1.2, 1.5]}
+PLACE_MM = np.array([20.0, -30.0, 40.0])
+
+
+def turned_phantom(head: Phantom, rotation: np.ndarray) -> Phantom:
+    """The head lying another way in the scanner, away from the origin."""
+    affine = head.affine.copy()
+    affine[:3] = rotation @ head.affine[:3]
+    affine[:3, 3] += PLACE_MM
+    return replace(head, affine=affine)
+
+
+def headers_turned(slices: Slices, rotvec: list[float]) -> Slices:
+    """The same slices with headers that say that everything lies another way."""
+    turned = turned_about(np.zeros(3), np.array(rotvec), PLACE_MM) @ slices.header_pose
+    return replace(slices.with_pose(turned), header_pose=turned)
+
+
+@pytest.mark.parametrize(
+    ("turn", "order"), [("180 x", (2, 0, 1)), ("180 z", (0, 1, 2)), ("oblique", (1, 2, 0))]
+)
+def test_a_head_in_any_orientation_is_found_and_set_upright(
+    head: Phantom, template: AtlasTemplate, turn: str, order: tuple[int, ...]
+):
+    rotation = Rotation.from_rotvec(TURNS[turn]).as_matrix()
+    stacks = simulated(turned_phantom(head, rotation))
+    slices, truth = as_slices([stacks[k] for k in order])
+    parts = StackPixels.of_all(slices)
+    rng = np.random.default_rng(0)
+    placed = place_in_template(slices, parts, template, rng)
+    motion = placed.motion(len(slices), parts)
+    error = pixel_errors_mm(moved(slices, motion), truth)
+    assert np.median(error) < 2
+    assert error.max() < 5
+    assert placed.correlation > 0.7
+    assert max(angle_deg(m @ rotation, np.eye(3)) for m in motion.rotation) < 15
+    # the atlas frame is that of the phantom, but for the turn
+    upright = standard_orientation(slices, placed.heads, motion, rng)
+    assert upright is not None
+    back = upright.pose @ slices.planes.pose.inverse()
+    np.testing.assert_allclose(back.rotation, back.rotation[:1].repeat(len(back), 0), atol=1e-9)
+    assert turn_angle_deg(back.rotation[0] @ rotation) < 5
+    middle = back.apply(np.tile(PLACE_MM, (len(back), 1)))[0]
+    assert abs(middle[0]) < 1.5  # the mid-sagittal plane is at x = 0
+    assert upright.correlation > 0.7
+
+
+def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], template: AtlasTemplate):
+    slices, _ = as_slices(still)
+    settings = MotionSettings(network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=3.0)
+    plain = estimate_motion(slices, settings, template=template)
+    assert plain.orientation is not None
+    # the phantom stands as the atlas does
+    assert max(turn_angle_deg(r) for r in plain.slices.world_from_header().rotation) < 5
+    turned = estimate_motion(headers_turned(slices, [0, 0, np.pi / 2]), settings, template=template)
+    assert turned.orientation is not None
+    apart = plain.slices.planes.pose.inverse() @ turned.slices.planes.pose
+    assert max(turn_angle_deg(r) for r in apart.rotation) < 5
+    away = plain.slices.planes.pixel_world_mm() - turned.slices.planes.pixel_world_mm()
+    assert np.linalg.norm(away, axis=1).mean() < 2
+
+
+def test_the_result_of_a_moving_head_stands_upright(moving: Moving):
+    """The phantom's own frame is the atlas', so that the true motions lead there."""
+    found = moving.estimate.slices.world_from_header()
+    common = found @ moving.truth.inverse()
+    middle = len(found) // 2
+    angles = sorted(turn_angle_deg(r) for r in common.rotation)
+    assert angles[middle] < 5
+    centers = moving.slices.header_pose.translation_mm[:, None]
+    away = np.linalg.norm((found.apply(centers) - moving.truth.apply(centers))[:, 0], axis=1)
+    assert np.median(away) < 8  # the mean head's middle is not quite the phantom's
+
+
+def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTemplate):
+    slices = headers_turned(as_slices(still[:1])[0], [0, np.pi, 0])
+    settings = MotionSettings(runs=False, finest_voxel_mm=3.0, standard_orientation=False)
+    estimate = estimate_motion(slices, settings, template=template)
+    assert estimate.orientation is None
+    np.testing.assert_allclose(estimate.slices.world_from_header().rotvec_rad(), 0, atol=1e-6)
+    upright = estimate_motion(slices, replace(settings, standard_orientation=True), template=template)
+    assert upright.orientation is not None
+    assert min(turn_angle_deg(r) for r in upright.slices.world_from_header().rotation) > 160
+
+
+def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
+    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
+):
+    slices, _ = still_slices
+    noise = np.random.default_rng(0).random(len(slices.value)).astype(np.float32)
+    scattered = slices.with_pose(
+        RigidPose(
+            slices.planes.rotation,
+            slices.planes.center_mm + np.random.default_rng(1).normal(0, 20, (len(slices), 3)),
+        )
+    )
+    heads = near_heads(slices, template)
+    still = RigidPose.identity(len(slices))
+    rng = np.random.default_rng(0)
+    assert standard_orientation(replace(scattered, value=noise), heads, still, rng) is None
+    assert standard_orientation(slices, heads, still, rng) is not None
+
+
+# -- size ------------------------------------------------------------------------------------------
+
+
+def test_the_masked_volume_is_the_heads(head: Phantom, still_slices: tuple[Slices, RigidPose]):
+    slices, _ = still_slices
+    true_mm3 = head.mask.sum() * abs(np.linalg.det(head.affine))
+    assert head_volume_mm3(slices) == pytest.approx(true_mm3, rel=0.05)
+    # by the distance of slices, whichever of them are there
+    assert head_volume_mm3(slices.take(slices.stack_id == 1)) == pytest.approx(true_mm3, rel=0.07)
+    other = slices.take(slices.slice_index % 2 == 0)
+    assert head_volume_mm3(other) == pytest.approx(true_mm3 / 2, rel=0.1)
+    one = slices.take([20])
+    area = one.mask.sum() * one.planes.spacing_mm[0].prod()
+    assert head_volume_mm3(one) == pytest.approx(area * one.thickness_mm[0])
+
+
+def test_masks_of_another_size_than_any_head_are_refused(
+    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
+):
+    slices, _ = still_slices
+
+    def enlarged(factor: float) -> Slices:
+        return replace(slices, planes=replace(slices.planes, spacing_mm=slices.planes.spacing_mm * factor))
+
+    assert template_fits(slices, template)
+    assert template_fits(enlarged(1.2), template)
+    assert not template_fits(enlarged(3.0), template)
+    assert not template_fits(enlarged(0.5), template)
+    # the estimate goes on without it
+    settings = MotionSettings(network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=3.0)
+    estimate = estimate_motion(enlarged(3.0), settings, template=template)
+    assert estimate.orientation is None
+    assert set(estimate.hypotheses) == {"headers"}
+
+
+def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate):
+    for volume_mm3 in (1e5, 4e5):
+        for number in range(len(template)):
+            head = fitted_head(template, number, volume_mm3)
+            inside = template.volume[number] > 0
+            assert inside.sum() * head.grid.voxel_volume_mm3 == pytest.approx(volume_mm3)
+            np.testing.assert_allclose(
+                head.grid.world(np.argwhere(inside)).mean(0), head.center_mm, atol=1e-9
+            )
+            np.testing.assert_allclose(head.grid.spacing_mm, head.scale * template.grid.spacing_mm)
+            assert head.weeks == template.weeks[number]
+
+
+def test_near_heads_are_the_three_of_about_the_size(
+    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
+):
+    slices, _ = still_slices
+    one = template.volume[0]
+    inside = np.argwhere(one > 0)
+    middle = inside.mean(0)
+    sizes = []
+    for factor in (0.4, 0.6, 1.0, 0.8):
+        smaller = np.zeros_like(one)
+        index = np.rint(middle + factor * (inside - middle)).astype(int)
+        smaller[tuple(index.T)] = 1.0
+        sizes.append(smaller)
+    several = AtlasTemplate(np.stack(sizes), template.affine, np.array([20.0, 22, 28, 24]))
+    near = near_heads(slices, several)
+    assert [head.weeks for head in near] == [28, 24, 22]
+    assert len(near_heads(slices, template)) == 2
+
+
+def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate):
+    """A mean head is preferred to noise of the same shape, whichever comes first."""
+    slices, _ = still_slices
+    inside = template.volume[0] > 0
+    noise = np.where(inside, np.random.default_rng(0).random(inside.shape), 0).astype(np.float32)
+    two = AtlasTemplate(np.stack([noise, template.volume[0]]), template.affine, np.array([23.0, 24.0]))
+    heads = near_heads(slices, two)
+    still = RigidPose.identity(len(slices))
+    for order in (heads, heads[::-1]):
+        found = standard_orientation(slices, order, still, np.random.default_rng(0))
+        assert found is not None
+        assert found.weeks == 24
+
+
+# -- the whole sphere ------------------------------------------------------------------------------
+
+
+def test_the_whole_head_turned_is_among_the_orientations_to_follow(
+    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
+):
+    slices, _ = still_slices
+    head = fitted_head(template, 0, head_volume_mm3(slices))
+    turned = headers_turned(slices, [2.0, -1.2, 1.5])
+    back = Rotation.from_rotvec([2.0, -1.2, 1.5]).as_matrix().T
+    first = head_orientations(StackPixels.of_all(turned), head)[0]
+    assert angle_deg(first, back) < 20
+
+
+def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices: tuple[Slices, RigidPose]):
+    """Among the orientations of a stack to follow is the true one, and its runs fall into place."""
+    slices, _ = still_slices
+    grid = VolumeGrid(head.t2.shape, head.affine)
+    volume = (head.t2 * head.mask / 1000).astype(np.float32)
+    stack = headers_turned(slices.take(slices.stack_id == 1), [np.pi, 0, 0])
+    (part,) = StackPixels.of_all(stack)
+    target = grid.world(np.argwhere(head.mask)).mean(0)
+    bases = stack_orientations(part, target, volume, grid)
+    away = [float(angle_deg(base, Rotation.from_rotvec([np.pi, 0, 0]).as_matrix().T)) for base in bases]
+    assert min(away) < 20
+    placed = place_around(part, bases[int(np.argmin(away))], target, volume, grid)
+    error = np.linalg.norm(
+        moved(stack, placed.motion).planes.center_mm
+        - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
+    )  # fmt: skip
+    assert np.median(error) < 6  # a lattice of 7 mm and 10 degrees
+    assert placed.runs.n_runs <= 3
+
+
+def test_orientations_to_follow_are_few_apart_and_best_first():
+    rotation = uniform_rotations(3000)
+    centers = turns_about(rotation[[100, 900, 2500]], np.zeros(3), np.zeros(3)).rotation
+    agreement = np.zeros(len(rotation))
+    for height, center in zip((0.70, 0.75, 0.60), centers, strict=True):
+        agreement = np.maximum(agreement, height - angle_deg(rotation, center) / 200)
+    found = peaks(rotation, agreement, 4, 40.0)
+    assert len(found) == 2  # the third is lower by more than the margin
+    assert angle_deg(found[0], centers[1]) < 1e-4
+    assert angle_deg(found[1], centers[0]) < 1e-4
+    assert PEAK_MARGIN < 0.15
+    assert len(peaks(rotation, agreement, 1, 40.0)) == 1

@@ -1,0 +1,107 @@
+"""The judgement of the uncertainty: calibrated, ordered and constant statements are told apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from g3r.uncertainty.error_model import ErrorModel
+from studies.uncertainty.calibration import build_parser
+from studies.uncertainty.data import CHECK_VOLUMES, FIT_VOLUMES, check_recipes, fit_recipes, relative_error
+from studies.uncertainty.figure import draw_calibration
+from studies.uncertainty.judgement import EXPONENTIAL_COVERAGE, check_record, check_text, judge
+
+
+@pytest.fixture
+def sample() -> tuple[np.ndarray, np.ndarray]:
+    """Stated values over a factor of 20, and errors of exponential size about them."""
+    rng = np.random.default_rng(0)
+    stated = np.exp(rng.uniform(np.log(0.01), np.log(0.2), 40_000))
+    return stated, rng.exponential(stated)
+
+
+def test_the_truth_is_calibrated(sample: tuple[np.ndarray, np.ndarray]) -> None:
+    found = judge(*sample)
+    assert found["mean_error"] / found["mean_stated"] == pytest.approx(1, abs=0.02)
+    assert found["coverage"] == pytest.approx(EXPONENTIAL_COVERAGE, abs=0.01)
+    for one in found["bins"]:
+        assert one["mean_error"] / one["stated"] == pytest.approx(1, abs=0.06)
+        assert one["rms_error"] / one["stated"] == pytest.approx(np.sqrt(2), abs=0.12)
+    assert 0.3 < found["spearman"] < 0.9
+    assert 0.2 < found["gain_over_constant"] < 0.9
+
+
+def test_half_as_much_is_seen(sample: tuple[np.ndarray, np.ndarray]) -> None:
+    stated, size = sample
+    found = judge(stated / 2, size)
+    assert found["mean_error"] / found["mean_stated"] == pytest.approx(2, abs=0.04)
+    assert found["coverage"][0] < 0.45
+
+
+def test_a_constant_ranks_nothing_and_the_error_everything(sample: tuple[np.ndarray, np.ndarray]) -> None:
+    stated, size = sample
+    shuffled = judge(np.random.default_rng(1).permutation(stated), size)
+    assert judge(np.full_like(size, 0.1), size)["spearman"] == 0
+    assert shuffled["gain_over_constant"] == pytest.approx(0, abs=0.03)
+    assert judge(size, size)["gain_over_constant"] == pytest.approx(1)
+    assert judge(-size + 2 * size.max(), size)["gain_over_constant"] < 0
+
+
+def test_error_does_not_depend_on_the_scale_of_the_volume() -> None:
+    rng = np.random.default_rng(2)
+    truth = rng.uniform(0.2, 1, (9, 9, 9)).astype(np.float32)
+    volume = truth + 0.05 * rng.standard_normal(truth.shape).astype(np.float32)
+    mask = np.ones(truth.shape, bool)
+    once = relative_error(volume, truth, mask)
+    np.testing.assert_allclose(relative_error(volume, 700 * truth, mask), once, atol=1e-5)
+    np.testing.assert_allclose(relative_error(700 * volume, truth, mask), 700 * once, rtol=1e-3, atol=1e-2)
+    assert abs(once.mean()) < 1e-6
+
+
+def test_fit_and_check_share_no_volume_and_no_seed() -> None:
+    assert not {v for v, *_ in FIT_VOLUMES} & {v for v, *_ in CHECK_VOLUMES}
+    fitted, checked = fit_recipes(), check_recipes()
+    assert not {r.seed for r, _ in fitted} & {r.seed for r, _ in checked}
+    assert len({r.name for r, _ in fitted}) == len(fitted)
+    assert all(r.volume.startswith("spina-bifida/") and r.volume.endswith("-operated") for r, _ in fitted)
+
+
+def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
+    rng = np.random.default_rng(seed)
+    n = 4000
+    evidence = {
+        "unmeasured": rng.uniform(0, 1, n), "from_prior": rng.exponential(0.02, n),
+        "edge": rng.exponential(0.05, n), "texture": rng.exponential(0.03, n),
+        "residual": 0.02 + rng.exponential(0.02, n), "depth_mm": rng.uniform(1, 30, n),
+    }  # fmt: skip
+    return SimpleNamespace(
+        label=name, n_stacks=n_stacks, evidence=evidence, error=rng.exponential(evidence["residual"]),
+        psnr_db=28.0, median_mm=0.1, trusted=None, seconds=1.0, map_seconds=0.5,
+        registered=True,
+    )  # fmt: skip
+
+
+def test_record_table_and_figure(tmp_path: Path) -> None:
+    found = [judged_subject("a", 3, 0), judged_subject("b", 3, 1), judged_subject("c", 1, 2)]
+    found.append(judged_subject("not registered", 3, 3))
+    found[-1].registered = False  # has a row, and no part in the figures of all
+    found[-1].error = 10 * found[-1].error
+    record = check_record(found, ErrorModel(-0.1, {"log residual": 1.0}))  # type: ignore[arg-type]
+    assert set(record["by_stacks"]) == {"1", "3"}
+    assert record["by_stacks"]["3"]["mean_error"] < 0.1
+    text = check_text({"with prior": {"preset": "p", "weights": "w", **record}})
+    assert text.count("| with prior |") == 2 + 4
+    assert "+ 1.00 log residual" in text
+    draw_calibration(record, tmp_path / "new" / "figure.png")
+    assert Image.open(tmp_path / "new" / "figure.png").width > 1000
+    assert len(list((tmp_path / "new").iterdir())) == 1
+
+
+def test_options() -> None:
+    assert build_parser().parse_args(["check", "--no-prior"]).no_prior
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(["judge"])

@@ -1,0 +1,222 @@
+"""Training of the pose network, its logs, and the way to a pose file."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.cli import export, pretrain
+from g3r.errors import InputError
+from g3r.pose_network.checkpoint import centred_grid, load_pose_network
+
+lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+
+from lightning.pytorch.loggers import TensorBoardLogger  # noqa: E402
+from torch.utils.data import DataLoader  # noqa: E402
+
+from g3r.pose_network.inference import as_pose  # noqa: E402
+from g3r.pose_network.network import PoseStep  # noqa: E402
+from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss
+
+SMALL = {"channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2, "warmup_steps": 1, "n_ages": 2}
+CONFIG = "lightning_configs/pose.yaml"
+
+
+def sample(seed, n_stacks=2, n_slices=5):
+    """One head's slices: noise, but with poses that fit together."""
+    rng = np.random.default_rng(seed)
+    stack = np.repeat(np.arange(n_stacks), n_slices)
+    header = Rotation.random(n_stacks, random_state=seed).as_matrix()[stack]
+    position = np.tile(np.linspace(-30, 30, n_slices), n_stacks)
+    turn = Rotation.random(random_state=seed + 100).as_matrix()
+    true = turn @ header
+    arrays = {
+        "image": rng.random((len(stack), 1, 40, 40)),
+        "area_mm2": np.full(len(stack), 2000.0),
+        "position_mm": position,
+        "thickness_mm": np.full(len(stack), 3.0),
+        "time_rank": np.full(len(stack), np.nan),
+        "header_rotation": header,
+        "true_rotation": true,
+        "true_translation_mm": true[:, :, 2] * position[:, None],
+    }
+    batch = {name: torch.from_numpy(value.astype(np.float32)) for name, value in arrays.items()}
+    return batch | {"stack": torch.from_numpy(stack), "set_of_stack": torch.zeros(n_stacks, dtype=torch.long)}
+
+
+class TinyData(lightning.LightningDataModule):
+    """A few heads in memory, and a template of two ages."""
+
+    def __init__(self, n_ages=2, pixel_mm=3.0, source="/some/where/atlas"):
+        super().__init__()
+        self.save_hyperparameters()
+
+    def template(self):
+        shape = (self.hparams["n_ages"], 9, 10, 11)
+        heads = np.random.default_rng(0).random(shape).astype(np.float32)
+        return AtlasTemplate(heads, centred_grid(shape, 3.0).affine, np.arange(25.0, 25.0 + shape[0]))
+
+    def train_dataloader(self):
+        return DataLoader([sample(seed) for seed in range(3)], batch_size=None)
+
+    def val_dataloader(self):
+        return DataLoader([sample(8, n_stacks=1), sample(9, n_stacks=2)], batch_size=None)
+
+
+def trainer(folder, **options):
+    return lightning.Trainer(
+        default_root_dir=folder, logger=TensorBoardLogger(folder, name="run"), enable_model_summary=False,
+        num_sanity_val_steps=0, accelerator="cpu", enable_progress_bar=False, log_every_n_steps=1,
+        **{"max_epochs": 1, **options},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of one epoch: its folder, its checkpoint, its module."""
+    folder = tmp_path_factory.mktemp("training")
+    torch.manual_seed(0)
+    module = PoseModule(**SMALL)
+    run = trainer(folder)
+    run.fit(module, TinyData())
+    run.save_checkpoint(folder / "last.ckpt")
+    return folder, folder / "last.ckpt", module
+
+
+def test_tensorboard_has_scalars_and_the_panel(trained):
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    log = event_accumulator.EventAccumulator(str(trained[0] / "run" / "version_0"))
+    log.Reload()
+    scores = {"val/slice_mm", "val/slice_deg", "val/stack_deg", "val/stacks_within_20deg", "val/stack_mm_1"}
+    train = {"train/mm_step0", "train/mm_step1", "train/vote_step0", "train/samples_per_second"}
+    assert scores | train <= set(log.Tags()["scalars"])
+    assert len(log.Tags()["images"]) == 1
+
+
+def test_the_template_is_the_data_module_s(trained):
+    heads = torch.from_numpy(TinyData().template().volume)
+    torch.testing.assert_close(trained[2].network.template.permute(3, 0, 1, 2), heads)
+    assert trained[2].weeks == [25.0, 26.0]
+
+
+def test_resuming_goes_on(trained, tmp_path):
+    module = PoseModule(**SMALL)
+    run = trainer(tmp_path, max_epochs=2)
+    run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
+    assert run.global_step == 6
+
+
+def test_export_gives_the_same_network(trained, tmp_path, capsys):
+    _, checkpoint, module = trained
+    path = tmp_path / "pose.pt"
+    assert export.main([str(checkpoint), str(path)]) == 0
+    network, meta = load_pose_network(path)
+    batch = sample(5)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            network(batch)[-1].translation_mm,
+            module.network.eval()(batch)[-1].translation_mm,
+            rtol=0,
+            atol=0.1,
+        )  # float16
+    assert meta.template.weeks.tolist() == [25, 26]
+    assert "TinyData(n_ages=2, pixel_mm=3.0, source=atlas)" in meta.training_data
+    assert "/some/where" not in meta.training_data
+    assert meta.validation["val/slice_mm"] > 0
+    assert "val/slice_mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("alter", "expected"),
+    [
+        (lambda content: content.pop("g3r_pose"), "not written by g3r-pretrain"),
+        (lambda content: content["g3r_pose"].update(weeks=[25.0]), "cannot be exported"),
+        (lambda content: content["state_dict"].popitem(), "cannot be exported"),
+        (lambda content: content.update(format="g3r-pose"), "exported pose already"),
+    ],
+)
+def test_export_refuses(trained, tmp_path, capsys, alter, expected):
+    content = torch.load(trained[1], weights_only=True)
+    alter(content)
+    torch.save(content, tmp_path / "run.ckpt")
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "pose.pt")]) == 3
+    line = capsys.readouterr().err
+    assert expected in line
+    assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"n_ages": 3}, "model.n_ages: 2"), ({"pixel_mm": 4.0}, "data.pixel_mm: 4.0")]
+)
+def test_data_that_do_not_fit(tmp_path, settings, message):
+    with pytest.raises(InputError, match=message):
+        trainer(tmp_path).fit(PoseModule(**SMALL), TinyData(**settings))
+
+
+def exact_step(batch):
+    return PoseStep(batch["true_rotation"], batch["true_translation_mm"], batch["true_rotation"])
+
+
+def test_losses_and_scores_of_true_poses():
+    batch = sample(0)
+    step = exact_step(batch)
+    assert float(point_loss(step, batch)) == pytest.approx(0.01)  # the root's softening
+    assert float(vote_loss(step, batch)) == 0.0
+    true = as_pose(step.rotation, step.translation_mm)
+    scores = summary([scores_of(true, true, batch)])
+    assert scores["slice_mm"] < 1e-3
+    assert scores["stack_deg_2"] < 1e-2
+    assert scores["stacks_within_20deg"] == 1.0
+
+
+def test_loss_is_a_distance_in_mm():
+    batch = sample(0)
+    off = PoseStep(batch["true_rotation"], batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]), None)
+    assert float(point_loss(off, batch)) == pytest.approx(5.0, abs=1e-3)
+
+
+def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are():
+    torch.manual_seed(1)
+    n_heads, per_stack = 40, 3
+    set_of_stack = torch.arange(n_heads).repeat_interleave(2)
+    stack = torch.arange(2 * n_heads).repeat_interleave(per_stack)
+    rotation = torch.eye(3).expand(len(stack), 3, 3)
+    turned, moved = disturbed(rotation, torch.zeros(len(stack), 3), stack, set_of_stack)
+    torch.testing.assert_close(turned @ turned.transpose(1, 2), rotation, atol=1e-5, rtol=0)
+    changed = (moved.abs().sum(1) > 0).reshape(n_heads, -1)
+    assert (changed.all(1) | ~changed.any(1)).all()
+    assert 5 < changed.all(1).sum() < n_heads - 5
+
+
+def test_starting_from_other_weights(trained, tmp_path):
+    fresh = PoseModule(**SMALL, start_from=str(trained[1]))
+    for one, other in zip(fresh.network.parameters(), trained[2].network.parameters(), strict=True):
+        torch.testing.assert_close(one, other.cpu())
+    with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
+        PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
+    wider = PoseModule(**{**SMALL, "width": 64}, start_from=str(trained[1]))  # what fits is taken
+    torch.testing.assert_close(
+        wider.network.encoder.stem.conv.weight, trained[2].network.encoder.stem.conv.weight.cpu()
+    )
+
+
+def test_the_configuration_fits(pytestconfig):
+    config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
+    assert config["model"]["class_path"] == f"{PoseModule.__module__}.{PoseModule.__qualname__}"
+    PoseModule(**config["model"]["init_args"])
+    from data_synth.pose_data import SliceSetDataModule
+
+    SliceSetDataModule(**config["data"]["init_args"])
+
+
+@pytest.mark.parametrize(("config", "setting"), [("pose", "width"), ("prior", "alpha")])
+def test_one_command_trains_both(pytestconfig, capsys, config, setting):
+    """Settings are read and shown, for a config with a class and for one without."""
+    path = pytestconfig.rootpath / "lightning_configs" / f"{config}.yaml"
+    with pytest.raises(SystemExit) as done:
+        pretrain.main(["fit", "--config", str(path), f"--model.{setting}", "64", "--print_config"])
+    assert done.value.code == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert shown["model"]["init_args"][setting] == 64

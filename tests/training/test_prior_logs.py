@@ -1,0 +1,209 @@
+"""What a training writes down: scores and images by number of stacks; and that it survives a kill."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from torch.utils.data import DataLoader
+
+lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+
+from g3r.acquisition.images import save_volume  # noqa: E402
+from g3r.cli import export  # noqa: E402
+from g3r.errors import InputError  # noqa: E402
+from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint  # noqa: E402
+from g3r.training import prior_module as training  # noqa: E402
+
+NETWORK = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4}
+TINY_TRAINING = [
+    "--config", "lightning_configs/prior.yaml", "--model.channels=[8,8]", "--model.units=[1,1]",
+    "--data.spacing_mm=3.0", "--data.patch_size=16", "--data.patches_per_subject=4", "--data.batch_size=4",
+    "--data.subjects_per_epoch=2", "--data.val_subjects=2", "--data.val_crop=16", "--data.num_workers=0",
+    "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.enable_progress_bar=false",
+    "--trainer.max_time=null",
+]  # fmt: skip
+
+
+def volumes(n, seed=0, size=12):
+    generator = torch.Generator().manual_seed(seed)
+    names = ("coarse", "density", "sharp", "truth")
+    batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
+    return {**batch, "mask": torch.ones_like(batch["truth"])}
+
+
+class ValidatedByStacks(lightning.LightningDataModule):
+    """Volumes of one, three and again three stacks, in a batch of one and a batch of two."""
+
+    spacing_mm = 0.8
+
+    def train_dataloader(self):
+        return DataLoader([volumes(2)], batch_size=None)
+
+    def val_dataloader(self):
+        batches = [
+            {**volumes(1, 1), "n_stacks": torch.tensor([1])},
+            {**volumes(2, 2), "n_stacks": torch.tensor([3, 3])},
+        ]
+        return DataLoader(batches, batch_size=None)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """What TensorBoard has of two epochs."""
+    folder = tmp_path_factory.mktemp("logs")
+    torch.manual_seed(0)
+    run = lightning.Trainer(
+        accelerator="cpu", max_epochs=2, logger=training.TensorBoardLogger(folder, name="run"),
+        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
+    )  # fmt: skip
+    run.fit(training.PriorModule(**NETWORK), ValidatedByStacks())
+    found = accumulators.EventAccumulator(str(folder / "run" / "version_0"))
+    found.Reload()
+    return found
+
+
+def test_scores_by_number_of_stacks_are_logged(log):
+    tags = set(log.Tags()["scalars"])
+    for stacks in ("", "_1stack", "_3stacks"):
+        expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in training.VALIDATED}
+        assert expected | {f"val/psnr_gain{stacks}"} <= tags
+    assert not any("2stacks" in tag for tag in tags)
+    assert {"train/samples_per_second", "train/waiting_for_data", "train/l1_prior"} <= tags
+
+
+def test_scores_are_means_over_volumes(log):
+    def last(tag):
+        return log.Scalars(tag)[-1].value
+
+    expected = (last("val/psnr_coarse_1stack") + 2 * last("val/psnr_coarse_3stacks")) / 3
+    assert last("val/psnr_coarse") == pytest.approx(expected, abs=1e-4)
+    assert last("val/psnr_gain") == pytest.approx(last("val/psnr_prior") - last("val/psnr_coarse"), abs=1e-4)
+    one = next(iter(ValidatedByStacks().val_dataloader()))
+    l1 = float((one["coarse"] - one["truth"]).abs().mean())
+    assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
+
+
+def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
+    tags = log.Tags()["images"]
+    assert sorted(tags) == [f"val/{n}: {training.PANEL_TAG}" for n in ("1stack", "3stacks")]
+    assert "confidence, gate" in training.PANEL_TAG
+    image = log.Images(tags[0])[-1]
+    assert (image.height, image.width) == (12, 7 * 12)
+
+
+def test_panel_of_a_network_without_a_gate():
+    batch = volumes(1)
+    shown = training.panel(batch, batch["coarse"], None)
+    coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
+    assert bool((gate == 1).all())
+    assert 0 < float(confidence.max()) < 1
+    assert torch.equal(prior, coarse)  # which stands for the prior here
+
+
+def test_going_on_at_another_voxel_size_is_refused(tmp_path):
+    """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
+    first = training.PriorModule(**NETWORK)
+    options = {
+        "accelerator": "cpu", "max_steps": 1, "logger": False, "enable_progress_bar": False,
+        "enable_model_summary": False, "enable_checkpointing": False,
+    }  # fmt: skip
+    run = lightning.Trainer(**options)
+    run.fit(first, ValidatedByStacks())
+    run.save_checkpoint(tmp_path / "run.ckpt")
+    network = first.network
+    save_prior_checkpoint(
+        tmp_path / "prior.pt", network, PriorCheckpoint(network.arguments(), first.voxel_mm, "noise")
+    )
+    data = ValidatedByStacks()
+    data.spacing_mm = 1.0
+    again = training.PriorModule(**NETWORK, start_from=str(tmp_path / "prior.pt"))
+    with pytest.raises(InputError, match=r"start_from: was trained on voxels of 0\.8 mm, the data have 1 mm"):
+        lightning.Trainer(**options).fit(again, data)
+    run, fresh = lightning.Trainer(**{**options, "max_steps": 2}), training.PriorModule(**NETWORK)
+    with pytest.raises(InputError, match=r"ckpt_path: was trained on voxels of 0\.8 mm, the data have 1 mm"):
+        run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
+
+
+def run_training(folder, *arguments):
+    command = [sys.executable, "-m", "g3r.cli.pretrain", "fit", *TINY_TRAINING]
+    command += [f"--trainer.logger.init_args.save_dir={folder}", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def steps_of(checkpoint):
+    return torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"]
+
+
+@pytest.mark.slow
+def test_training_goes_on_after_a_kill(tmp_path):
+    """Killed without warning after its second epoch at the earliest, and resumed for one epoch more."""
+    process = run_training(tmp_path, "--trainer.max_epochs=1000")
+    last = tmp_path / "prior" / "version_0" / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 300
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            if last.exists() and steps_of(last) >= 4:
+                break
+        except (OSError, RuntimeError, EOFError):
+            pass  # being written
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    done = steps_of(last)  # whole, although its writer was killed
+    assert done >= 4
+    epochs = done // 2 + 1  # two steps each
+    resumed = run_training(tmp_path, f"--trainer.max_epochs={epochs}", f"--ckpt_path={last}")
+    words, _ = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, words[-2000:]
+    (after,) = (tmp_path / "prior" / "version_1" / "checkpoints").glob("last*.ckpt")
+    assert steps_of(after) == done + 2
+    found = accumulators.EventAccumulator(str(tmp_path / "prior" / "version_1"))
+    found.Reload()
+    assert min(event.step for event in found.Scalars("train/l1_prior")) >= done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--trainer.precision=bf16-mixed"],
+        ["--trainer.devices=2", "--trainer.strategy=ddp"],
+    ],
+    ids=["mixed precision", "two devices"],
+)
+def test_trainer_flags(tmp_path, flags):
+    process = run_training(tmp_path, "--trainer.max_epochs=1", *flags)
+    words, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, words[-2000:]
+    (last,) = (tmp_path / "prior" / "version_0" / "checkpoints").glob("last*.ckpt")
+    assert steps_of(last) > 0
+
+
+@pytest.mark.slow
+def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
+    """A folder of volumes with masks is enough for the prior; names need not hold an age."""
+    generator = np.random.default_rng(0)
+    index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
+    mask = np.linalg.norm(index / [10, 8, 9], axis=-1) < 1
+    for name in ("placenta-a", "placenta-b"):
+        image = np.where(mask, 300 + 200 * gaussian_filter(generator.normal(size=mask.shape), 1.5), 0)
+        (tmp_path / "atlas" / name).mkdir(parents=True)
+        save_volume(
+            tmp_path / "atlas" / name / "t2.nii.gz", image.astype(np.float32), np.diag([3.0, 3, 3, 1])
+        )
+        save_volume(tmp_path / "atlas" / name / "mask.nii.gz", mask, np.diag([3.0, 3, 3, 1]))
+    process = run_training(tmp_path, "--trainer.max_epochs=1", f"--data.source={tmp_path / 'atlas'}")
+    words, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, words[-2000:]
+    (last,) = (tmp_path / "prior" / "version_0" / "checkpoints").glob("last*.ckpt")
+    assert export.main([str(last), str(tmp_path / "prior.pt")]) == 0
+    assert load_prior(tmp_path / "prior.pt", 3.0)[1].voxel_mm == 3.0
+    with pytest.raises(InputError, match=r"expected 0\.8 mm"):
+        load_prior(tmp_path / "prior.pt", 0.8)

@@ -1,0 +1,279 @@
+"""Training, its logs, and the way from a training checkpoint to a prior file."""
+
+import subprocess
+import sys
+from datetime import timedelta
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from g3r.cli import export
+from g3r.errors import InputError
+from g3r.prior.checkpoint import load_prior
+
+lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+
+from torch.utils.data import DataLoader  # noqa: E402
+
+from g3r.prior.checkpoint import PriorCheckpoint, save_prior_checkpoint  # noqa: E402
+from g3r.training import prior_module as training  # noqa: E402
+from g3r.training.annealed_module import cosine_factor  # noqa: E402
+
+SMALL = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4, "warmup_steps": 1}
+CONFIG = "lightning_configs/prior.yaml"
+
+
+def smooth_noise(generator, size):
+    coarse_noise = torch.rand(1, 1, size // 4, size // 4, size // 4, generator=generator)
+    return torch.nn.functional.interpolate(coarse_noise, scale_factor=4, mode="trilinear")[0]
+
+
+def sample(seed, size=16):
+    """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = smooth_noise(generator, size)
+    density = 3 * smooth_noise(generator, size)
+    error = -0.5 * torch.exp(-density) * truth + 0.02 * torch.randn(truth.shape, generator=generator)
+    mask = torch.ones_like(truth)
+    mask[:, :3] = 0
+    coarse, sharp = mask * (truth + error), mask * (truth + 0.8 * error)
+    return {"coarse": coarse, "density": density, "sharp": sharp, "truth": mask * truth, "mask": mask}
+
+
+class TinyData(lightning.LightningDataModule):
+    """Four samples in memory."""
+
+    def __init__(self, spacing_mm=0.8, source="/some/where/atlas"):
+        super().__init__()
+        self.save_hyperparameters()
+
+    def train_dataloader(self):
+        return DataLoader([sample(seed) for seed in range(4)], batch_size=2)
+
+    def val_dataloader(self):
+        return DataLoader([sample(seed) for seed in (8, 9)], batch_size=2)
+
+
+def trainer(folder, **options):
+    defaults = {"accelerator": "cpu", "max_steps": 2, "enable_progress_bar": False, "log_every_n_steps": 1}
+    return lightning.Trainer(
+        default_root_dir=folder,
+        logger=training.TensorBoardLogger(folder, name="run"),
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **{**defaults, **options},
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two steps: its folder, its checkpoint, its module."""
+    folder = tmp_path_factory.mktemp("training")
+    torch.manual_seed(0)
+    module = training.PriorModule(**SMALL, alpha=0.1)
+    run = trainer(folder)
+    run.fit(module, TinyData())
+    run.save_checkpoint(folder / "last.ckpt")
+    return folder, folder / "last.ckpt", module
+
+
+def test_tensorboard_has_scalars_and_the_panel(trained):
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    log = event_accumulator.EventAccumulator(str(trained[0] / "run" / "version_0"))
+    log.Reload()
+    scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
+    speed = {"train/samples_per_second", "train/waiting_for_data"}
+    assert scores | speed | {"train/l1_prior", "train/l1_coarse"} <= set(log.Tags()["scalars"])
+    (tag,) = log.Tags()["images"]
+    image = log.Images(tag)[0]
+    assert (image.height, image.width) == (16, 7 * 16)
+
+
+def test_training_moves_the_weights(trained):
+    assert float(trained[2].network.refiner.head.weight.detach().abs().max()) > 0
+
+
+def test_resuming_goes_on(trained, tmp_path):
+    module = training.PriorModule(**SMALL, alpha=0.1)
+    run = trainer(tmp_path, max_steps=3)
+    run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
+    assert run.global_step == 3
+
+
+def test_export_gives_the_same_network(trained, tmp_path, capsys):
+    _, checkpoint, module = trained
+    path = tmp_path / "prior.pt"
+    assert export.main([str(checkpoint), str(path)]) == 0
+    network, meta = load_prior(path)
+    inputs = torch.rand(3, 1, 1, 12, 16, 9)
+    with torch.no_grad():
+        torch.testing.assert_close(network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
+    assert (meta.alpha, meta.voxel_mm) == (0.1, 0.8)
+    assert "TinyData(spacing_mm=0.8, source=atlas)" in meta.training_data
+    assert "/some/where" not in meta.training_data
+    assert meta.validation["val/psnr_prior"] > 0
+    assert "val/psnr_prior" in capsys.readouterr().out
+
+
+def test_export_does_not_overwrite_unless_told(trained, tmp_path, capsys):
+    path = tmp_path / "prior.pt"
+    path.write_text("precious")
+    assert export.main([str(trained[1]), str(path)]) == 3
+    assert capsys.readouterr().err.count("\n") == 1
+    assert path.read_text() == "precious"
+    assert export.main([str(trained[1]), str(path), "--force", "--data-description", "three heads"]) == 0
+    assert load_prior(path)[1].training_data == "three heads"
+
+
+def without(*keys):
+    return lambda content: [content.pop(key) for key in keys]
+
+
+def spoil(content):
+    content["state_dict"]["network.refiner.head.weight"][0, 0, 0, 0, 0] = np.inf
+
+
+@pytest.mark.parametrize(
+    ("alter", "expected"),
+    [
+        (without("g3r_prior"), "not written by g3r-pretrain"),
+        (without("state_dict"), "not written by g3r-pretrain"),
+        (lambda content: content["g3r_prior"].update(voxel_mm=None), "cannot be exported"),
+        (lambda content: content["g3r_prior"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
+        (lambda content: content["state_dict"].popitem(), "cannot be exported"),
+        (spoil, "NaN or infinity"),
+        (lambda content: content.update(format="g3r-prior"), "exported prior already"),
+    ],
+)
+def test_export_refuses(trained, tmp_path, capsys, alter, expected):
+    content = torch.load(trained[1], weights_only=True)
+    alter(content)
+    torch.save(content, tmp_path / "run.ckpt")
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.pt")]) == 3
+    line = capsys.readouterr().err
+    assert expected in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "prior.pt").exists()
+
+
+@pytest.mark.parametrize("content", [None, "text\n"])
+def test_export_refuses_what_is_no_checkpoint(tmp_path, capsys, content):
+    if content is not None:
+        (tmp_path / "run.ckpt").write_text(content)
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.pt")]) == 3
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_voxel_size_must_agree_with_the_data(tmp_path):
+    module = training.PriorModule(**SMALL, voxel_mm=1.0)
+    with pytest.raises(InputError, match=r"1.0 mm, but the data are made at 0.8 mm"):
+        trainer(tmp_path).fit(module, TinyData())
+
+
+def test_a_patch_can_be_learnt():
+    """Sixty steps on one patch bring the prior's error to half the coarse volume's."""
+    torch.manual_seed(0)
+    module = training.PriorModule(**SMALL, learning_rate=3e-3)
+    batch = {name: value[None] for name, value in sample(0, size=24).items()}
+    weight = training.loss_weight(batch["mask"], 0.1)
+    optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
+    for _ in range(60):
+        prior = module(batch["coarse"], batch["density"], batch["sharp"])
+        loss = training.weighted_l1(prior, batch["truth"], weight)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    coarse_loss = training.weighted_l1(batch["coarse"], batch["truth"], weight)
+    assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
+
+
+@pytest.mark.parametrize("use_sharp", [False, True])
+def test_beginning_with_the_weights_of_another_prior(tmp_path, use_sharp):
+    """Channels that the file lacks have no effect at first; on another base the residual begins at zero."""
+    torch.manual_seed(0)
+    old = training.DensityGatedPriorNetwork([8, 8], [1, 1], 4, alpha=0.05, use_sharp=use_sharp)
+    torch.nn.init.normal_(old.refiner.head.weight)
+    path = tmp_path / "old.pt"
+    save_prior_checkpoint(path, old, PriorCheckpoint(old.arguments(), 0.8, "noise"))
+    volumes = [torch.rand(1, 1, 8, 8, 8) for _ in range(3)]
+    new = training.PriorModule(**SMALL, alpha=0.05, start_from=str(path)).network
+    torch.testing.assert_close(new(*volumes), old(*volumes))
+    moved = training.PriorModule(**SMALL, sharp_base=True, start_from=str(path)).network
+    torch.testing.assert_close(moved(*volumes), volumes[2])
+    with pytest.raises(InputError, match="give it the same channels and units"):
+        training.PriorModule(**{**SMALL, "channels": [8, 16]}, start_from=str(path))
+
+
+def test_loss_weight_is_one_in_the_mask_and_small_outside():
+    mask = torch.zeros(1, 1, 5, 5, 5)
+    mask[0, 0, 2, 2, 2] = 1
+    weight = training.loss_weight(mask, 0.1)
+    assert float(weight[0, 0, 2, 2, 2]) == 1
+    assert float(weight.sum()) == pytest.approx(1 + 0.1 * 124)
+
+
+def test_weighted_l1_of_an_empty_mask_without_background_is_zero():
+    ones = torch.ones(1, 1, 4, 4, 4)
+    assert float(training.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
+
+
+def test_symmetries_turn_all_volumes_alike():
+    batch = {name: value[None] for name, value in sample(0, size=8).items()}
+    batch["density"] = batch["truth"].clone()
+    seen = set()
+    for seed in range(200):
+        torch.manual_seed(seed)
+        turned = training.random_cube_symmetry(batch)
+        assert torch.equal(turned["density"], turned["truth"])
+        seen.add(turned["truth"].numpy().tobytes())
+    assert 40 < len(seen) <= 48
+
+
+def test_symmetries_keep_the_shape():
+    batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
+    assert {tuple(training.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {
+        (1, 1, 4, 4, 6)
+    }
+
+
+def test_scores_leave_out_samples_without_a_brain():
+    truth = torch.rand(2, 1, 12, 12, 12)
+    mask = torch.zeros_like(truth, dtype=torch.bool)
+    mask[1, :, 2:9] = True
+    scores = training.scores_in_mask(truth + 0.1, truth, mask)
+    assert scores["psnr"] == [pytest.approx(20.0, abs=1e-3)]
+    assert len(scores["ssim"]) == 1
+
+
+def test_learning_rate_follows_the_budget_that_ends_first(tmp_path):
+    """With many steps but no time left, the rate is at its end."""
+    module = training.PriorModule(**SMALL)
+    run = trainer(tmp_path, max_steps=-1, max_epochs=10_000, max_time=timedelta(seconds=2))
+    run.fit(module, TinyData())
+    (optimizer,) = run.optimizers
+    assert optimizer.param_groups[0]["lr"] < 0.05 * module.learning_rate
+
+
+def test_cosine_factor():
+    values = [cosine_factor(progress) for progress in (-1, 0, 0.5, 1, 7)]
+    assert values == pytest.approx([1, 1, 0.505, 0.01, 0.01])
+
+
+def test_the_configuration_fits_the_module(pytestconfig):
+    config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
+    module = training.PriorModule(**config["model"])
+    assert module.network.arguments()["alpha"] == config["model"]["alpha"]
+
+
+@pytest.mark.parametrize("command", ["pretrain", "export"])
+def test_help_is_quick(command):
+    code = (
+        f"import sys\nfrom g3r.cli import {command}\n"
+        f"try: {command}.main(['--help'])\nexcept SystemExit as done: assert done.code == 0\n"
+        "assert not {'torch', 'monai', 'lightning'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "usage:" in done.stdout
