@@ -57,9 +57,7 @@ class TruthVolume:
     ventricles: NDArray[np.bool_] | None = None
 
 
-def find_subjects(
-    folder: str | Path, include: Sequence[str] = (), exclude: Sequence[str] = ()
-) -> list[AtlasSubject]:
+def find_subjects(folder: str | Path, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> list[AtlasSubject]:
     """Volumes with masks below a folder, by name.
 
     Recognised are SUBJECT/t2.nii.gz with SUBJECT/mask.nii.gz, and X.nii.gz with X_mask.nii.gz or
@@ -138,9 +136,7 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
             raise InputError(f"{subject.mask}: mask is empty at {spacing_mm:g} mm; use a finer spacing")
     bright = float(np.percentile(data[mask], 99.5))
     if not bright > 0:
-        raise InputError(
-            f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image"
-        )
+        raise InputError(f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image")
     data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
     ventricles = None if labels is None else (labels == VENTRICLES) & mask
     return TruthVolume(subject.name, data, mask, affine, labels, ventricles)

@@ -24,24 +24,11 @@ def augmentation() -> tio.Compose:
             tio.OneOf(
                 {
                     tio.RandomAffine(
-                        scales=0.08,
-                        degrees=15,
-                        translation=0,
-                        image_interpolation="bspline",
-                        default_pad_value=0,
+                        scales=0.08, degrees=15, translation=0, image_interpolation="bspline", default_pad_value=0
                     ): 0.75,
                     tio.RandomAffineElasticDeformation(
-                        affine_kwargs={
-                            "scales": 0.08,
-                            "degrees": 15,
-                            "translation": 0,
-                            "default_pad_value": 0,
-                        },
-                        elastic_kwargs={
-                            "num_control_points": 7,
-                            "max_displacement": 2.5,
-                            "locked_borders": 2,
-                        },
+                        affine_kwargs={"scales": 0.08, "degrees": 15, "translation": 0, "default_pad_value": 0},
+                        elastic_kwargs={"num_control_points": 7, "max_displacement": 2.5, "locked_borders": 2},
                     ): 0.25,
                 }
             ),
@@ -72,9 +59,7 @@ def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Genera
         return volume
     data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
     data /= max(float(np.percentile(data[mask], 99.5)), 1e-6)
-    return TruthVolume(
-        volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine)
-    )
+    return TruthVolume(volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine))
 
 
 def _other_anatomy(volume: TruthVolume, rng: np.random.Generator) -> TruthVolume:

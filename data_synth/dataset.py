@@ -21,12 +21,12 @@ from data_synth.augment import augmentation, augmented
 from data_synth.heads import Subject, load_volume_of
 from data_synth.motion import ResidualKind, draw_residual_kind, residual_errors
 from data_synth.protocol_sampling import (
-    RIM_SHARE,
+    SKULL_RIM_SHARE,
     SMALL_MASK_SHARE,
     draw_settings,
-    in_line,
-    remasked,
-    with_rim,
+    rigid_stack,
+    with_mask_errors,
+    with_skull_rim,
 )
 from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 from data_synth.subject_cache import KeptSubjects, SyntheticSubject
@@ -57,7 +57,7 @@ class SyntheticSubjects(Dataset):
         spacing_mm: voxel size.
         length: subjects per epoch.
         seed: of the whole dataset.
-        smallest_shape: grids are padded to at least this many voxels per axis.
+        min_shape: grids are padded to at least this many voxels per axis.
         augment: whether truth volumes are varied by torchio.
         in_order: take the sources in turn instead of drawing them, and 1, 2, 3 stacks in turn (validation).
         distinct: after so many epochs the same subjects come again, cut into other patches; 0 for never.
@@ -70,7 +70,7 @@ class SyntheticSubjects(Dataset):
         spacing_mm: float = 0.8,
         length: int = 32,
         seed: int = 0,
-        smallest_shape: int = 64,
+        min_shape: int = 64,
         augment: bool = True,
         in_order: bool = False,
         distinct: int = 0,
@@ -82,7 +82,7 @@ class SyntheticSubjects(Dataset):
         self.spacing_mm = spacing_mm
         self.length = length
         self.seed = seed
-        self.smallest_shape = smallest_shape
+        self.min_shape = min_shape
         self.augment = augmentation() if augment else None
         self.in_order = in_order
         self.distinct = distinct
@@ -92,9 +92,7 @@ class SyntheticSubjects(Dataset):
     def _recipe(self) -> str:
         """All that decides the subjects, besides the code."""
         names = [source.name for source in self.sources]
-        return repr(
-            (names, self.spacing_mm, self.seed, self.smallest_shape, self.augment is not None, self.in_order)
-        )
+        return repr((names, self.spacing_mm, self.seed, self.min_shape, self.augment is not None, self.in_order))
 
     def __len__(self) -> int:
         return self.length
@@ -129,7 +127,7 @@ class SyntheticSubjects(Dataset):
         truth = self._volume(which)
         if self.augment is not None:
             truth = augmented(truth, self.augment, rng)
-        truth = _padded(cropped(truth, MARGIN_VOXELS), self.smallest_shape)
+        truth = _padded(cropped(truth, MARGIN_VOXELS), self.min_shape)
         return synthesise(truth, rng, 1 + index % VALIDATION_STACKS if self.in_order else None)
 
     def _volume(self, which: int) -> TruthVolume:
@@ -153,10 +151,10 @@ def synthesise(truth: TruthVolume, rng: np.random.Generator, n_stacks: int | Non
     residual = draw_residual_kind(rng)
     settings = draw_settings(residual, rng, n_stacks)
     kind = rng.random()
-    seen = with_rim(truth, rng) if kind < RIM_SHARE else truth
+    seen = with_skull_rim(truth, rng) if kind < SKULL_RIM_SHARE else truth
     stacks = simulate_stacks(seen.data, seen.mask, seen.affine, settings, rng)
-    if kind < RIM_SHARE + SMALL_MASK_SHARE:
-        stacks = remasked(stacks, rng, grow=kind < RIM_SHARE)
+    if kind < SKULL_RIM_SHARE + SMALL_MASK_SHARE:
+        stacks = with_mask_errors(stacks, rng, grow=kind < SKULL_RIM_SHARE)
     slices = slices_from_stacks([one.stack for one in stacks])
     grid = VolumeGrid(truth.data.shape, truth.affine)
     found = _poses_left_by_registration(stacks, settings, slices, grid.center_mm, residual, rng)
@@ -192,24 +190,22 @@ def _poses_left_by_registration(
     motion = true_pose
     no_jerks = settings[0].motion.n_jerks == 0  # registration finds those
     if len(stacks) == 1 and no_jerks and residual != "gross" and rng.random() < IN_LINE_SHARE:
-        motion = in_line(true_pose, center_mm)
+        motion = rigid_stack(true_pose, center_mm)
     exact = motion @ slices.planes.pose
     return residual_errors(residual, slices.stack_id, exact.translation_mm, rng) @ exact
 
 
 def _trust(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
     """Weight of each masked pixel: registration mostly notices slices without signal."""
-    void = np.array([stacks[s].is_void[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
-    noticed = void & (rng.random(len(void)) < NOTICED_SHARE)
-    return np.where(noticed, rng.uniform(0, 0.3, len(void)), 1.0)[slices.pixel_plane]
+    dropout = np.array([stacks[s].is_void[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
+    noticed = dropout & (rng.random(len(dropout)) < NOTICED_SHARE)
+    return np.where(noticed, rng.uniform(0, 0.3, len(dropout)), 1.0)[slices.pixel_plane]
 
 
 class HeadPatchSampler(tio.data.PatchSampler):
     """Patches centred on random voxels of the mask and moved back onto the grid; fixed by the subject."""
 
-    def _generate_patches(
-        self, subject: Any, num_patches: int | None = None
-    ) -> Generator[tio.Subject, None, None]:
+    def _generate_patches(self, subject: Any, num_patches: int | None = None) -> Generator[tio.Subject, None, None]:
         rng = np.random.default_rng([*subject[SAMPLE_SEED_KEY], 1])
         inside = np.flatnonzero(subject["mask"].data[0].numpy() > 0.5)
         size, shape = self.patch_size.astype(int), np.array(subject.spatial_shape)

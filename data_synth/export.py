@@ -13,7 +13,7 @@ from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError, cannot_be_written
-from g3r.run.output_folder import UnfinishedRun
+from g3r.run.output_folder import OutputFolder
 
 POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
 
@@ -44,7 +44,7 @@ def save_simulation(
         InputError: the folder exists and is not empty (without `replace`), or cannot be written.
     """
     check_output(folder, replace=replace)
-    with UnfinishedRun(folder) as run:
+    with OutputFolder(folder) as run:
         check_output(folder, replace=replace)
         try:
             with run.result() as beside:
@@ -72,9 +72,7 @@ def check_output(folder: Path, *, replace: bool) -> None:
         raise InputError(f"{folder}: holds something else than a simulation; choose another --output")
 
 
-def _write(
-    folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], record: Mapping[str, object]
-) -> None:
+def _write(folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], record: Mapping[str, object]) -> None:
     save_volume(folder / "truth.nii.gz", truth.data, truth.affine)
     save_volume(folder / "truth-mask.nii.gz", truth.mask, truth.affine)
     centers = []
@@ -95,8 +93,6 @@ def _write(
                 header_center = stack.grid.world([(n_i - 1) / 2, (n_j - 1) / 2, k])
                 center = pose.rotation[k] @ header_center + pose.translation_mm[k]
                 rotation = pose.rotation[k] @ frame
-                centers.append(
-                    {"stack": number, "slice": k, "rotation": rotation.tolist(), "center": center.tolist()}
-                )
+                centers.append({"stack": number, "slice": k, "rotation": rotation.tolist(), "center": center.tolist()})
     (folder / "poses.json").write_text(json.dumps(centers) + "\n")
     (folder / "simulation.json").write_text(json.dumps(record, indent=2) + "\n")

@@ -104,9 +104,13 @@ def load_volume_of(subject: Subject, spacing_mm: float) -> TruthVolume:
     made = fetal_brain_phantom(subject.weeks, spacing_mm, subject.seed)
     bright = float(np.percentile(made.t2[made.mask], 99.5))
     return TruthVolume(
-        subject.name, made.t2 / np.float32(bright), made.mask, made.affine, made.labels,
+        subject.name,
+        made.t2 / np.float32(bright),
+        made.mask,
+        made.affine,
+        made.labels,
         made.labels == LABELS["ventricles"],
-    )  # fmt: skip
+    )
 
 
 def load_head(subject: Subject, spacing_mm: float, margin_voxels: int = 3) -> TruthVolume:

@@ -69,17 +69,17 @@ def slice_trajectory(
         stack's mean motion.
     """
     angle_deg = np.cumsum(rng.normal(0, 1, (n_slices, 3)) * level.walk_deg, axis=0)
-    shift_mm = np.cumsum(rng.normal(0, 1, (n_slices, 3)) * level.walk_mm, axis=0)
+    translation_mm = np.cumsum(rng.normal(0, 1, (n_slices, 3)) * level.walk_mm, axis=0)
     for _ in range(level.n_jerks):
         moment = int(rng.integers(1, max(n_slices, 2)))
         angle_deg[moment:] += rng.normal(0, level.jerk_deg, 3)
-        shift_mm[moment:] += rng.normal(0, level.jerk_mm, 3)
+        translation_mm[moment:] += rng.normal(0, level.jerk_mm, 3)
     angle_deg -= angle_deg.mean(0)
-    shift_mm -= shift_mm.mean(0)
+    translation_mm -= translation_mm.mean(0)
     offset = RigidPose.from_rotvec(
         np.deg2rad(rng.normal(0, 1, (1, 3)) * level.offset_deg), rng.normal(0, 1, (1, 3)) * level.offset_mm
     )
-    in_time = RigidPose.from_rotvec(np.deg2rad(angle_deg), shift_mm) @ offset
+    in_time = RigidPose.from_rotvec(np.deg2rad(angle_deg), translation_mm) @ offset
     place = np.empty(n_slices, np.int64)
     place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
     return about(in_time.take(place), center_mm)
@@ -127,16 +127,16 @@ def residual_errors(
         return RigidPose.identity(n)
     tail = np.where(rng.random((n, 1)) < TAIL_SHARE, TAIL_FACTOR, 1.0)
     size_mm, size_deg = np.exp(rng.uniform(np.log(0.1), np.log(0.8))), rng.uniform(0.2, 1.2)
-    shift_mm = _partly_shared(stack_id, rng) * tail * (size_mm / np.sqrt(3))
+    translation_mm = _partly_shared(stack_id, rng) * tail * (size_mm / np.sqrt(3))
     angle_rad = _partly_shared(stack_id, rng) * tail * (np.deg2rad(size_deg) / np.sqrt(3))
     if kind == "gross":
         for _ in range(int(rng.integers(1, 4))):
             first = int(rng.integers(n))
             run = np.arange(first, min(first + int(rng.integers(1, 7)), n))
             run = run[stack_id[run] == stack_id[first]]
-            shift_mm[run] += _direction(rng) * rng.uniform(3, 8)
+            translation_mm[run] += _direction(rng) * rng.uniform(3, 8)
             angle_rad[run] += _direction(rng) * np.deg2rad(rng.uniform(0, 10))
-    return about(RigidPose.from_rotvec(angle_rad, shift_mm), center_mm)
+    return about(RigidPose.from_rotvec(angle_rad, translation_mm), center_mm)
 
 
 def _partly_shared(stack_id: NDArray[np.int64], rng: np.random.Generator) -> Array:

@@ -19,21 +19,21 @@ REACH_MM = 4.0
 
 LESION_RADIUS_MM = (1.5, 6.0)
 LESION_EDGE_MM = 0.4
-MOST_LESIONS = 3
+MAX_LESIONS = 3
 
 
-def enlarged_ventricles(head: TruthVolume, shift_mm: float) -> TruthVolume:
+def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume:
     """A head whose ventricles have grown into the brain around them.
 
     Args:
         head: with ventricles; without any it is returned as it is.
-        shift_mm: how far the walls move at most; up to `REACH_MM` no tissue is folded.
+        translation_mm: how far the walls move at most; up to `REACH_MM` no tissue is folded.
 
     Raises:
         ValueError: a shift below 0 or beyond `REACH_MM`.
     """
-    if not 0 <= shift_mm <= REACH_MM:
-        raise ValueError(f"walls move by {shift_mm:g} mm; expected 0 to {REACH_MM:g} mm")
+    if not 0 <= translation_mm <= REACH_MM:
+        raise ValueError(f"walls move by {translation_mm:g} mm; expected 0 to {REACH_MM:g} mm")
     if head.ventricles is None or not head.ventricles.any():
         return head
     spacing_mm = np.linalg.norm(head.affine[:3, :3], axis=0)
@@ -42,7 +42,7 @@ def enlarged_ventricles(head: TruthVolume, shift_mm: float) -> TruthVolume:
     steepest = float(np.sqrt((inwards**2).sum(0)).max())
     # a voxel shows what lay further inwards
     index = np.indices(head.data.shape, dtype=np.float32)
-    index += inwards * np.float32(shift_mm / steepest) / spacing_mm[:, None, None, None].astype(np.float32)
+    index += inwards * np.float32(translation_mm / steepest) / spacing_mm[:, None, None, None].astype(np.float32)
     data = map_coordinates(head.data, index, order=3, mode="nearest", output=np.float32)
     ventricles = map_coordinates(head.ventricles.astype(np.float32), index, order=1) > 0.5
     labels = head.labels
@@ -55,7 +55,7 @@ def enlarged_ventricles(head: TruthVolume, shift_mm: float) -> TruthVolume:
 def with_lesions(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
     """A head with one to three ellipsoids of other brightness, somewhere in the mask."""
     inside = np.argwhere(head.mask)
-    for _ in range(int(rng.integers(1, MOST_LESIONS + 1))):
+    for _ in range(int(rng.integers(1, MAX_LESIONS + 1))):
         center = inside[rng.integers(len(inside))]
         radii = rng.uniform(*LESION_RADIUS_MM) * np.exp(rng.normal(0, 0.25, 3))
         turn = Rotation.random(rng=rng).as_matrix()
@@ -64,11 +64,7 @@ def with_lesions(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
 
 
 def with_lesion(
-    head: TruthVolume,
-    center: NDArray[np.integer],
-    radii_mm: Array,
-    intensity: float,
-    turn: Array | None = None,
+    head: TruthVolume, center: NDArray[np.integer], radii_mm: Array, intensity: float, turn: Array | None = None
 ) -> TruthVolume:
     """A head in which one ellipsoid has one intensity.
 

@@ -93,9 +93,7 @@ class _Anatomy:
         return cls(weeks, row[0] / 2, row[1] / 2, *row[2:])
 
 
-def fetal_brain_phantom(
-    gestational_age_weeks: float = 30.0, spacing_mm: float = 0.8, seed: int = 0
-) -> Phantom:
+def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float = 0.8, seed: int = 0) -> Phantom:
     """Procedural T2-weighted fetal brain with labels.
 
     Args:
@@ -113,9 +111,7 @@ def fetal_brain_phantom(
         contrast and proportions by eye after the published fetal atlases.
     """
     if not AGE_RANGE_WEEKS[0] <= gestational_age_weeks <= AGE_RANGE_WEEKS[1]:
-        raise InputError(
-            f"phantom: gestational age of {gestational_age_weeks:g} weeks; expected 18 to 41 weeks"
-        )
+        raise InputError(f"phantom: gestational age of {gestational_age_weeks:g} weeks; expected 18 to 41 weeks")
     if not 0.3 <= spacing_mm <= 3:
         raise InputError(f"phantom: voxel size of {spacing_mm:g} mm; expected 0.3 to 3 mm")
     rng = np.random.default_rng([seed, round(gestational_age_weeks * 100)])
@@ -197,7 +193,7 @@ def _draw(
 
 
 def _smooth_cerebrum(body: _Anatomy, p: Coordinates) -> Field:
-    """Both hemispheres without fissures: an egg (wider behind), flattened below, with temporal lobes."""
+    """Both hemispheres without fissures: an egg (wider behind), bias_corrected below, with temporal lobes."""
     a, b, c = body.a, body.b, body.csf
     x, y, z = p
     taper = 1 - 0.07 * y / np.float32(b)  # narrower forehead
@@ -249,23 +245,16 @@ def _folded_surface(
     allowed *= np.clip((z + np.float32(0.42 * a)) / np.float32(0.22 * a), 0.15, 1)
     core = ellipsoid((side, y, z), (0, 0, -0.05 * a), (0.5 * a, 0.5 * b, 0.42 * a))
     allowed *= np.clip(-core / np.float32(0.08 * a), 0, 1)
-    for wavelength, depth, weight in (
-        (0.72 * a, body.depth_primary, 0.45),
-        (0.40 * a, body.depth_secondary, 0.6),
-    ):
+    for wavelength, depth, weight in ((0.72 * a, body.depth_primary, 0.45), (0.40 * a, body.depth_secondary, 0.6)):
         if depth <= 0.3:
             continue
         noise = wave_field(u, wavelength, 0.25, 14, rng)
         noise += np.float32(weight) * wave_field(own, wavelength, 0.25, 10, rng)
         away = sheet_distance(noise, spacing_mm, 1.1 / wavelength)
-        local = np.float32(depth) * np.clip(
-            0.75 + 0.45 * wave_field(u, 1.5 * wavelength, 0.3, 8, rng), 0, 1.3
-        )
+        local = np.float32(depth) * np.clip(0.75 + 0.45 * wave_field(u, 1.5 * wavelength, 0.3, 8, rng), 0, 1.3)
         local *= allowed
         below = np.maximum(cerebrum - local, 0)
-        valley = (
-            np.sqrt(away**2 + below**2) - np.float32((0.25 + 0.1 * body.csf) * min(1, depth / 4)) * allowed
-        )
+        valley = np.sqrt(away**2 + below**2) - np.float32((0.25 + 0.1 * body.csf) * min(1, depth / 4)) * allowed
         surface = intersection(surface, valley, 2.5)
     return surface
 
@@ -345,12 +334,7 @@ def _brainstem(body: _Anatomy, p: Coordinates) -> Field:
     a, b = body.a, body.b
     stem = tube(
         p,
-        [
-            (0, -0.06 * b, -0.20 * a),
-            (0, -0.13 * b, -0.48 * a),
-            (0, -0.22 * b, -0.85 * a),
-            (0, -0.28 * b, -1.05 * a),
-        ],
+        [(0, -0.06 * b, -0.20 * a), (0, -0.13 * b, -0.48 * a), (0, -0.22 * b, -0.85 * a), (0, -0.28 * b, -1.05 * a)],
         [0.17 * a, 0.15 * a, 0.11 * a, 0.08 * a],
     )
     pons = ellipsoid(p, (0, -0.10 * b, -0.54 * a), (0.20 * a, 0.13 * b, 0.17 * a))

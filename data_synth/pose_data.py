@@ -17,7 +17,7 @@ from data_synth.heads import Subject, load_head, training_and_validation
 from data_synth.pose_samples import SliceSet, draw_slice_set
 from data_synth.prior_data import EpochSampler, epoch_of
 from data_synth.slice_sampling import Head
-from data_synth.template import mean_heads
+from data_synth.template import atlas_templates
 from data_synth.trajectories import RecordedTrajectory, load_trajectories
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
@@ -30,7 +30,7 @@ VAL_MAX_SLICES = 120
 N_VAL_PHANTOMS = 8
 N_VARIANTS = 8
 """Shapes and contrasts per subject and epoch; making one takes as long as several slice sets."""
-SMALLEST_SHARE = 4
+MIN_SHARE = 4
 """A training set has at least this fraction (one over it) of the largest number of slices."""
 
 
@@ -110,7 +110,7 @@ class SliceSetDataModule(LightningDataModule):
         """Mean heads of the training subjects."""
         if self._template is None:
             h: Any = self.hparams
-            self._template = mean_heads(self._sources()[0], h.template_spacing_mm)
+            self._template = atlas_templates(self._sources()[0], h.template_spacing_mm)
         return self._template
 
     def train_dataloader(self) -> DataLoader:
@@ -191,7 +191,7 @@ class SliceSets(Dataset):
         which = index % len(self.sources) if self.in_order else int(rng.integers(len(self.sources)))
         max_slices = self.max_slices
         if not self.in_order:  # many heads of few slices teach more per second than few heads of many
-            max_slices = int(rng.integers(max(self.max_slices // SMALLEST_SHARE, 1), self.max_slices + 1))
+            max_slices = int(rng.integers(max(self.max_slices // MIN_SHARE, 1), self.max_slices + 1))
         made = draw_slice_set(
             self._head(which, epoch, -1 if self.in_order else int(rng.integers(N_VARIANTS))),
             rng,
@@ -232,9 +232,7 @@ def slice_set_batch(sets: Sequence[SliceSet]) -> dict[str, torch.Tensor]:
     }
     batch["image"] = batch["image"][:, None]
     batch["true_rotation"] = np.concatenate([s.true_pose.rotation for s in sets]).astype(np.float32)
-    batch["true_translation_mm"] = np.concatenate([s.true_pose.translation_mm for s in sets]).astype(
-        np.float32
-    )
+    batch["true_translation_mm"] = np.concatenate([s.true_pose.translation_mm for s in sets]).astype(np.float32)
     n_stacks = [int(one.images.stack_id.max()) + 1 for one in sets]
     first = np.cumsum([0, *n_stacks])
     batch["stack"] = np.concatenate([one.images.stack_id + first[k] for k, one in enumerate(sets)])

@@ -27,7 +27,7 @@ TIMED_SHARE = 0.3
 LEVEL_SHARE = {"none": 0.15, "mild": 0.25, "moderate": 0.35, "severe": 0.25}
 TIMED_OFFSET_DEG, TIMED_OFFSET_MM = 20.0, 5.0
 """Stacks that follow a trajectory in time: largest standard deviation of a stack's turn, and its shift's."""
-SMALLEST_AREA_MM2 = 60.0
+MIN_AREA_MM2 = 60.0
 LOOK_PIXEL_MM, LOOK_SIZE = 5.0, 36
 """The quick look at where in the field of view the head is."""
 
@@ -75,13 +75,13 @@ def draw_slice_set(
     # where each stack's mask is by its header, from a quick look at large pixels
     look = sample_masks(head, index_from_atlas, true, LOOK_PIXEL_MM, LOOK_SIZE, threshold)
     area = look.sum((1, 2)) * LOOK_PIXEL_MM**2
-    kept = _thinned(np.flatnonzero(area > SMALLEST_AREA_MM2), max_slices, rng)
+    kept = _thinned(np.flatnonzero(area > MIN_AREA_MM2), max_slices, rng)
     header, true, look, area = header.take(kept), true.take(kept), look[kept], area[kept]
     thickness_mm, time_rank = thickness_mm[kept], time_rank[kept]
     _, stack_id = np.unique(stack_id[kept], return_inverse=True)
-    shift_mm = _shift_to_centroid(look, area, header, stack_id, LOOK_PIXEL_MM)
+    translation_mm = _shift_to_centroid(look, area, header, stack_id, LOOK_PIXEL_MM)
 
-    frame = RigidPose.from_rotvec(np.zeros_like(shift_mm), shift_mm * [1, 1, 0])
+    frame = RigidPose.from_rotvec(np.zeros_like(translation_mm), translation_mm * [1, 1, 0])
     true = true @ frame
     image, inside = sample_slices(head, index_from_atlas, true, thickness_mm, pixel_mm, size, threshold)
     if vary:
@@ -90,7 +90,7 @@ def draw_slice_set(
     images = SliceImages(
         (image / max(bright, 1e-6)).astype(np.float32),
         inside.sum((1, 2)) * pixel_mm**2,
-        -shift_mm[:, 2],
+        -translation_mm[:, 2],
         thickness_mm,
         time_rank,
         stack_id.astype(np.int64),
@@ -101,11 +101,7 @@ def draw_slice_set(
 
 
 def _draw_stacks(
-    head: Head,
-    shape: Array,
-    rng: np.random.Generator,
-    n_stacks: int | None,
-    recorded: Sequence[RecordedTrajectory],
+    head: Head, shape: Array, rng: np.random.Generator, n_stacks: int | None, recorded: Sequence[RecordedTrajectory]
 ) -> tuple[RigidPose, RigidPose, Array, Array, NDArray[np.int64]]:
     """Header poses, true poses, thickness, rank in time and stack of all slices that may meet the head.
 
@@ -154,9 +150,7 @@ def _draw_stacks(
         rank.append(in_time if order_known else np.full(len(z), np.nan))
         stack_id.append(np.full(len(z), stack))
     joined = [
-        RigidPose(
-            np.concatenate([p.rotation for p in many]), np.concatenate([p.translation_mm for p in many])
-        )
+        RigidPose(np.concatenate([p.rotation for p in many]), np.concatenate([p.translation_mm for p in many]))
         for many in (header, true)
     ]
     n = len(joined[0])
@@ -211,11 +205,7 @@ def _homogeneous(linear: NDArray[np.floating]) -> Array:
 
 
 def _random_intensities(
-    image: NDArray[np.float32],
-    inside: NDArray[np.float32],
-    pose: RigidPose,
-    pixel_mm: float,
-    rng: np.random.Generator,
+    image: NDArray[np.float32], inside: NDArray[np.float32], pose: RigidPose, pixel_mm: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """Gamma, gain per slice, shading, voids and Rician noise."""
     n, size = len(image), image.shape[1]
@@ -223,8 +213,8 @@ def _random_intensities(
     slope = (rng.normal(0, 0.1, 3) / 50.0) @ pose.rotation  # [K, 3] per mm along each slice's axes
     at = (np.arange(size) - (size - 1) / 2) * pixel_mm
     log_gain = rng.normal(0, rng.uniform(0, 0.1), n)
-    void = rng.random(n) < 0.03
-    log_gain = np.where(void, np.log(rng.uniform(0.1, 0.7, n)), log_gain)
+    dropout = rng.random(n) < 0.03
+    log_gain = np.where(dropout, np.log(rng.uniform(0.1, 0.7, n)), log_gain)
     field = np.exp(
         log_gain[:, None, None] + slope[:, 0, None, None] * at[:, None] + slope[:, 1, None, None] * at
     ).astype(np.float32)

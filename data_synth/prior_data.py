@@ -112,13 +112,24 @@ class StackSynthesisDataModule(LightningDataModule):
         train, val = self._sources()
         logger.info("synthesis from %d training and %d validation subjects", len(train), len(val))
         self.train_subjects = SyntheticSubjects(
-            train, h.spacing_mm, h.subjects_per_epoch, h.seed, smallest_shape=h.patch_size,
-            distinct=h.distinct_epochs, cache=h.cache,
-        )  # fmt: skip
-        fixed = SyntheticSubjects(
-            val, h.spacing_mm, h.val_subjects, h.seed + 1_000_003, h.val_crop, augment=False, in_order=True,
+            train,
+            h.spacing_mm,
+            h.subjects_per_epoch,
+            h.seed,
+            min_shape=h.patch_size,
+            distinct=h.distinct_epochs,
             cache=h.cache,
-        )  # fmt: skip
+        )
+        fixed = SyntheticSubjects(
+            val,
+            h.spacing_mm,
+            h.val_subjects,
+            h.seed + 1_000_003,
+            h.val_crop,
+            augment=False,
+            in_order=True,
+            cache=h.cache,
+        )
         self.val_volumes = FixedCrops(fixed, h.val_crop)
 
     def train_dataloader(self) -> DataLoader:
@@ -135,9 +146,7 @@ class StackSynthesisDataModule(LightningDataModule):
             max_length=h.patches_per_subject * min(QUEUE_SUBJECTS, h.subjects_per_epoch),
             samples_per_volume=h.patches_per_subject,
             sampler=HeadPatchSampler(h.patch_size),
-            subject_sampler=EpochSampler(
-                h.subjects_per_epoch, 0, rank, n_ranks, epoch_of(self.trainer, n_batches)
-            ),
+            subject_sampler=EpochSampler(h.subjects_per_epoch, 0, rank, n_ranks, epoch_of(self.trainer, n_batches)),
             shuffle_subjects=False,
             num_workers=h.num_workers,
             start_background=False,  # a run that goes on does not know its epoch yet
@@ -193,12 +202,7 @@ class EpochSampler(Sampler[int]):
     """
 
     def __init__(
-        self,
-        length: int,
-        epoch: int = 0,
-        rank: int = 0,
-        n_ranks: int = 1,
-        now: Callable[[], int] | None = None,
+        self, length: int, epoch: int = 0, rank: int = 0, n_ranks: int = 1, now: Callable[[], int] | None = None
     ) -> None:
         self.now = now
         self.length = length

@@ -16,9 +16,9 @@ from data_synth.simulator import Orientation, SimulatedStack, StackSettings
 from g3r.geometry import RigidPose
 
 N_STACKS_SHARE = {1: 0.3, 2: 0.17, 3: 0.32, 4: 0.09, 5: 0.06, 6: 0.06}
-VOID_SHARE_IF_GROSS, SPIKE_SHARE_IF_GROSS = 0.03, 0.02
+DROPOUT_SHARE_IF_GROSS, SPIKE_SHARE_IF_GROSS = 0.03, 0.02
 
-RIM_SHARE = 0.3
+SKULL_RIM_SHARE = 0.3
 """How often skull and mother are seen around the head, and masks reach into them."""
 RIM_MM = 3.0
 SKULL_MM = 1.5
@@ -26,9 +26,7 @@ SMALL_MASK_SHARE = 0.1
 """How often masks miss the head's outermost voxels."""
 
 
-def draw_settings(
-    residual: ResidualKind, rng: np.random.Generator, n_stacks: int | None = None
-) -> list[StackSettings]:
+def draw_settings(residual: ResidualKind, rng: np.random.Generator, n_stacks: int | None = None) -> list[StackSettings]:
     """Settings of one to six stacks as a protocol may have them: one resolution, mostly orthogonal.
 
     Args:
@@ -40,7 +38,7 @@ def draw_settings(
     number = drawn if n_stacks is None else n_stacks
     level = LEVELS[str(rng.choice(["none", "mild", "moderate"]))]
     if residual == "gross":
-        level = replace(level, dropout_share=VOID_SHARE_IF_GROSS)
+        level = replace(level, dropout_share=DROPOUT_SHARE_IF_GROSS)
     thickness = float(rng.uniform(2.0, 5.0) if rng.random() < 0.4 else rng.uniform(2.0, 3.5))
     orthogonal: list[Orientation] = ["axial", "coronal", "sagittal"]
     first = int(rng.integers(3))
@@ -71,7 +69,7 @@ def _draw_gap_mm(thickness_mm: float, rng: np.random.Generator) -> float:
     return float(rng.uniform(0.0, 1.5)) if kind < 0.85 else -float(rng.uniform(0.1, 0.5)) * thickness_mm
 
 
-def with_rim(truth: TruthVolume, rng: np.random.Generator) -> TruthVolume:
+def with_skull_rim(truth: TruthVolume, rng: np.random.Generator) -> TruthVolume:
     """The head with a dark skull and a blotchy mother around it, outside the mask."""
     voxel_mm = float(np.linalg.norm(truth.affine[:3, :3], axis=0).mean())
     away_mm = distance_transform_edt(~truth.mask) * voxel_mm
@@ -82,7 +80,7 @@ def with_rim(truth: TruthVolume, rng: np.random.Generator) -> TruthVolume:
     return replace(truth, data=np.where(truth.mask, truth.data, rim).astype(np.float32))
 
 
-def remasked(stacks: Sequence[SimulatedStack], rng: np.random.Generator, grow: bool) -> list[SimulatedStack]:
+def with_mask_errors(stacks: Sequence[SimulatedStack], rng: np.random.Generator, grow: bool) -> list[SimulatedStack]:
     """Stacks whose masks reach into the rim by up to 3 mm (`grow`), or miss the head's outermost pixels."""
     result = []
     for one in stacks:
@@ -97,7 +95,7 @@ def remasked(stacks: Sequence[SimulatedStack], rng: np.random.Generator, grow: b
     return result
 
 
-def in_line(true_pose: RigidPose, center_mm: NDArray[np.float64]) -> RigidPose:
+def rigid_stack(true_pose: RigidPose, center_mm: NDArray[np.float64]) -> RigidPose:
     """The one motion [K] that a stack's slices have on average: what is known of a single stack.
 
     Args:

@@ -33,9 +33,7 @@ def tube(p: Coordinates, points_mm: list[tuple[float, ...]], radius_mm: list[flo
         axis = np.subtract(b, a)
         along = sum((x - np.float32(o)) * np.float32(d) for x, o, d in zip(p, a, axis, strict=True))
         t = np.clip(along / np.float32(axis @ axis), 0, 1)
-        gap = np.sqrt(
-            sum((x - np.float32(o) - t * np.float32(d)) ** 2 for x, o, d in zip(p, a, axis, strict=True))
-        )
+        gap = np.sqrt(sum((x - np.float32(o) - t * np.float32(d)) ** 2 for x, o, d in zip(p, a, axis, strict=True)))
         inside = np.float32(ra) + t * np.float32(rb - ra) - gap
         best = inside if best is None else union(best, inside, 0.5 * max(ra, rb))
     assert best is not None
@@ -72,9 +70,7 @@ def coverage(distance_mm: Field, softness_mm: float) -> Field:
     return np.clip(np.float32(0.5) + distance_mm / np.float32(softness_mm), 0, 1)
 
 
-def wave_field(
-    p: Coordinates, wavelength_mm: float, bandwidth: float, n_waves: int, rng: np.random.Generator
-) -> Field:
+def wave_field(p: Coordinates, wavelength_mm: float, bandwidth: float, n_waves: int, rng: np.random.Generator) -> Field:
     """Band-limited noise of unit variance: a sum of cosines with random directions and phases.
 
     Args:
@@ -95,9 +91,7 @@ def wave_field(
     return out * np.float32(np.sqrt(2 / n_waves))
 
 
-def smooth_noise(
-    shape: tuple[int, ...], sigma_mm: float, spacing_mm: float, rng: np.random.Generator
-) -> Field:
+def smooth_noise(shape: tuple[int, ...], sigma_mm: float, spacing_mm: float, rng: np.random.Generator) -> Field:
     """Gaussian noise of unit variance with a correlation length of about `sigma_mm`, on a voxel grid.
 
     Drawn on a grid about as coarse as the noise is smooth and interpolated by cubic splines, so a
@@ -108,7 +102,5 @@ def smooth_noise(
     lattice = gaussian_filter(rng.normal(size=small), 1.0, mode="wrap")
     lattice /= lattice.std()
     coefficient = spline_filter(lattice, 3)
-    index = np.meshgrid(
-        *(np.arange(n, dtype=np.float32) / step + 1 for n in shape), indexing="ij", sparse=False
-    )
+    index = np.meshgrid(*(np.arange(n, dtype=np.float32) / step + 1 for n in shape), indexing="ij", sparse=False)
     return map_coordinates(coefficient, index, order=3, prefilter=False, output=np.float32)

@@ -170,9 +170,7 @@ class _Head:
     bright: float
 
     @classmethod
-    def of(
-        cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool
-    ) -> _Head:
+    def of(cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool) -> _Head:
         grid = VolumeGrid(mask.shape, affine)
         reach = binary_dilation(mask, iterations=SIGNAL_REACH_VOXELS)
         shell = np.argwhere(mask & ~np.roll(mask, 1, 0) | mask & ~np.roll(mask, -1, 0))
@@ -182,19 +180,21 @@ class _Head:
         volume_grid = grid
         if fine:
             shape = [2 * n - 1 for n in volume.shape]
-            volume = zoom(
-                volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest"
-            )
+            volume = zoom(volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest")
             volume_grid = VolumeGrid(volume.shape, affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
         return cls(
-            np.ascontiguousarray(volume, np.float32), volume_grid, mask.astype(np.float32),
-            reach.astype(np.float32), grid, points, (extent.min(0) + extent.max(0)) / 2, bright,
-        )  # fmt: skip
+            np.ascontiguousarray(volume, np.float32),
+            volume_grid,
+            mask.astype(np.float32),
+            reach.astype(np.float32),
+            grid,
+            points,
+            (extent.min(0) + extent.max(0)) / 2,
+            bright,
+        )
 
 
-def _simulate_stack(
-    head: _Head, settings: StackSettings, rng: np.random.Generator, name: str
-) -> SimulatedStack:
+def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generator, name: str) -> SimulatedStack:
     frame = _frame(settings, rng)
     spacing = np.array([settings.resolution_mm] * 2 + [settings.thickness_mm + settings.gap_mm])
     local = (head.point_mm - head.center_mm) @ frame
@@ -270,11 +270,7 @@ class _ProfileOperator(VoxelOperator):
     """The voxel operator with the simulator's own slice profile; without settings it reads single points."""
 
     def __init__(
-        self,
-        planes: Planes,
-        grid: VolumeGrid,
-        pixel_index: NDArray[np.int64] | None,
-        settings: StackSettings | None,
+        self, planes: Planes, grid: VolumeGrid, pixel_index: NDArray[np.int64] | None, settings: StackSettings | None
     ) -> None:
         super().__init__(planes, grid, pixel_index, (1, 1, 1))
         if settings is not None:
@@ -283,9 +279,7 @@ class _ProfileOperator(VoxelOperator):
             self.move(planes)
 
 
-def _profile_nodes(
-    settings: StackSettings, voxel_mm: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _profile_nodes(settings: StackSettings, voxel_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sample positions [Q, 3] (mm in the slice's frame) and weights [Q] of the slice profile.
 
     The variance along each axis is that of the profile less that of trilinear reading.

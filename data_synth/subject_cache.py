@@ -38,19 +38,19 @@ class KeptSubjects:
 
     Args:
         folder: made where it is missing.
-        recipe: all that decides the subjects; another recipe has files of other names.
+        spec: all that decides the subjects; another recipe has files of other names.
 
     Raises:
         InputError: the folder cannot be made.
     """
 
-    def __init__(self, folder: str | Path, recipe: str) -> None:
+    def __init__(self, folder: str | Path, spec: str) -> None:
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another cache") from None
-        self.prefix = hashlib.sha256(f"{RECIPE_VERSION} {recipe}".encode()).hexdigest()[:12]
+        self.prefix = hashlib.sha256(f"{RECIPE_VERSION} {spec}".encode()).hexdigest()[:12]
 
     def _path(self, epoch: int, index: int) -> Path:
         return self.folder / f"{self.prefix}-{epoch:05d}-{index:05d}.npz"

@@ -22,7 +22,7 @@ HALF_WINDOW_WEEKS = 2.0
 """A mean head of an age takes in the subjects of at most this many weeks more or less."""
 
 
-def mean_heads(
+def atlas_templates(
     subjects: Sequence[Subject], spacing_mm: float = 3.0, weeks: Sequence[float] = TEMPLATE_WEEKS
 ) -> AtlasTemplate:
     """Mean heads in the atlas frame: centred, normalised, averaged over near ages, left-right symmetric.

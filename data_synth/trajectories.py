@@ -69,13 +69,13 @@ def modelled_trajectory(n_samples: int, rng: np.random.Generator) -> RecordedTra
     lively = np.exp(rng.normal(0, SPREAD_BETWEEN_SUBJECTS))
     jerk = rng.random((n_samples, 1)) < JERK_SHARE
     angle_deg = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_DEG, QUIET_DEG) * lively
-    shift_mm = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_MM, QUIET_MM) * lively
+    translation_mm = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_MM, QUIET_MM) * lively
     steps = Rotation.from_rotvec(angle_deg, degrees=True).as_matrix()
     rotation = np.empty((n_samples, 3, 3))
     rotation[0] = np.eye(3)
     for k in range(1, n_samples):
         rotation[k] = steps[k] @ rotation[k - 1]
-    return RecordedTrajectory(rotation, np.cumsum(shift_mm, axis=0))
+    return RecordedTrajectory(rotation, np.cumsum(translation_mm, axis=0))
 
 
 def timed_trajectory(

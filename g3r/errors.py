@@ -32,9 +32,7 @@ class NumericalError(G3RError):
     exit_code = 4
 
 
-def cannot_be_written(
-    path: str | os.PathLike[str], error: OSError, needed_bytes: int | None = None
-) -> InputError:
+def cannot_be_written(path: str | os.PathLike[str], error: OSError, needed_bytes: int | None = None) -> InputError:
     """The error to raise where a file or folder could not be written.
 
     Args:
@@ -49,9 +47,7 @@ def cannot_be_written(
     free = _free_bytes(Path(path))
     # a quota or a limit on the size of files leaves the disk itself with space
     left = "" if free is None else f", {free / MEGABYTE:.1f} MB are free"
-    return InputError(
-        f"{path}: cannot be written ({said}{needed}{left}); free some space or choose another --output"
-    )
+    return InputError(f"{path}: cannot be written ({said}{needed}{left}); free some space or choose another --output")
 
 
 def _free_bytes(path: Path) -> int | None:

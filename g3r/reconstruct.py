@@ -22,7 +22,7 @@ from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
 from g3r.gaussians.seeding import seed_cloud
 from g3r.output.assemble import Cut, RunSoFar, cut_short, finished
-from g3r.output.record import Clock, left_out_notes
+from g3r.output.record import Clock, skipped_slice_notes
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import TimeBudget
@@ -32,21 +32,21 @@ from g3r.pose_network.network import PoseNetwork
 from g3r.prior.checkpoint import PriorCheckpoint, load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.inference import estimate_prior
-from g3r.registration import MotionEstimate, estimate_motion
+from g3r.registration import Registration, register
 from g3r.registration.prior_registration import register_to_prior
-from g3r.registration.quality import pose_warnings, stack_confidences
+from g3r.registration.quality import pose_warnings, stack_qualities
 from g3r.registration.template_search import head_volume_mm3, template_fits
-from g3r.run.allocator import give_back
+from g3r.run.allocator import release_memory
 from g3r.run.deadline import Deadline
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
-from g3r.run.stop_request import Interruption
+from g3r.run.stop_request import StopRequest
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
 DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
-LEAST_DISTILLATION = 1e-3
+MIN_DISTILLATION = 1e-3
 """Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
 
 Progress = Callable[[str, int, int], None]
@@ -86,24 +86,22 @@ class GaussianReconstructor:
             self.settings = PRESETS[self.settings]
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
-            raise InputError(
-                f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm"
-            )
+            raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
         if self.settings.use_prior:
             path = Path(self.checkpoint or DEFAULT_CHECKPOINT)
             self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
-        if self.settings.motion.template or self.settings.motion.network:
+        if self.settings.registration.template or self.settings.registration.network:
             path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
             self.pose_network, self.pose_meta = load_pose_network(path)
 
     def reconstruct(
         self,
         stacks: Sequence[Stack],
-        motion: MotionEstimate | None = None,
+        motion: Registration | None = None,
         budget: TimeBudget | None = None,
         *,
         stages: Stages | None = None,
-        interruption: Interruption | None = None,
+        stop_request: StopRequest | None = None,
     ) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
 
@@ -114,7 +112,7 @@ class GaussianReconstructor:
                 to the prior volume afterwards, where there is one.
             budget: chooses registration, views of the prior, Gaussians and steps in place of the settings.
             stages: keeps what each stage gives, or has it from an earlier run; nothing is kept when None.
-            interruption: a signal during the fit gives the volume so far (`record["partial"]`); before it,
+            stop_request: a signal during the fit gives the volume so far (`record["partial"]`); before it,
                 and without this, `KeyboardInterrupt` passes through.
 
         Raises:
@@ -125,7 +123,7 @@ class GaussianReconstructor:
         stages = stages or Stages()
         clock, notes, by_then = stages.clock, list[str](), None
         slices, first_scale = normalised_slices(stacks)
-        notes += left_out_notes(stacks, slices)
+        notes += skipped_slice_notes(stacks, slices)
         single = len(np.unique(slices.stack_id)) == 1
         settings = _settings_for(self.settings, single)
         if single:
@@ -136,51 +134,61 @@ class GaussianReconstructor:
             notes.append("motion was given, not estimated here")
         else:
             if budget:
-                settings, by_then = budget.for_motion(settings)
+                settings, by_then = budget.for_registration(settings)
             motion = stages.once("motion", lambda: self._motion(slices, settings, clock, by_then))
-        confidences = stack_confidences(motion, len(stacks))
-        warnings = pose_warnings(motion, confidences, stacks)
-        if settings.motion.standard_orientation and motion.orientation is None:
+        qualities = stack_qualities(motion, len(stacks))
+        warnings = pose_warnings(motion, qualities, stacks)
+        if settings.registration.standard_orientation and motion.orientation is None:
             notes.append(
                 "standard orientation unknown, the volume stays in scanner space: no mean head fits the "
                 f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
             )
         volume, settings = self._prior_volume(motion, settings, stages, budget, single)
-        notes += _notes_on_single(volume.believed) if single else []
+        notes += _notes_on_single(volume.accepted) if single else []
         intensity = first_scale * volume.scale
         run = RunSoFar(
-            stacks, settings, self.prior_meta, self.pose_meta, motion, confidences, volume, intensity, stages,
-            budget, notes, warnings,
-        )  # fmt: skip
+            stacks,
+            settings,
+            self.prior_meta,
+            self.pose_meta,
+            motion,
+            qualities,
+            volume,
+            intensity,
+            stages,
+            budget,
+            notes,
+            warnings,
+        )
         try:
             second_by = None
             if budget:
                 settings, by_then, second_by = budget.for_fit(
-                    settings, volume.start, volume.prior, clock.seconds["coarse"], math.prod(run.grid.shape),
+                    settings,
+                    volume.start,
+                    volume.prior,
+                    clock.seconds["coarse"],
+                    math.prod(run.grid.shape),
                     np.random.default_rng(settings.seed),
-                )  # fmt: skip
+                )
                 run = replace(run, settings=settings)
             first = stages.once("fit to prior", lambda: self._prior_cloud(run, by_then))
         except KeyboardInterrupt:
-            if interruption is None or not interruption.asked():
+            if stop_request is None or not stop_request.is_requested():
                 raise
-            interruption.postpone()
+            stop_request.postpone()
             return cut_short(run, self._cut("fit to prior", settings.prior_stage.n_steps), None, None)
-        if interruption is None:
-            return finished(
-                run, first, stages.once("fit to slices", lambda: self._fit(run, first, second_by))
-            )
-        interruption.postpone()
-        second_by = interruption.cut(second_by)
-        fit = stages.once(
-            "fit to slices", lambda: self._fit(run, first, second_by), unless=interruption.asked
-        )
-        if interruption.asked():
+        if stop_request is None:
+            return finished(run, first, stages.once("fit to slices", lambda: self._fit(run, first, second_by)))
+        stop_request.postpone()
+        second_by = stop_request.cut(second_by)
+        fit = stages.once("fit to slices", lambda: self._fit(run, first, second_by), unless=stop_request.is_requested)
+        if stop_request.is_requested():
             cut = Cut("fit to slices", len(fit.history), settings.slice_stage.n_steps)
             return cut_short(run, cut, first, fit)
         return finished(run, first, fit)
 
-    def register_stacks(self, stacks: Sequence[Stack]) -> MotionEstimate:
+    def register_stacks(self, stacks: Sequence[Stack]) -> Registration:
         """Poses of all slices of some stacks, as `reconstruct` finds them and takes them.
 
         Raises:
@@ -189,42 +197,43 @@ class GaussianReconstructor:
         return self.register(normalised_slices(stacks)[0])
 
     def register(
-        self,
-        slices: Slices,
-        settings: ReconstructionSettings | None = None,
-        deadline: Deadline | None = None,
-    ) -> MotionEstimate:
+        self, slices: Slices, settings: ReconstructionSettings | None = None, deadline: Deadline | None = None
+    ) -> Registration:
         """Poses of all slices, with this reconstructor's template and pose network.
 
         Args:
             slices: at their header poses, intensities of order one.
             settings: those of the reconstructor when None.
-            deadline: see `estimate_motion`.
+            deadline: see `register`.
         """
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
         template = self.pose_meta.template if self.pose_meta else None
         proposals = {}
-        wanted = chosen.motion.network
-        if chosen.motion.network_as_reserve:
+        wanted = chosen.registration.network
+        if chosen.registration.network_as_reserve:
             wanted &= template is None or not template_fits(slices, template)
         if self.pose_network is not None and self.pose_meta is not None and wanted:
             pose = predict_poses(self.pose_network, self.pose_meta, slices)
             proposals["network"] = pose @ slices.header_pose.inverse()
-        return estimate_motion(
-            slices, chosen.motion, self._report("motion"), template=template, proposals=proposals,
+        return register(
+            slices,
+            chosen.registration,
+            self._report("motion"),
+            template=template,
+            proposals=proposals,
             deadline=deadline,
-        )  # fmt: skip
+        )
 
     def _motion(
         self, slices: Slices, settings: ReconstructionSettings, clock: Clock, deadline: Deadline | None
-    ) -> MotionEstimate:
+    ) -> Registration:
         with clock("motion"):
             return self.register(slices, settings, deadline)
 
     def _prior_volume(
         self,
-        motion: MotionEstimate,
+        motion: Registration,
         settings: ReconstructionSettings,
         stages: Stages,
         budget: TimeBudget | None,
@@ -245,15 +254,15 @@ class GaussianReconstructor:
                 self.progress("prior", 0, 1)
                 prior = self._prior(start, chosen)
                 self.progress("prior", 1, 1)
-            scale, believed = start.scale, None
-            if single and settings.use_prior and settings.motion.runs:
+            scale, accepted = start.scale, None
+            if single and settings.use_prior and settings.registration.segments:
                 with clock("slices to prior"):
-                    nudged, gain, believed = register_to_prior(start.slices, gain, prior, start.grid)
-                    if believed:
+                    nudged, gain, accepted = register_to_prior(start.slices, gain, prior, start.grid)
+                    if accepted:
                         start = FitStart.of(nudged, gain, motion.weight, voxel_mm)
                         scale *= start.scale
                         prior = self._prior(start, chosen)
-            return PriorVolume(start, prior, gain, scale, believed)
+            return PriorVolume(start, prior, gain, scale, accepted)
 
         return stages.once("prior", make), chosen
 
@@ -261,11 +270,16 @@ class GaussianReconstructor:
         if self.network is None:
             return start.sharp
         prior = estimate_prior(
-            self.network, start.coarse, start.density, start.sharp, n_views=settings.prior_views,
-            max_whole_voxels=settings.prior_whole_voxels, tile_voxels=settings.prior_tile_voxels,
+            self.network,
+            start.coarse,
+            start.density,
+            start.sharp,
+            n_views=settings.prior_views,
+            max_whole_voxels=settings.prior_whole_voxels,
+            tile_voxels=settings.prior_tile_voxels,
             halo_voxels=settings.prior_halo_voxels,
-        )  # fmt: skip
-        give_back()  # the most that is ever freed at a time
+        )
+        release_memory()  # the most that is ever freed at a time
         return prior
 
     def _prior_cloud(self, run: RunSoFar, deadline: Deadline | None) -> PriorCloud:
@@ -296,14 +310,21 @@ class GaussianReconstructor:
                 # the prior counts where slices are sparse; where they are dense they know better. It was made
                 # of the same slices: from several stacks only 1 - c of what it says there is its own
                 power = 1 if len(np.unique(start.slices.stack_id)) == 1 else 2
-                unmeasured = np.maximum((1 - confidence(start.density)) ** power, LEAST_DISTILLATION)
-                trust = (unmeasured * start.mask).astype(np.float32)
-                distil_to = VolumeTarget.of(run.volume.prior, trust, start.grid)
+                unmeasured = np.maximum((1 - confidence(start.density)) ** power, MIN_DISTILLATION)
+                slice_weight = (unmeasured * start.mask).astype(np.float32)
+                distil_to = VolumeTarget.of(run.volume.prior, slice_weight, start.grid)
             return fit_slices(
-                first.cloud, start.slices, run.volume.gain, run.motion.weight, distil_to,
-                settings.slice_stage, stage_rng(settings.seed, "fit to slices"),
-                self._report("fit to slices"), deadline, self.observer,
-            )  # fmt: skip
+                first.cloud,
+                start.slices,
+                run.volume.gain,
+                run.motion.weight,
+                distil_to,
+                settings.slice_stage,
+                stage_rng(settings.seed, "fit to slices"),
+                self._report("fit to slices"),
+                deadline,
+                self.observer,
+            )
 
     def _report(self, stage: str) -> Callable[[int, int], None]:
         def report(done: int, total: int) -> None:
@@ -322,15 +343,15 @@ def _settings_for(settings: ReconstructionSettings, single: bool) -> Reconstruct
     stage = settings.slice_stage
     if single:
         # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
-        held = settings.use_prior and settings.distillation and settings.motion.runs
+        held = settings.use_prior and settings.distillation and settings.registration.segments
         return replace(settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held))
     # several stacks check each other: the schedule alone decides how hard the prior pulls
     return replace(settings, slice_stage=replace(stage, prior_error=0.0))
 
 
-def _notes_on_single(believed: bool | None) -> list[str]:
-    if believed is None:
+def _notes_on_single(accepted: bool | None) -> list[str]:
+    if accepted is None:
         return ["slices of the single stack stay where the mean head or the header has them"]
-    if believed:
+    if accepted:
         return ["slices of the single stack were registered to the prior volume"]
     return ["slices of the single stack stay in line up to the fit: the prior gave no reason to move"]

@@ -20,9 +20,10 @@ def parser_of(name: str, description: str, folder: Path) -> argparse.ArgumentPar
         folder: where its records go by default.
     """
     parser = argparse.ArgumentParser(
-        prog=f"python -m studies.{name}", description=description,
+        prog=f"python -m studies.{name}",
+        description=description,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--preset", default="balanced", help="settings")
     parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
     parser.add_argument("--threads", type=int, help="(None: all cores, shared out)")

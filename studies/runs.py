@@ -19,7 +19,7 @@ from g3r.evaluation.pose_error import PoseError
 from g3r.geometry import RigidPose
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration.quality import pose_warnings, stack_confidences
+from g3r.registration.quality import pose_warnings, stack_qualities
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
@@ -56,11 +56,15 @@ class Run:
     def record(self) -> dict[str, Any]:
         """The figures as plain numbers, without the slices."""
         result: dict[str, Any] = {
-            **self.error.figures(), "worst_mm": max(self.error.per_slice_mm.values()),
+            **self.error.figures(),
+            "worst_mm": max(self.error.per_slice_mm.values()),
             "orientation_deg": self.orientation_deg,
-            "seconds": round(self.seconds, 2), "cpu_seconds": round(self.cpu_seconds, 2),
-            "warned": bool(self.warnings), "bad": self.is_bad, "warnings": list(self.warnings),
-        }  # fmt: skip
+            "seconds": round(self.seconds, 2),
+            "cpu_seconds": round(self.cpu_seconds, 2),
+            "warned": bool(self.warnings),
+            "bad": self.is_bad,
+            "warnings": list(self.warnings),
+        }
         if self.scores:
             result |= {"psnr_db": self.scores.psnr_db, "ssim": self.scores.ssim}
             result |= {"stage_seconds": dict(self.stage_seconds or {})}
@@ -73,15 +77,13 @@ def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint
     wall, cpu = time.perf_counter(), time.process_time()
     motion = reconstructor.register_stacks(case.stacks)
     seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-    confidences = stack_confidences(motion, len(case.stacks))
+    confidences = stack_qualities(motion, len(case.stacks))
     warnings = tuple(pose_warnings(motion, confidences, case.stacks))
     error = case.pose_error(motion.slices)
     return Run(error, seconds, cpu_seconds, warnings, orientation_deg=orientation_deg(case, error.common))
 
 
-def reconstructed(
-    case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None
-) -> Run:
+def reconstructed(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
     """The whole reconstruction, its volume scored after rigid alignment."""
     reconstructor = GaussianReconstructor(checkpoint, settings)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -92,9 +94,14 @@ def reconstructed(
     volume = Volume(result.volume, _moved(error.common, result.grid.affine), case.name)
     scores = compare(volume, case.truth, case.truth_mask, align=True).scores
     return Run(
-        error, seconds, cpu_seconds, tuple(result.record["warnings"]), scores, result.record["seconds"],
+        error,
+        seconds,
+        cpu_seconds,
+        tuple(result.record["warnings"]),
+        scores,
+        result.record["seconds"],
         orientation_deg(case, error.common),
-    )  # fmt: skip
+    )
 
 
 def _moved(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:

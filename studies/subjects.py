@@ -29,7 +29,7 @@ RECORD_NAME = "simulation.json"
 
 
 @dataclass(frozen=True)
-class SubjectRecipe:
+class SubjectSpec:
     """All that decides a simulated subject.
 
     Args:
@@ -63,40 +63,40 @@ def test_data_folder() -> Path:
     return folder
 
 
-def simulated_subject(recipe: SubjectRecipe, atlas: Path, cache: Path) -> Path:
+def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
     """The folder of a subject, simulated if the cache does not hold it.
 
     Raises:
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
     """
-    folder = cache / recipe.name
-    record = asdict(recipe)
+    folder = cache / spec.name
+    record = asdict(spec)
     if folder.is_dir():
         path = folder / RECORD_NAME
         found = json.loads(path.read_text(encoding="utf-8")).get("recipe") if path.is_file() else None
         if found != record:
             raise InputError(f"{folder}: made by another recipe; remove it or choose another --cache")
         return folder
-    chosen = find_subjects(atlas, include=[recipe.volume])
-    rng = np.random.default_rng(recipe.seed)
-    truth = _stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), recipe, rng)
-    settings = orthogonal_settings(3, recipe.motion, bias=recipe.bias)
+    chosen = find_subjects(atlas, include=[spec.volume])
+    rng = np.random.default_rng(spec.seed)
+    truth = _stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), spec, rng)
+    settings = orthogonal_settings(3, spec.motion, bias=spec.bias)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}
     save_simulation(folder, truth, stacks, {"recipe": record, **extra})
-    logger.info("%s: simulated", recipe.name)
+    logger.info("%s: simulated", spec.name)
     return folder
 
 
-def _stretched(truth: TruthVolume, recipe: SubjectRecipe, rng: np.random.Generator) -> TruthVolume:
+def _stretched(truth: TruthVolume, spec: SubjectSpec, rng: np.random.Generator) -> TruthVolume:
     """The volume with other voxel sizes (no resampling, no loss), centred, turned at random if asked."""
-    factor = 1 + rng.uniform(-recipe.stretch, recipe.stretch, 3)
+    factor = 1 + rng.uniform(-spec.stretch, spec.stretch, 3)
     turn = np.eye(3)
-    if recipe.turned:
+    if spec.turned:
         from scipy.spatial.transform import Rotation
 
         turn = Rotation.random(rng=rng).as_matrix()
     affine = np.eye(4)
     affine[:3, :3] = turn @ truth.affine[:3, :3] * factor
     affine[:3, 3] = -affine[:3, :3] @ ((np.array(truth.data.shape) - 1) / 2)
-    return TruthVolume(recipe.name, truth.data * np.float32(BRIGHT), truth.mask, affine)
+    return TruthVolume(spec.name, truth.data * np.float32(BRIGHT), truth.mask, affine)

@@ -50,9 +50,7 @@ ALLOWED["cli"] = ROOMS - {"cli"}
 DATA_SYNTH_MAY = {"geometry", "acquisition", "unfinished"} | OPEN_TO_ALL
 
 SOURCES = sorted(
-    path
-    for folder in ("g3r", "data_synth", "studies", "tests")
-    for path in (REPOSITORY / folder).rglob("*.py")
+    path for folder in ("g3r", "data_synth", "studies", "tests") for path in (REPOSITORY / folder).rglob("*.py")
 )
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".txt", ".yaml", ".yml", ".cff", ".cfg", ".sh", ".json", ""}
 IGNORED_FOLDERS = {"runs", "lightning_logs", "out", "demo", "build", "dist"}
@@ -126,9 +124,7 @@ def modules_after(statement: str, *wanted: str) -> set[str]:
         f"import json, sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\n"
         f"print('\\n' + json.dumps([m for m in {list(wanted)!r} if m in sys.modules]))"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY
-    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert run.returncode == 0, run.stderr
     return set(json.loads(run.stdout.splitlines()[-1]))
 
@@ -183,9 +179,7 @@ def repository_texts() -> list[Path]:
             relative(path)
             for path in REPOSITORY.rglob("*")
             if not any(
-                part in IGNORED_FOLDERS
-                or (part.startswith(".") and part != ".ci")
-                or part.endswith(".egg-info")
+                part in IGNORED_FOLDERS or (part.startswith(".") and part != ".ci") or part.endswith(".egg-info")
                 for part in path.relative_to(REPOSITORY).parts
             )
         ]
@@ -195,9 +189,7 @@ def repository_texts() -> list[Path]:
 
 def test_no_path_of_one_machine() -> None:
     # spelled in pieces, so that this file does not find itself
-    machine = re.compile(
-        "|".join(re.escape(a + b) for a, b in [("/wo", "rk/"), ("/ho", "me/"), ("/ro", "ot/")])
-    )
+    machine = re.compile("|".join(re.escape(a + b) for a, b in [("/wo", "rk/"), ("/ho", "me/"), ("/ro", "ot/")]))
     shared = ".." + "/shared"
     for path in repository_texts():
         text = path.read_text(encoding="utf-8", errors="ignore")
@@ -207,9 +199,7 @@ def test_no_path_of_one_machine() -> None:
 
 @pytest.mark.parametrize("path", SOURCES, ids=relative)
 def test_source_has_a_name_and_a_docstring(path: Path) -> None:
-    assert path.stem not in {"utils", "util", "helpers", "misc"}, (
-        "a function without a home: name the concept"
-    )
+    assert path.stem not in {"utils", "util", "helpers", "misc"}, "a function without a home: name the concept"
     if not path.is_relative_to(REPOSITORY / "tests"):  # a test's name says what it is about
         docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert docstring, f"{relative(path)} has no module docstring"

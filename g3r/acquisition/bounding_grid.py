@@ -19,16 +19,7 @@ def grid_around(slices: Slices, spacing_mm: float, margin_mm: float = 6.0) -> Vo
     if not slices.mask.any():
         raise ValueError("no pixel is masked")
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    _bounds(
-        slices.mask,
-        planes.offset,
-        planes.shape,
-        planes.spacing_mm,
-        planes.rotation,
-        planes.center_mm,
-        low,
-        high,
-    )
+    _bounds(slices.mask, planes.offset, planes.shape, planes.spacing_mm, planes.rotation, planes.center_mm, low, high)
     return VolumeGrid.isotropic(low, high, spacing_mm, margin_mm)
 
 

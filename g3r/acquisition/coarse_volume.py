@@ -86,7 +86,5 @@ def normalisation_scale(coarse: NDArray[np.floating], density: NDArray[np.floati
         raise InputError("no voxel is covered by a slice; check masks and headers")
     scale = float(np.percentile(covered, 99))
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(
-            f"99th percentile of the image inside the masks is {scale:g}; expected a positive value"
-        )
+        raise InputError(f"99th percentile of the image inside the masks is {scale:g}; expected a positive value")
     return scale

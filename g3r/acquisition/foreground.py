@@ -16,16 +16,14 @@ INSIDE_SHARE = 1 / 3
 of a mask lies, the volume is right to 1 %, but the outermost voxels are lost here and there, and with them 1
 to 4 dB; this is generous by about a quarter of the distance of slices (docs/method.md, "Mask")."""
 
-LEAST_DENSITY = 0.1
+MIN_DENSITY = 0.1
 """Coverage (1 is one gapless stack) below which nobody is asked: what no slice has seen is not brain."""
 
 RIM_MM = 6.0
 """How far beyond its mask's bounding box a slice says that there is no brain."""
 
 
-def foreground_mask(
-    slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None
-) -> NDArray[np.bool_]:
+def foreground_mask(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
     """Brain mask [I, J, K]: where most of the slices that cover a voxel have it in their masks.
 
     Masked and unmasked pixels are spread through their PSF; what lies beyond the first and the last slice of
@@ -48,7 +46,7 @@ def foreground_mask(
     inside, total = operator.adjoint(covered * mask), operator.adjoint(covered)
     sigma = 0.5 * _slice_distance_mm(slices) / grid.spacing_mm.mean()
     inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
-    brain = (inside > INSIDE_SHARE * total) & (inside > LEAST_DENSITY)
+    brain = (inside > INSIDE_SHARE * total) & (inside > MIN_DENSITY)
     pieces, n_pieces = label(brain)
     if n_pieces == 0:
         raise InputError("no voxel is covered by a slice; check masks and headers")
@@ -109,7 +107,5 @@ def _slice_distance_mm(slices: Slices) -> float:
         normal = slices.header_pose.rotation[of_stack][:, :, 2]
         step = np.abs(((center[1:] - center[:-1]) * normal[1:]).sum(1))
         index_step = np.maximum(np.diff(slices.slice_index[of_stack]), 1)
-        distances.append(
-            np.median(step / index_step) if len(step) else float(slices.thickness_mm[of_stack][0])
-        )
+        distances.append(np.median(step / index_step) if len(step) else float(slices.thickness_mm[of_stack][0]))
     return float(max(distances))

@@ -31,8 +31,7 @@ class HeaderText:
     def record(self) -> dict[str, Any]:
         """For run.json."""
         texts = [
-            {"code": code, "text": content.decode("utf-8", "backslashreplace")}
-            for code, content in self.extensions
+            {"code": code, "text": content.decode("utf-8", "backslashreplace")} for code, content in self.extensions
         ]
         return {"fields": dict(self.fields), "extensions": texts}
 

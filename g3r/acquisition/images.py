@@ -18,7 +18,7 @@ from g3r.geometry import VolumeGrid
 MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 """Masks are drawn on copies whose headers lost digits: corners may differ by this much."""
 
-MOST_LABELS = 256
+MAX_LABELS = 256
 """A mask with more different values above 1 than this is taken for an image."""
 
 
@@ -70,9 +70,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
             f"{mask.name}: mask grid {mask.data.shape} differs from that of {reference.name} "
             f"{reference.data.shape}; resample the mask or pass the matching file"
         )
-    corners = (
-        np.array(np.meshgrid(*[(0, n - 1) for n in reference.data.shape], indexing="ij")).reshape(3, -1).T
-    )
+    corners = np.array(np.meshgrid(*[(0, n - 1) for n in reference.data.shape], indexing="ij")).reshape(3, -1).T
     offset = reference.grid.index(mask.grid.world(corners)) - corners
     if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
         raise InputError(
@@ -92,7 +90,7 @@ def _check_mask_values(mask: Volume) -> None:
     if not above.size or above.max() < 2 or (above == above[0]).all():  # a spline overshoots 1
         return
     whole = (above == np.rint(above)).all()
-    if not whole or len(np.unique(above)) > MOST_LABELS:
+    if not whole or len(np.unique(above)) > MAX_LABELS:
         raise InputError(
             f"{mask.name}: holds values up to {above.max():g} as an image does; expected a mask of 0 and 1 "
             "(or labels, or a probability); pass the mask that belongs to the stack"

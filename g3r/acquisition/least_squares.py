@@ -41,11 +41,15 @@ def sharpened_volume(
     """
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     value = slices.masked_value if gain is None else slices.masked_value / gain[slices.pixel_plane]
-    trust = np.ones(len(value)) if weight is None else weight
+    slice_weight = np.ones(len(value)) if weight is None else weight
     return solve_volume(
-        operator, value.astype(np.float32), trust.astype(np.float32), start=coarse,
-        n_iterations=SHARPENING_STEPS, smoothness=SHARPENING_SMOOTHNESS,
-    )  # fmt: skip
+        operator,
+        value.astype(np.float32),
+        slice_weight.astype(np.float32),
+        start=coarse,
+        n_iterations=SHARPENING_STEPS,
+        smoothness=SHARPENING_SMOOTHNESS,
+    )
 
 
 def solve_volume(

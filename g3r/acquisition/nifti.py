@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
-LARGEST_VOXEL_COUNT = 2**28
+MAX_VOXEL_COUNT = 2**28
 """A header that claims more voxels than this (1 GB as float32) is refused before any memory is taken."""
 
-LARGEST_VOXEL_BYTES = 8 * LARGEST_VOXEL_COUNT
+MAX_VOXEL_BYTES = 8 * MAX_VOXEL_COUNT
 
 GZIP_RATIO = 1032
 """Deflate makes of a byte at most this many, so a compressed file cannot hold more (zlib's documentation)."""
 
-BLOCK_BYTES, MOST_BLOCKS_BEYOND = 2**20, 64
+BLOCK_BYTES, MAX_BLOCKS_BEYOND = 2**20, 64
 """What may follow the voxels of a compressed file is read to its end, but not for ever."""
 
 NIFTI_ENDINGS = (".nii", ".hdr", ".img")
@@ -63,14 +63,8 @@ def open_nifti(path: str | os.PathLike[str]) -> tuple[NiftiImage, list[str]]:
             image = nib.load(path, mmap=False)
     except Exception as error:  # nibabel's parsers raise whatever damaged bytes make them raise
         found = one_line(error).replace(str(path), path.name)
-        raise InputError(
-            f"{path.name}: not a readable NIfTI file ({found}); expected .nii or .nii.gz"
-        ) from None
-    if (
-        isinstance(image, NiftiImage)
-        and int(image.header["sform_code"]) <= 0
-        and NO_SIZE in " ".join(remarks)
-    ):
+        raise InputError(f"{path.name}: not a readable NIfTI file ({found}); expected .nii or .nii.gz") from None
+    if isinstance(image, NiftiImage) and int(image.header["sform_code"]) <= 0 and NO_SIZE in " ".join(remarks):
         raise InputError(f"{path.name}: bad header (pixdim is 0); fix pixdim, or give it an sform")
     if not isinstance(image, NiftiImage):
         raise InputError(f"{path.name}: is a {type(image).__name__}; expected NIfTI, convert it first")
@@ -88,22 +82,17 @@ def checked_grid(image: NiftiImage, name: str) -> VolumeGrid:
     if len(shape) > 3 and all(n == 1 for n in shape[3:]):
         shape = shape[:3]
     if len(shape) != 3:
-        raise InputError(
-            f"{name}: has shape {image.shape}; expected 3D, or 4D with one frame: split the frames"
-        )
+        raise InputError(f"{name}: has shape {image.shape}; expected 3D, or 4D with one frame: split the frames")
     if min(shape) < 1:
         raise InputError(f"{name}: has an empty axis (shape {shape}); export the image again")
     dtype = image.get_data_dtype()
     if dtype.kind not in "iuf":
-        raise InputError(
-            f"{name}: holds {dtype} values (colour or complex); expected one real number a voxel"
-        )
+        raise InputError(f"{name}: holds {dtype} values (colour or complex); expected one real number a voxel")
     _check_size(image, shape, dtype.itemsize, name)
     units = LENGTH_UNITS.get(int(image.header["xyzt_units"]) & 7)
     if units:
         raise InputError(
-            f"{name}: header gives lengths in {units}; expected mm, convert the header (xyzt_units "
-            "and affine)"
+            f"{name}: header gives lengths in {units}; expected mm, convert the header (xyzt_units and affine)"
         )
     try:
         return VolumeGrid((shape[0], shape[1], shape[2]), np.array(image.affine, dtype=np.float64))
@@ -125,9 +114,7 @@ def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray
     except Exception as error:  # zlib, gzip and nibabel have many names for damage
         if isinstance(error, MemoryError):
             raise
-        raise InputError(
-            f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off"
-        ) from None
+        raise InputError(f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off") from None
 
 
 def _read(image: NiftiImage) -> NDArray[np.float32]:
@@ -139,7 +126,7 @@ def _read(image: NiftiImage) -> NDArray[np.float32]:
     layout = (of_file.shape, of_file.dtype, of_file.offset, of_file.slope, of_file.inter)
     with gzip.open(file) as stream:
         data = np.asarray(ArrayProxy(stream, layout, mmap=False), dtype=np.float32)
-        for _ in range(MOST_BLOCKS_BEYOND):
+        for _ in range(MAX_BLOCKS_BEYOND):
             if not stream.read(BLOCK_BYTES):
                 return data
     raise InputError(f"{file.name}: holds far more than its header claims; export the image again")
@@ -181,17 +168,14 @@ def _check_file(path: Path) -> None:
         found = getattr(error, "strerror", None) or one_line(error)
         raise InputError(f"{path}: cannot be read ({found}); check the path") from None
     if stat.S_ISDIR(status.st_mode):
-        raise InputError(
-            f"{path}: is a folder; expected a NIfTI file (.nii or .nii.gz; dcm2niix makes one of DICOM)"
-        )
+        raise InputError(f"{path}: is a folder; expected a NIfTI file (.nii or .nii.gz; dcm2niix makes one of DICOM)")
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is a pipe or device; expected a NIfTI file (.nii or .nii.gz)")
     name = path.name.lower()
     compressed = name.endswith(".gz")
     if not name.removesuffix(".gz").endswith(NIFTI_ENDINGS):
         raise InputError(
-            f"{path.name}: is not NIfTI by its name; expected .nii or .nii.gz, convert it first (dcm2niix "
-            "for DICOM)"
+            f"{path.name}: is not NIfTI by its name; expected .nii or .nii.gz, convert it first (dcm2niix for DICOM)"
         )
     try:
         with path.open("rb") as stream:
@@ -218,7 +202,7 @@ def _check_size(image: NiftiImage, shape: tuple[int, ...], voxel_bytes: int, nam
     for extent in shape:  # in whole numbers, which do not overflow
         n_voxels *= extent
     claimed = n_voxels * voxel_bytes
-    if n_voxels > LARGEST_VOXEL_COUNT or claimed > LARGEST_VOXEL_BYTES:
+    if n_voxels > MAX_VOXEL_COUNT or claimed > MAX_VOXEL_BYTES:
         raise InputError(
             f"{name}: header claims {shape} voxels ({claimed / 1e9:.3g} GB); expected a stack or volume of "
             "ordinary size"
@@ -228,9 +212,7 @@ def _check_size(image: NiftiImage, shape: tuple[int, ...], voxel_bytes: int, nam
         size = file.stat().st_size
         start = int(of_file.offset)
     except (OSError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off"
-        ) from None
+        raise InputError(f"{name}: voxels cannot be read ({one_line(error)}); the file may be cut off") from None
     room = size * GZIP_RATIO if file.name.lower().endswith(".gz") else size
     if start < 0 or start + claimed > room:
         raise InputError(

@@ -15,7 +15,7 @@ from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
-SMALLEST_SLICE_PIXELS = 12
+MIN_SLICE_PIXELS = 12
 """Slices with fewer masked pixels carry no pose and little image; they are left out and named in run.json."""
 
 
@@ -92,9 +92,7 @@ class Planes:
             position += uv[:, axis, None] * self.rotation[plane, :, axis]
         return position
 
-    def _plane_and_uv(
-        self, pixel: NDArray[np.integer] | None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _plane_and_uv(self, pixel: NDArray[np.integer] | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         if pixel is None:
             pixel, plane = np.arange(self.n_pixels), self.plane_id()
         else:
@@ -175,8 +173,7 @@ class Slices:
         """The slices at an index array or mask, with their pixels."""
         chosen = np.arange(len(self))[index]
         pixels = np.concatenate(
-            [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen]
-            or [np.zeros(0, int)]
+            [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen] or [np.zeros(0, int)]
         )
         return Slices(
             self.planes.take(chosen),
@@ -221,7 +218,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         frame = left @ right
         for k in range(stack.image.shape[2]):
             inside = stack.mask[:, :, k]
-            if inside.sum() < SMALLEST_SLICE_PIXELS:
+            if inside.sum() < MIN_SLICE_PIXELS:
                 continue
             rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
             box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
@@ -237,9 +234,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             slice_index.append(k)
             thickness.append(stack.thickness_mm)
     if not rotation:
-        raise InputError(
-            f"{stacks[0].name}: no slice with {SMALLEST_SLICE_PIXELS} masked pixels; check the masks"
-        )
+        raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
     planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
     return Slices(
         planes,

@@ -71,8 +71,7 @@ def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:
     in_stack = slices.header_pose.take(first).inverse() @ slices.header_pose
     center = np.stack(
         [
-            np.bincount(plane, uv[:, a], len(slices))
-            / np.maximum(np.bincount(plane, minlength=len(slices)), 1)
+            np.bincount(plane, uv[:, a], len(slices)) / np.maximum(np.bincount(plane, minlength=len(slices)), 1)
             for a in range(2)
         ]
         + [np.zeros(len(slices))],

@@ -28,7 +28,7 @@ SPACING_RANGE_MM = (0.05, 50.0)
 INTENSITY_RANGE = (1e-30, 1e30)
 """Largest value inside a mask: what float32 can be divided by."""
 
-LEAST_POSITIVE_SHARE = 0.01
+MIN_POSITIVE_SHARE = 0.01
 """Of the masked values; intensities are normalised by their 99th percentile."""
 
 FARTHEST_MM = 500.0
@@ -65,9 +65,7 @@ class Stack:
         if image.ndim != 3:
             raise InputError(f"{self.name}: has shape {image.shape}; expected a 3D stack of slices")
         if mask.shape != image.shape:
-            raise InputError(
-                f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same"
-            )
+            raise InputError(f"{self.name}: mask has shape {mask.shape}, image {image.shape}; expected the same")
         if image.shape[2] < 2:
             raise InputError(f"{self.name}: holds {image.shape[2]} slice; expected a stack of at least 2")
         try:
@@ -83,9 +81,7 @@ class Stack:
         axes = affine[:3, :3] / spacing
         cosine = np.abs(axes.T @ axes - np.eye(3)).max()
         if cosine > ORTHOGONALITY_TOLERANCE:
-            raise InputError(
-                f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes"
-            )
+            raise InputError(f"{self.name}: axes are sheared (cosine {cosine:.2g}); resample to orthogonal axes")
         low, high = THICKNESS_RANGE_MM
         if not (np.isfinite(self.thickness_mm) and low <= self.thickness_mm <= high):
             raise InputError(
@@ -97,12 +93,10 @@ class Stack:
         inside = image[mask]
         n_bad = int((~np.isfinite(inside)).sum())
         if n_bad:
-            raise InputError(
-                f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out"
-            )
+            raise InputError(f"{self.name}: {n_bad} values inside the mask are not finite; repair or mask them out")
         if inside.size > 1 and inside.min() == inside.max():
             raise InputError(f"{self.name}: every value inside the mask is {inside[0]:g}; expected an image")
-        if np.count_nonzero(inside > 0) < LEAST_POSITIVE_SHARE * inside.size:
+        if np.count_nonzero(inside > 0) < MIN_POSITIVE_SHARE * inside.size:
             raise InputError(
                 f"{self.name}: hardly a value inside the mask is positive (the largest is {inside.max():g}); "
                 "expected a magnitude image"
@@ -130,9 +124,7 @@ class Stack:
 
 
 def load_stack(
-    path: str | os.PathLike[str],
-    mask_path: str | os.PathLike[str] | None = None,
-    thickness_mm: float | None = None,
+    path: str | os.PathLike[str], mask_path: str | os.PathLike[str] | None = None, thickness_mm: float | None = None
 ) -> Stack:
     """Read a stack and its mask.
 
@@ -174,8 +166,10 @@ def load_stack(
     if stack.thickness_mm < stack.spacing_mm[:2].min():
         logger.warning(
             "%s: thickness %g mm is less than the pixels' %s mm; check --thickness",
-            stack.name, stack.thickness_mm, spaced(stack.spacing_mm[:2]),
-        )  # fmt: skip
+            stack.name,
+            stack.thickness_mm,
+            spaced(stack.spacing_mm[:2]),
+        )
     return stack
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes
 from g3r.geometry import VolumeGrid
 
-MOST_SCATTER_BUFFERS = 4
+MAX_SCATTER_BUFFERS = 4
 """Each thread that scatters needs its own volume; more than four cost more memory than they save time."""
 
 
@@ -82,9 +82,15 @@ class VoxelOperator:
             raise ValueError(f"volume has shape {volume.shape}; the operator's grid is {self.grid.shape}")
         pixels = np.zeros(self.n_pixels, volume.dtype)
         _gather(
-            np.ascontiguousarray(volume), self.plane, self.uv_mm, self.index_from_plane, self.index_center,
-            self.node_index, self.node_weight, pixels,
-        )  # fmt: skip
+            np.ascontiguousarray(volume),
+            self.plane,
+            self.uv_mm,
+            self.index_from_plane,
+            self.index_center,
+            self.node_index,
+            self.node_weight,
+            pixels,
+        )
         return pixels
 
     def adjoint(self, pixels: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -95,12 +101,18 @@ class VoxelOperator:
         """
         if pixels.shape != (self.n_pixels,):
             raise ValueError(f"pixels have shape {pixels.shape}; expected ({self.n_pixels},)")
-        n_buffers = min(numba.get_num_threads(), MOST_SCATTER_BUFFERS)
+        n_buffers = min(numba.get_num_threads(), MAX_SCATTER_BUFFERS)
         buffers = np.zeros((n_buffers, *self.grid.shape), pixels.dtype)
         _scatter(
-            pixels, self.plane, self.uv_mm, self.index_from_plane, self.index_center,
-            self.node_index, self.node_weight, buffers,
-        )  # fmt: skip
+            pixels,
+            self.plane,
+            self.uv_mm,
+            self.index_from_plane,
+            self.index_center,
+            self.node_index,
+            self.node_weight,
+            buffers,
+        )
         return buffers[0] if n_buffers == 1 else buffers.sum(0)
 
 

@@ -40,11 +40,18 @@ def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]
     """Arguments of g3r-infer for a simulated subject."""
     numbers = range(len(case.stacks))
     return [
-        "--stacks", *[str(case.folder / f"stack-{n}.nii.gz") for n in numbers],
-        "--masks", *[str(case.folder / f"mask-{n}.nii.gz") for n in numbers],
-        "--thickness", *[f"{stack.thickness_mm:g}" for stack in case.stacks],
-        "--preset", preset, "--output", str(output), "--quiet",
-    ]  # fmt: skip
+        "--stacks",
+        *[str(case.folder / f"stack-{n}.nii.gz") for n in numbers],
+        "--masks",
+        *[str(case.folder / f"mask-{n}.nii.gz") for n in numbers],
+        "--thickness",
+        *[f"{stack.thickness_mm:g}" for stack in case.stacks],
+        "--preset",
+        preset,
+        "--output",
+        str(output),
+        "--quiet",
+    ]
 
 
 def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
@@ -63,8 +70,10 @@ def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
     start = time.perf_counter()
     child = subprocess.Popen(
         [sys.executable, "-m", "g3r.cli.infer", *arguments],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": path},
+    )
     assert child.stderr is not None
     said = child.stderr.read().decode(errors="replace").strip()  # to the end of the process
     _, status, usage = os.wait4(child.pid, 0)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-FEWEST_REPEATS, MOST_REPEATS = 3, 30
+MIN_REPEATS, MAX_REPEATS = 3, 30
 ENOUGH_SECONDS = 0.3
 
 PAGE_BYTES = 4096
@@ -18,11 +18,11 @@ _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
 
 
-def least_cpu_seconds(call: Callable[[], object]) -> float:
+def min_cpu_seconds(call: Callable[[], object]) -> float:
     """Least CPU time of several calls; after one that is not counted."""
     call()
     best, spent, n = float("inf"), 0.0, 0
-    while n < FEWEST_REPEATS or (spent < ENOUGH_SECONDS and n < MOST_REPEATS):
+    while n < MIN_REPEATS or (spent < ENOUGH_SECONDS and n < MAX_REPEATS):
         start = time.process_time()
         call()
         seconds = time.process_time() - start

@@ -13,7 +13,7 @@ from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
 from g3r.planning.presets import ReconstructionSettings, changed
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 
 SAMPLES_PER_FIT = 10
 
@@ -76,13 +76,13 @@ class FitWatch:
         return [self.seconds[-1] - moment for moment in self.seconds]
 
 
-def shared_registration(case: SimulatedCase, settings: ReconstructionSettings) -> MotionEstimate:
+def shared_registration(case: SimulatedCase, settings: ReconstructionSettings) -> Registration:
     """Poses of a subject's slices, for several fits."""
     return GaussianReconstructor(settings=settings).register_stacks(case.stacks)
 
 
 def measured_fit(
-    case: SimulatedCase, settings: ReconstructionSettings, motion: MotionEstimate | None = None
+    case: SimulatedCase, settings: ReconstructionSettings, motion: Registration | None = None
 ) -> dict[str, Any]:
     """One reconstruction: seconds by stage, number of Gaussians, quality, and quality during the fit.
 

@@ -45,12 +45,17 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
     points = (points * HEAD_MM)[np.lexsort(np.rint(points * HEAD_MM / 4).T)]  # neighbours near in memory
     spacing_mm = float(4 / 3 * np.pi * HEAD_MM.prod() / n_gaussians) ** (1 / 3)
     arrays = (
-        points, np.log(SIGMA_PER_SPACING * spacing_mm) + rng.normal(0, SPREAD, (n_gaussians, 3)),
-        rng.normal(size=(n_gaussians, 4)), rng.uniform(0, 1, n_gaussians),
-    )  # fmt: skip
+        points,
+        np.log(SIGMA_PER_SPACING * spacing_mm) + rng.normal(0, SPREAD, (n_gaussians, 3)),
+        rng.normal(size=(n_gaussians, 4)),
+        rng.uniform(0, 1, n_gaussians),
+    )
     cloud = GaussianCloud.of([torch.tensor(array, dtype=torch.float32) for array in arrays], np.zeros(3))
-    frames = [np.eye(3), Rotation.from_euler("x", 90, degrees=True).as_matrix(),
-              Rotation.from_euler("y", 90, degrees=True).as_matrix()]  # fmt: skip
+    frames = [
+        np.eye(3),
+        Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+        Rotation.from_euler("y", 90, degrees=True).as_matrix(),
+    ]
     rotation, center, shape, stack = [], [], [], []
     for number, frame in enumerate(frames):
         reach = np.abs(frame.T) @ HEAD_MM
@@ -65,42 +70,46 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
     k = len(stack)
     spacing = np.full((k, 2), PIXEL_MM)
     planes = Planes(
-        np.array(rotation), np.array(center), spacing, np.array(shape, dtype=np.int64),
+        np.array(rotation),
+        np.array(center),
+        spacing,
+        np.array(shape, dtype=np.int64),
         psf_variance_mm2(spacing, np.full(k, THICKNESS_MM)),
-    )  # fmt: skip
+    )
     value = rng.random(planes.n_pixels, dtype=np.float32)
     index = np.arange(k)
     slices = Slices(
-        planes,
-        value,
-        np.ones(len(value), bool),
-        np.array(stack),
-        index,
-        np.full(k, THICKNESS_MM),
-        planes.pose,
+        planes, value, np.ones(len(value), bool), np.array(stack), index, np.full(k, THICKNESS_MM), planes.pose
     )
     return KernelScene(cloud, slices)
 
 
 @numba.njit(cache=True)
-def count_pixels(
-    shapes, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, records
-):  # fmt: skip
+def count_pixels(shapes, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, projections):
     """Number of (pair, pixel) evaluations inside the cut-off, and of pairs that have any."""
     n_pixels, n_pairs = 0, 0
     for k in range(len(rotation)):
         n = set_up_plane(
-            shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
-            gain[k], cut, True, records,
-        )  # fmt: skip
+            shapes,
+            order,
+            start[k],
+            start[k + 1],
+            rotation[k],
+            center[k],
+            psf[k],
+            shape[k],
+            spacing[k],
+            gain[k],
+            cut,
+            True,
+            projections,
+        )
         n_pairs += n
         for i in range(n):
-            r = records[i]
+            r = projections[i]
             for x in range(max(0, int(r.row - r.half_x)), min(shape[k, 0], int(r.row + r.half_x) + 3)):
                 dx = x - r.row - r.x
-                for y in range(
-                    max(0, int(r.column - r.half_y)), min(shape[k, 1], int(r.column + r.half_y) + 3)
-                ):
+                for y in range(max(0, int(r.column - r.half_y)), min(shape[k, 1], int(r.column + r.half_y) + 3)):
                     u = y - r.column - r.y - r.slope * dx
                     n_pixels += r.e_0 + r.q_x * dx * dx + r.q_u * u * u >= -0.5 * cut
     return n_pixels, n_pairs

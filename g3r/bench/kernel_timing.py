@@ -14,7 +14,7 @@ from g3r.fitting import kernels as fit_kernels
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.slice_term import SliceTerm
-from g3r.gaussians import GaussianCloud, find_pairs, kernels, kernels_backward, render
+from g3r.gaussians import GaussianCloud, find_overlaps, kernels, kernels_backward, render
 from g3r.gaussians.overlap import CloudArrays, Workspace
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
@@ -29,14 +29,14 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
     """Pairs, pixels inside the cut-off, and seconds of one forward and one backward pass."""
     scene = head_scene(n_gaussians)
     planes, arrays = scene.slices.planes, CloudArrays.of(scene.cloud)
-    pairs = find_pairs(scene.cloud, planes, CUTOFF_SIGMA)
+    pairs = find_overlaps(scene.cloud, planes, CUTOFF_SIGMA)
     described: Any = plane_arguments(planes, planes.center_mm, np.ones(len(planes)), pairs)
     work, cut = Workspace.of(planes, pairs.most), CUTOFF_SIGMA**2
     n_pixels, n_pairs = count_pixels(arrays.shapes, *described, cut, record_space(pairs.most))  # type: ignore[call-arg]
     out = np.zeros(planes.n_pixels, np.float32)
     buffers = np.zeros((1, n_gaussians, kernels.N_GRADIENTS))
     plane_gradient = np.zeros((len(planes), kernels.N_PLANE_GRADIENTS))
-    common = (arrays.shapes, arrays.peak, *described, cut, True, work.images, work.records)
+    common = (arrays.shapes, arrays.amplitude, *described, cut, True, work.images, work.projections)
 
     def forward() -> None:
         kernels.forward(*common, out)  # type: ignore[call-arg]
@@ -45,10 +45,11 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
         kernels_backward.backward(*common, out, buffers, plane_gradient)  # type: ignore[call-arg]
 
     return {
-        "n_pairs": int(n_pairs), "n_pixels": int(n_pixels),
+        "n_pairs": int(n_pairs),
+        "n_pixels": int(n_pixels),
         "forward_seconds": best_seconds(forward, repeats, CLOCK),
         "backward_seconds": best_seconds(backward, repeats, CLOCK),
-    }  # fmt: skip
+    }
 
 
 def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, float]:
@@ -71,9 +72,11 @@ def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, 
         torch.set_num_threads(n_threads)
     n_pixels = n_gaussians * planes.n_pixels
     return {
-        "n_pairs": n_gaussians * len(planes), "n_pixels": n_pixels,
-        "forward_seconds": min(forward), "backward_seconds": min(backward),
-    }  # fmt: skip
+        "n_pairs": n_gaussians * len(planes),
+        "n_pixels": n_pixels,
+        "forward_seconds": min(forward),
+        "backward_seconds": min(backward),
+    }
 
 
 def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
@@ -84,8 +87,7 @@ def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
     """
     scene = head_scene(n_gaussians)
     slices, n = scene.slices, len(scene.slices)
-    further = {"turn": (np.zeros((n, 3)), 1e-3), "shift": (np.zeros((n, 3)), 0.03),
-               "log_gain": (np.zeros(n), 2e-3)}  # fmt: skip
+    further = {"turn": (np.zeros((n, 3)), 1e-3), "shift": (np.zeros((n, 3)), 0.03), "log_gain": (np.zeros(n), 2e-3)}
     parameters = FitParameters(scene.cloud, LearningRates(), further)
     term = SliceTerm(slices, np.ones(n), np.ones(n), parameters)
     terms: list[ImageTerm] = [term]
@@ -118,5 +120,8 @@ def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
         setattr(fit_kernels, plain.__name__, plain)
     calls = numba_rates(n_gaussians, repeats)
     both = calls["forward_seconds"] + calls["backward_seconds"]
-    return {"step_seconds": min(totals), "step_over_kernels": min(totals) / both,
-            "not_kernel_share": float(np.median(shares))}  # fmt: skip
+    return {
+        "step_seconds": min(totals),
+        "step_over_kernels": min(totals) / both,
+        "not_kernel_share": float(np.median(shares)),
+    }

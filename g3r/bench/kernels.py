@@ -60,8 +60,10 @@ def run_kernels(options: argparse.Namespace) -> dict[str, Any]:
     numba.set_num_threads(1)
     try:
         for size in options.sizes:
-            limits = {"copy_bytes_per_second": copy_bytes_per_second(options.repeats),
-                      "fused_per_second": fused_per_second(options.repeats)}  # fmt: skip
+            limits = {
+                "copy_bytes_per_second": copy_bytes_per_second(options.repeats),
+                "fused_per_second": fused_per_second(options.repeats),
+            }
             rates = numba_rates(size, options.repeats)
             rows.append(_row("numba", size, limits, rates) | step_seconds(size, options.repeats))
         rates = reference_rates(REFERENCE_GAUSSIANS, REFERENCE_SLICES, options.repeats)
@@ -86,13 +88,27 @@ def _row(backend: str, n_gaussians: int, limits: dict[str, float], rates: dict[s
 def table(record: dict[str, Any]) -> str:
     """The record as Markdown."""
     where = record["machine"]
-    head = ["backend", "Gaussians", "pairs", "pixels per pair", "forward Mpx/s", "FMA/px", "copied B/px",
-            "backward Mpx/s", "FMA/px", "copied B/px", "step / kernels", "not kernel"]  # fmt: skip
+    head = [
+        "backend",
+        "Gaussians",
+        "pairs",
+        "pixels per pair",
+        "forward Mpx/s",
+        "FMA/px",
+        "copied B/px",
+        "backward Mpx/s",
+        "FMA/px",
+        "copied B/px",
+        "step / kernels",
+        "not kernel",
+    ]
     lines = [
         f"{where['processor']}, one core; g3r {where['g3r']}"
         f"{' at ' + where['commit'] if where['commit'] else ''}, numba {where['numba']}; {record['date']}.",
-        "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head),
-    ]  # fmt: skip
+        "",
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+    ]
     for row in record["rows"]:
         pixels_per_pair = row["n_pixels"] / row["n_pairs"]
         cells = [row["backend"], f"{row['n_gaussians']:,}", f"{row['n_pairs']:,}", f"{pixels_per_pair:.0f}"]

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from g3r.bench.scenes import SceneSize
     from g3r.gaussians import GaussianCloud
 
-STEP, SEARCH, PEAKS, WRITING = "optimiser step", "pair search", "peaks", "volume"
-"""What is measured: forward, backward and update; `find_pairs`; `solve_peaks`; `render` of a volume."""
+STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "pair search", "peaks", "volume"
+"""What is measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
 
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
-    "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, PEAKS, WRITING)),
-    "slices": ("n_slices", 6, (STEP, SEARCH, PEAKS)),
-    "pixels per slice": ("n_pixels", 1024, (STEP, PEAKS)),
+    "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, AMPLITUDES, WRITING)),
+    "slices": ("n_slices", 6, (STEP, SEARCH, AMPLITUDES)),
+    "pixels per slice": ("n_pixels", 1024, (STEP, AMPLITUDES)),
     "output voxels": ("n_voxels", 27_000, (WRITING,)),
 }
 """What grows: its field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
@@ -33,10 +33,10 @@ PIXEL_FIELDS = ("n_pixels", "n_voxels")
 N_SIZES = 8
 """Each twice the one before: 2^7 = 128, two decades."""
 
-PEAK_ITERATIONS = 4
+AMPLITUDE_ITERATIONS = 4
 TIMED_STEPS = 6
 
-LEAST_EXPONENT, MOST_EXPONENT = 0.9, 1.15
+MIN_EXPONENT, MAX_EXPONENT = 0.9, 1.15
 
 MARKERS = "scaling"
 
@@ -93,21 +93,14 @@ def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
 def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> dict[str, Any]:
     """One size: work, seconds and memory of each operation."""
     from g3r.bench.cost import peak_extra_bytes
-    from g3r.bench.scenes import (
-        corner_slices,
-        corners,
-        made_cloud,
-        made_slices,
-        made_volume_planes,
-        pixel_evaluations,
-    )
-    from g3r.gaussians import find_pairs
+    from g3r.bench.scenes import corner_slices, corners, made_cloud, made_slices, made_volume_planes, pixel_evaluations
+    from g3r.gaussians import find_overlaps
     from g3r.gaussians.render import CUTOFF_SIGMA
 
     cloud = made_cloud(size)
     volume, slices = made_volume_planes(size), made_slices(size, cloud)
     planes = volume if operations == (WRITING,) else slices.planes
-    pairs = find_pairs(cloud, planes, CUTOFF_SIGMA)
+    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
     calls = scene_calls(cloud, slices, volume)
     row: dict[str, Any] = {
         "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
@@ -126,22 +119,22 @@ def scene_calls(
     cloud: GaussianCloud, slices: Slices, volume: Planes
 ) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
     """Of each operation: what gives its seconds, and a single call of it."""
-    from g3r.bench.cost import least_cpu_seconds
-    from g3r.gaussians import find_pairs, render, solve_peaks
+    from g3r.bench.cost import min_cpu_seconds
+    from g3r.gaussians import find_overlaps, render, solve_amplitudes
     from g3r.gaussians.render import CUTOFF_SIGMA
 
     weight = slices.mask.astype("float32")
-    pairs = find_pairs(cloud, slices.planes, CUTOFF_SIGMA)
+    pairs = find_overlaps(cloud, slices.planes, CUTOFF_SIGMA)
     single: dict[str, Callable[[], object]] = {
-        SEARCH: lambda: find_pairs(cloud, slices.planes, CUTOFF_SIGMA),
-        PEAKS: lambda: solve_peaks(
-            cloud, slices.planes, slices.value, weight, n_iterations=PEAK_ITERATIONS, pairs=pairs
+        SEARCH: lambda: find_overlaps(cloud, slices.planes, CUTOFF_SIGMA),
+        AMPLITUDES: lambda: solve_amplitudes(
+            cloud, slices.planes, slices.value, weight, n_iterations=AMPLITUDE_ITERATIONS, pairs=pairs
         ),
         WRITING: lambda: render(cloud, volume),
     }
 
     def timed(call: Callable[[], object]) -> Callable[[], float]:
-        return lambda: least_cpu_seconds(call)
+        return lambda: min_cpu_seconds(call)
 
     step = lambda: step_seconds(cloud, slices)  # noqa: E731
     return {STEP: (step, step), **{name: (timed(call), call) for name, call in single.items()}}
@@ -167,7 +160,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
         def __call__(self, step: int, cloud: object, pose: object) -> None:
             moments.append(time.process_time())
 
-    settings = SliceStageSettings(n_steps=TIMED_STEPS, peak_iterations=0)
+    settings = SliceStageSettings(n_steps=TIMED_STEPS, amplitude_iterations=0)
     ones = np.ones(len(slices))
     fit_slices(cloud, slices, ones, ones, None, settings, np.random.default_rng(0), observer=Watch())
     return float(np.diff(moments).min())

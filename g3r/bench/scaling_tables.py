@@ -8,7 +8,7 @@ from typing import Any
 
 from g3r.bench.exponents import Exponent, fitted_exponent
 from g3r.bench.record import machine_line, markdown_table
-from g3r.bench.scaling import LEAST_EXPONENT, MOST_EXPONENT
+from g3r.bench.scaling import MAX_EXPONENT, MIN_EXPONENT
 
 COLOURS = {"optimiser step": "#0072b2", "pair search": "#e69f00", "peaks": "#009e73", "volume": "#cc79a7"}
 
@@ -25,7 +25,7 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
         "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs "
         "do not: the judged exponent is that of the seconds less those of the same pairs with a pixel in "
         "each corner of their planes (set-up). Elsewhere it is that of all seconds. "
-        f"(!) is outside {LEAST_EXPONENT:g} to {MOST_EXPONENT:g}. Seconds are CPU time, the least of "
+        f"(!) is outside {MIN_EXPONENT:g} to {MAX_EXPONENT:g}. Seconds are CPU time, the least of "
         f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
     )
     return "\n\n".join(parts)
@@ -59,26 +59,31 @@ def exponents(rows: list[dict[str, Any]], operation: str, kind: str) -> tuple[Ex
 def _exponent_table(record: Mapping[str, Any]) -> str:
     lines = []
     for name, rows in record["growing"].items():
-        work = [
-            fitted_exponent([r["size"] for r in rows], [r[key] for r in rows], True).value for key in WORK
-        ]
+        work = [fitted_exponent([r["size"] for r in rows], [r[key] for r in rows], True).value for key in WORK]
         for operation in rows[0]["seconds"]:
             time, memory = (exponents(rows, operation, kind) for kind in ("seconds", "bytes"))
             assert time is not None
             judged = judged_exponent(rows, operation)
-            outside = judged is None or not LEAST_EXPONENT <= judged.value <= MOST_EXPONENT
+            outside = judged is None or not MIN_EXPONENT <= judged.value <= MAX_EXPONENT
             cells = [
-                f"{operation}, {name}", f"{work[0]:.2f}", f"{work[1]:.2f}",
-                
+                f"{operation}, {name}",
+                f"{work[0]:.2f}",
+                f"{work[1]:.2f}",
                 (_written(judged) if judged else "") + (" (!)" if outside else ""),
-                _written(time[0]), _written(time[1]),
+                _written(time[0]),
+                _written(time[1]),
                 _written(memory[0]) if memory else "not measured",
-            ]  # fmt: skip
+            ]
             lines.append(cells)
     head = [
-        "exponent of", "pairs", "pixel evaluations", "judged", "seconds, largest decade",
-        "seconds, all sizes", "memory, largest decade",
-    ]  # fmt: skip
+        "exponent of",
+        "pairs",
+        "pixel evaluations",
+        "judged",
+        "seconds, largest decade",
+        "seconds, all sizes",
+        "memory, largest decade",
+    ]
     return markdown_table(head, lines)
 
 

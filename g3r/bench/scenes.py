@@ -11,7 +11,7 @@ from g3r.acquisition.planes import Planes, Slices, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.cloud import rotation_from_quaternion
-from g3r.gaussians.overlap import PairList
+from g3r.gaussians.overlap import OverlapList
 from g3r.geometry import VolumeGrid
 
 HEAD_MM = 50.0
@@ -74,24 +74,30 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
     side = max(2, round(size.n_pixels**0.5))
     variance = psf_variance_mm2(np.full(2, PIXEL_MM), THICKNESS_MM)
     planes = Planes(
-        np.array(rotation), np.array(center), np.full((size.n_slices, 2), HEAD_MM / side),
-        np.full((size.n_slices, 2), side), np.tile(variance, (size.n_slices, 1)),
-    )  # fmt: skip
+        np.array(rotation),
+        np.array(center),
+        np.full((size.n_slices, 2), HEAD_MM / side),
+        np.full((size.n_slices, 2), side),
+        np.tile(variance, (size.n_slices, 1)),
+    )
     value = render(cloud, planes).numpy()
     value = value + 0.02 * rng.standard_normal(len(value)).astype(np.float32) * value.mean()
     index = np.concatenate([np.arange(n) for n in per_stack])
     stack_id = np.repeat(np.arange(N_STACKS), per_stack)
     return Slices(
-        planes, value.astype(np.float32), np.ones(len(value), bool), stack_id, index,
-        np.full(size.n_slices, THICKNESS_MM), planes.pose,
-    )  # fmt: skip
+        planes,
+        value.astype(np.float32),
+        np.ones(len(value), bool),
+        stack_id,
+        index,
+        np.full(size.n_slices, THICKNESS_MM),
+        planes.pose,
+    )
 
 
 def corners(planes: Planes) -> Planes:
     """The same rectangles with a pixel in each corner only: the same pairs, and hardly a pixel in them."""
-    return replace(
-        planes, shape=np.full((len(planes), 2), 2), spacing_mm=(planes.shape - 1) * planes.spacing_mm
-    )
+    return replace(planes, shape=np.full((len(planes), 2), 2), spacing_mm=(planes.shape - 1) * planes.spacing_mm)
 
 
 def corner_slices(slices: Slices) -> Slices:
@@ -109,7 +115,7 @@ def made_volume_planes(size: SceneSize) -> Planes:
     return volume_planes(VolumeGrid((side, side, side), affine))
 
 
-def pixel_evaluations(cloud: GaussianCloud, planes: Planes, pairs: PairList, cutoff_sigma: float) -> float:
+def pixel_evaluations(cloud: GaussianCloud, planes: Planes, pairs: OverlapList, cutoff_sigma: float) -> float:
     """How many pixels the ellipses of all pairs cover, planes taken as endless: the work inside of pairs."""
     rotation = rotation_from_quaternion(cloud.quaternion_wxyz).double().numpy()
     root = rotation * np.exp(cloud.log_scale.double().numpy())[:, None, :]

@@ -37,14 +37,10 @@ class Quality:
 
     def record(self) -> dict[str, float]:
         """The figures."""
-        return {
-            "psnr_db": round(self.psnr_db, 3), "ssim": round(self.ssim, 4), "tre_mm": round(self.tre_mm, 3)
-        }  # fmt: skip
+        return {"psnr_db": round(self.psnr_db, 3), "ssim": round(self.ssim, 4), "tre_mm": round(self.tre_mm, 3)}
 
 
-def quality(
-    case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable
-) -> Quality:
+def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable) -> Quality:
     """Score a volume [I, J, K] and the slices' poses.
 
     The volume may stand in another orientation than the truth, further than alignment reaches: the common

@@ -80,8 +80,11 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         _ = case.truth_mask  # before any work
     threads = options.threads or available_cores()
     record: dict[str, Any] = {
-        "machine": machine(threads), "repeats": options.repeats, "base": options.base, "cases": {},
-    }  # fmt: skip
+        "machine": machine(threads),
+        "repeats": options.repeats,
+        "base": options.base,
+        "cases": {},
+    }
     path = options.output / "trade.json"
     with tempfile.TemporaryDirectory(prefix="g3r-bench-") as scratch:
         output = Path(scratch) / "result"
@@ -118,12 +121,15 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
     stages[OUTSIDE_STAGES] = round(wall - sum(stages.values()), 3)
     stages_cpu[OUTSIDE_STAGES] = round(cpu - sum(stages_cpu.values()), 3)
     return {
-        "seconds": round(wall, 3), "cpu_seconds": round(cpu, 3),
+        "seconds": round(wall, 3),
+        "cpu_seconds": round(cpu, 3),
         "all_seconds": [round(run.seconds, 3) for run in runs],
         "peak_bytes": max(run.peak_bytes for run in runs),
-        "stages": stages, "stages_cpu": stages_cpu, "n_gaussians": runs[-1].record["n_gaussians"],
+        "stages": stages,
+        "stages_cpu": stages_cpu,
+        "n_gaussians": runs[-1].record["n_gaussians"],
         **quality_of_folder(case, output).record(),
-    }  # fmt: skip
+    }
 
 
 def _measure_fits(case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any]) -> None:

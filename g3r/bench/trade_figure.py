@@ -10,11 +10,9 @@ from g3r.bench.pareto import pareto_front
 from g3r.bench.trade_tables import Point, points_of, sweep_offset
 
 COLOURS = {"draft": "#cc79a7", "fast": "#e69f00", "balanced": "#0072b2", "accurate": "#009e73"}
-SWEEP_COLOURS = {
-    "Gaussians": "#7f3c8d", "iterations": "#d55e00", "cut-off": "#56b4e9", "resolution": "#8c6d31",
-}  # fmt: skip
+SWEEP_COLOURS = {"Gaussians": "#7f3c8d", "iterations": "#d55e00", "cut-off": "#56b4e9", "resolution": "#8c6d31"}
 
-LEAST_SHOWN_DB = 6.0
+MIN_SHOWN_DB = 6.0
 """The axis begins this far under the worst preset; curves may begin deeper."""
 
 
@@ -48,7 +46,7 @@ def draw_trade(record: Mapping[str, Any], path: Path) -> None:
             )
         lowest = min(row["psnr_db"] for row in case["presets"].values())
         highest = max(point.psnr_db for point in points)
-        axis.set_ylim(min(lowest, highest - 1) - LEAST_SHOWN_DB / 2, highest + 0.5)
+        axis.set_ylim(min(lowest, highest - 1) - MIN_SHOWN_DB / 2, highest + 0.5)
         axis.set_xscale("log")
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -66,9 +64,14 @@ def draw_trade(record: Mapping[str, Any], path: Path) -> None:
 def _draw_front(axis: Any, points: list[Point], legend: dict[str, Any]) -> None:
     front = [points[n] for n in pareto_front([p.seconds for p in points], [p.psnr_db for p in points])]
     (line,) = axis.plot(
-        [p.seconds for p in front], [p.psnr_db for p in front], color="#c8c8c8", lw=7, zorder=1,
-        solid_capstyle="round", solid_joinstyle="round",
-    )  # fmt: skip
+        [p.seconds for p in front],
+        [p.psnr_db for p in front],
+        color="#c8c8c8",
+        lw=7,
+        zorder=1,
+        solid_capstyle="round",
+        solid_joinstyle="round",
+    )
     legend["Pareto front"] = line
 
 
@@ -77,7 +80,12 @@ def _draw_sweeps(axis: Any, case: Mapping[str, Any], base: str, legend: dict[str
         offset = sweep_offset(case, base)
         rows = list(variants.values())
         (line,) = axis.plot(
-            [row["seconds"] + offset for row in rows], [row["psnr_db"] for row in rows], ".-",
-            color=SWEEP_COLOURS.get(sweep, "#666666"), lw=0.9, ms=5, zorder=3,
-        )  # fmt: skip
+            [row["seconds"] + offset for row in rows],
+            [row["psnr_db"] for row in rows],
+            ".-",
+            color=SWEEP_COLOURS.get(sweep, "#666666"),
+            lw=0.9,
+            ms=5,
+            zorder=3,
+        )
         legend[sweep] = line

@@ -65,9 +65,7 @@ def trade_tables(record: Mapping[str, Any]) -> str:
     if any(BEST in case["presets"] for case in record["cases"].values()):
         parts.append(_check_table(record))
     parts += [_stage_table(name, case) for name, case in record["cases"].items()]
-    parts += [
-        _sweep_table(name, case, record["base"]) for name, case in record["cases"].items() if "sweeps" in case
-    ]
+    parts += [_sweep_table(name, case, record["base"]) for name, case in record["cases"].items() if "sweeps" in case]
     runs = "one run" if record["repeats"] == 1 else f"medians of {record['repeats']} runs"
     parts.append(
         f"Seconds are those of the whole command `g3r-infer`, {runs}, kernels compiled before. "
@@ -83,15 +81,30 @@ def _preset_table(record: Mapping[str, Any]) -> str:
         front = {points[n] for n in pareto_front([p.seconds for p in points], [p.psnr_db for p in points])}
         for point, (preset, row) in zip(points, case["presets"].items(), strict=False):
             cells = [
-                name, f"`{preset}`", f"{row['seconds']:.1f}", f"{row['cpu_seconds']:.1f}",
-                f"{row['peak_bytes'] / GB:.2f}", f"{row['n_gaussians']:,}", f"{row['psnr_db']:.2f}",
-                f"{row['ssim']:.4f}", f"{row['tre_mm']:.2f}", "yes" if point in front else "no",
-            ]  # fmt: skip
+                name,
+                f"`{preset}`",
+                f"{row['seconds']:.1f}",
+                f"{row['cpu_seconds']:.1f}",
+                f"{row['peak_bytes'] / GB:.2f}",
+                f"{row['n_gaussians']:,}",
+                f"{row['psnr_db']:.2f}",
+                f"{row['ssim']:.4f}",
+                f"{row['tre_mm']:.2f}",
+                "yes" if point in front else "no",
+            ]
             rows.append(cells)
     head = [
-        "case", "preset", "seconds", "CPU seconds", "peak memory, GB", "Gaussians", "PSNR, dB", "SSIM",
-        "TRE, mm", "on the Pareto front",
-    ]  # fmt: skip
+        "case",
+        "preset",
+        "seconds",
+        "CPU seconds",
+        "peak memory, GB",
+        "Gaussians",
+        "PSNR, dB",
+        "SSIM",
+        "TRE, mm",
+        "on the Pareto front",
+    ]
     return markdown_table(head, rows)
 
 
@@ -123,8 +136,7 @@ def _stage_table(name: str, case: Mapping[str, Any]) -> str:
     stages = list(dict.fromkeys(stage for row in presets.values() for stage in row["stages"]))
     head = [f"{name}: stage", *[f"`{p}` {kind}" for p in presets for kind in ("wall", "CPU")]]
     rows = [
-        [stage, *[f"{row[key].get(stage, 0.0):.1f}" for row in presets.values() for key in KINDS]]
-        for stage in stages
+        [stage, *[f"{row[key].get(stage, 0.0):.1f}" for row in presets.values() for key in KINDS]] for stage in stages
     ]
     return markdown_table(head, rows)
 
@@ -136,15 +148,17 @@ def _sweep_table(name: str, case: Mapping[str, Any], base: str) -> str:
     offset = sweep_offset(case, base)
     rows = [
         [
-            sweep, label + (f" (`{base}`)" if row["same_as_base"] else ""), f"{row['seconds'] + offset:.1f}",
+            sweep,
+            label + (f" (`{base}`)" if row["same_as_base"] else ""),
+            f"{row['seconds'] + offset:.1f}",
             f"{row['stages']['fit to prior'] + row['stages']['fit to slices']:.1f}",
-            f"{row['n_gaussians']:,}", f"{row['psnr_db']:.2f}", f"{row['ssim']:.4f}",
+            f"{row['n_gaussians']:,}",
+            f"{row['psnr_db']:.2f}",
+            f"{row['ssim']:.4f}",
             f"{row['tre_mm']:.2f}",
         ]
         for sweep, variants in case["sweeps"].items()
         for label, row in variants.items()
-    ]  # fmt: skip
-    head = [
-        f"{name}: sweep", "value", "seconds", "of them fitting", "Gaussians", "PSNR, dB", "SSIM", "TRE, mm"
-    ]  # fmt: skip
+    ]
+    head = [f"{name}: sweep", "value", "seconds", "of them fitting", "Gaussians", "PSNR, dB", "SSIM", "TRE, mm"]
     return markdown_table(head, rows)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from g3r.errors import InputError
 
-LARGEST_PICKLE_BYTES = 4_000_000
+MAX_PICKLE_BYTES = 4_000_000
 """Ours have about 20 kB: names and sizes, the numbers stand beside."""
 
 CALLED = re.compile(
@@ -52,7 +52,7 @@ def check_archive(path: Path, kind: str, another_file: str) -> None:
             # stored as they are, and each once: no small file unfolds to a large one
             plain = all(one.compress_type == zipfile.ZIP_STORED for one in entries)
             plain &= sum(one.file_size for one in entries) <= path.stat().st_size
-            if not plain or len(pickled) != 1 or pickled[0].file_size > LARGEST_PICKLE_BYTES:
+            if not plain or len(pickled) != 1 or pickled[0].file_size > MAX_PICKLE_BYTES:
                 raise InputError(damaged)
             foreign = _foreign_name(archive.read(pickled[0]))
     except InputError:

@@ -19,7 +19,7 @@ Network = TypeVar("Network", bound=nn.Module)
 LONGEST_TEXT = 10_000
 """Characters of a description."""
 
-LARGEST_NUMBER = 1e30
+MAX_NUMBER = 1e30
 
 LONGEST_LIST = 16
 """Entries of an argument that is a list: levels of a network, axes of a template."""
@@ -41,9 +41,7 @@ def write_file(path: Path, content: Mapping[str, Any]) -> None:
     except OSError as error:
         if beside is not None:
             Path(beside).unlink(missing_ok=True)
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); choose a writable path"
-        ) from error
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a writable path") from error
 
 
 def read_file(path: Path, kind: str, another_file: str) -> dict[str, Any]:
@@ -64,9 +62,7 @@ def read_file(path: Path, kind: str, another_file: str) -> dict[str, Any]:
     except Exception as error:  # torch.load says "damaged" in many types
         raise InputError(f"{path}: is damaged or not written by g3r-export; {another_file}") from error
     if not isinstance(content, dict):
-        raise InputError(
-            f"{path}: is not a {kind} checkpoint (holds a {type(content).__name__}); {another_file}"
-        )
+        raise InputError(f"{path}: is not a {kind} checkpoint (holds a {type(content).__name__}); {another_file}")
     return content
 
 
@@ -87,17 +83,13 @@ def check_identity(
     """
     if not _is(content.get("format"), f"g3r-{kind}"):
         if "pytorch-lightning_version" in content:
-            raise InputError(
-                f"{path}: is a Lightning training checkpoint; turn it into a {kind} with g3r-export"
-            )
+            raise InputError(f"{path}: is a Lightning training checkpoint; turn it into a {kind} with g3r-export")
         found = f"format is {_shown(content.get('format'))}, expected {f'g3r-{kind}'!r}"
         raise InputError(f"{path}: is not a {kind} checkpoint ({found}); {another_file}")
     for key, value in expected.items():
         if not _is(content.get(key), value):
             name = key.replace("_", " ")
-            raise InputError(
-                f"{path}: {name} is {_shown(content.get(key))}, this g3r reads {value!r}; {again(kind)}"
-            )
+            raise InputError(f"{path}: {name} is {_shown(content.get(key))}, this g3r reads {value!r}; {again(kind)}")
 
 
 def plain_arguments(content: Mapping[str, Any], largest: Mapping[str, float]) -> dict[str, Any]:
@@ -119,7 +111,7 @@ def plain_arguments(content: Mapping[str, Any], largest: Mapping[str, float]) ->
         values = value if isinstance(value, list | tuple) else [value]
         if len(values) > LONGEST_LIST or not all(type(one) in (bool, int, float) for one in values):
             raise TypeError(f"network argument {name[:40]} is {_shown(value)}, expected plain numbers")
-        if not all(abs(one) <= largest.get(name, LARGEST_NUMBER) for one in values):  # NaN is not
+        if not all(abs(one) <= largest.get(name, MAX_NUMBER) for one in values):  # NaN is not
             raise ValueError(f"network argument {name[:40]} is {_shown(value)}, out of bounds")
     return dict(found)
 
@@ -127,7 +119,7 @@ def plain_arguments(content: Mapping[str, Any], largest: Mapping[str, float]) ->
 def number(content: Mapping[str, Any], key: str) -> float:
     """A plain number of a file; `KeyError` without it, `TypeError` for something else."""
     value = content[key]
-    if type(value) not in (int, float) or (type(value) is int and abs(value) > LARGEST_NUMBER):
+    if type(value) not in (int, float) or (type(value) is int and abs(value) > MAX_NUMBER):
         raise TypeError(f"could not convert {key} {_shown(value)} to a number")
     return float(value)
 
@@ -149,18 +141,14 @@ def scores(content: Mapping[str, Any]) -> dict[str, float]:
 
 
 def built(
-    path: Path,
-    build: Callable[[], Network],
-    fewest_values: Callable[[], float],
-    content: Mapping[str, Any],
-    kind: str,
+    path: Path, build: Callable[[], Network], min_values: Callable[[], float], content: Mapping[str, Any], kind: str
 ) -> Network:
     """A network with a file's weights; memory is taken only once the file is known to hold enough to fill it.
 
     Args:
         path: for the message.
         build: makes the network.
-        fewest_values: a lower bound, about the number of its weights, from the same arguments.
+        min_values: a lower bound, about the number of its weights, from the same arguments.
         content: of the file.
         kind: for the message: "prior".
 
@@ -176,8 +164,8 @@ def built(
             if value.numel() * value.element_size() > value.untyped_storage().nbytes():
                 raise ValueError(f"weight {_shown(name)} claims more values than the file holds")
             n_values += value.numel()
-        if fewest_values() > n_values:
-            raise ValueError(f"{n_values} values for at least {fewest_values():.3g}")
+        if min_values() > n_values:
+            raise ValueError(f"{n_values} values for at least {min_values():.3g}")
         network = build()
         network.load_state_dict(dict(weights), strict=True)
     except MemoryError:
@@ -195,9 +183,7 @@ def built(
 def check_digest(path: Path, weights: Mapping[str, Tensor], expected: object) -> None:
     """Raise `InputError` where weights are not those whose digest was written."""
     if weights_digest(weights) != expected:
-        raise InputError(
-            f"{path}: is damaged (the weights do not match their checksum); copy or export it again"
-        )
+        raise InputError(f"{path}: is damaged (the weights do not match their checksum); copy or export it again")
 
 
 def plain_weights(network: nn.Module) -> dict[str, Tensor]:

@@ -37,9 +37,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = build_parser().parse_args(words[:1]).command
     module = import_module(f"g3r.bench.{name}")
     parser = argparse.ArgumentParser(
-        prog=f"g3r-bench {name}", description=f"Measure {COMMANDS[name]}.",
+        prog=f"g3r-bench {name}",
+        description=f"Measure {COMMANDS[name]}.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     module.add_arguments(parser)
     options = parser.parse_args(words[1:])
     logging.basicConfig(level=logging.WARNING, format=f"g3r-bench {name}: %(message)s", stream=sys.stderr)

@@ -27,16 +27,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--volume", required=True, help="reconstructed volume (NIfTI)")
     parser.add_argument("--reference", required=True, help="true volume (NIfTI)")
     parser.add_argument("--mask", required=True, help="mask on the reference's grid (NIfTI)")
-    parser.add_argument(
-        "--align", action="store_true", help="remove one rigid motion of the whole head first"
-    )
+    parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
     parser.add_argument("--json", metavar="FILE", help="also write the scores here")
-    parser.add_argument(
-        "--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)"
-    )
-    parser.add_argument(
-        "--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)"
-    )
+    parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
+    parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)")
     parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
     return parser
 
@@ -68,7 +62,7 @@ def table(comparison: Comparison, pose_error: PoseError | None = None) -> str:
         f"{s.psnr_db:8.2f} {s.ssim:7.4f} {s.ncc:7.4f} {s.rmse:7.4f}   {s.n_voxels}",
     ]
     if alignment:
-        lines.append(f"aligned: {alignment.rotation_deg:.2f} deg, {alignment.shift_mm:.2f} mm removed")
+        lines.append(f"aligned: {alignment.rotation_deg:.2f} deg, {alignment.translation_mm:.2f} mm removed")
     if pose_error:
         lines.append(
             f"slice poses (TRE mm): mean {pose_error.mean_mm:.2f}, median {pose_error.median_mm:.2f}, "
@@ -115,7 +109,7 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
     if comparison.alignment:
         record["alignment"] = {
             "rotation_deg": comparison.alignment.rotation_deg,
-            "shift_mm": comparison.alignment.shift_mm,
+            "translation_mm": comparison.alignment.translation_mm,
         }
     if pose_error:
         record["poses"] = pose_error.figures()

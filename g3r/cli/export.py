@@ -65,9 +65,7 @@ def export(
         recorded = f"{described['training_data']}; {described['optimiser_steps']} optimiser steps"
         words = recorded if data_description is None else data_description
         if not all(bool(value.isfinite().all()) for value in content["state_dict"].values()):
-            raise InputError(
-                f"{run}: the weights hold NaN or infinity; export an earlier checkpoint of the run"
-            )
+            raise InputError(f"{run}: the weights hold NaN or infinity; export an earlier checkpoint of the run")
         return write(file, described, _weights(content), words)
     except (G3RError, MemoryError):
         raise
@@ -76,9 +74,7 @@ def export(
         raise InputError(f"{run}: cannot be exported ({found}); export another checkpoint") from error
 
 
-def _write_prior(
-    file: Path, described: dict[str, Any], weights: dict[str, Any], words: str
-) -> "PriorCheckpoint":
+def _write_prior(file: Path, described: dict[str, Any], weights: dict[str, Any], words: str) -> "PriorCheckpoint":
     """Write a prior file, and see that it can be read."""
     from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint
     from g3r.prior.dgpn import DensityGatedPriorNetwork
@@ -96,19 +92,12 @@ def _write_prior(
     return meta
 
 
-def _write_pose(
-    file: Path, described: dict[str, Any], weights: dict[str, Any], words: str
-) -> "PoseCheckpoint":
+def _write_pose(file: Path, described: dict[str, Any], weights: dict[str, Any], words: str) -> "PoseCheckpoint":
     """Write a pose file, and see that it can be read."""
     import numpy as np
 
     from g3r.acquisition.atlas_template import AtlasTemplate
-    from g3r.pose_network.checkpoint import (
-        PoseCheckpoint,
-        centred_grid,
-        load_pose_network,
-        save_pose_checkpoint,
-    )
+    from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid, load_pose_network, save_pose_checkpoint
     from g3r.pose_network.network import PoseNetwork
 
     network = PoseNetwork(**described["network_arguments"])
@@ -131,9 +120,7 @@ def _weights(content: dict[str, Any]) -> dict[str, Any]:
     """The network's part of a training checkpoint's state."""
     prefix = "network."
     return {
-        name.removeprefix(prefix): value
-        for name, value in content["state_dict"].items()
-        if name.startswith(prefix)
+        name.removeprefix(prefix): value for name, value in content["state_dict"].items() if name.startswith(prefix)
     }
 
 
@@ -158,18 +145,10 @@ def _read_run(run: Path) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise InputError(f"{run}: no such file; {expected}") from error
     except Exception as error:  # torch.load says "damaged" in many types
-        raise InputError(
-            f"{run}: cannot be read as a checkpoint ({type(error).__name__}); {expected}"
-        ) from error
+        raise InputError(f"{run}: cannot be read as a checkpoint ({type(error).__name__}); {expected}") from error
     if isinstance(content, dict) and content.get("format") in ("g3r-prior", "g3r-pose"):
-        raise InputError(
-            f"{run}: is an exported {content['format'].removeprefix('g3r-')} already; {expected}"
-        )
-    if (
-        not isinstance(content, dict)
-        or "state_dict" not in content
-        or not any(key in content for key in EXPORT_KEYS)
-    ):
+        raise InputError(f"{run}: is an exported {content['format'].removeprefix('g3r-')} already; {expected}")
+    if not isinstance(content, dict) or "state_dict" not in content or not any(key in content for key in EXPORT_KEYS):
         raise InputError(f"{run}: was not written by g3r-pretrain; {expected}")
     return content
 

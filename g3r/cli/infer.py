@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from g3r.cli.failures import EXPECTED, line_and_code
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
-from g3r.run.stop_request import Interruption
+from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
@@ -39,22 +39,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parsed_options(argv)
     logging.basicConfig(
-        level=logging.WARNING if options.quiet else logging.INFO,
-        format="g3r-infer: %(message)s",
-        stream=sys.stderr,
+        level=logging.WARNING if options.quiet else logging.INFO, format="g3r-infer: %(message)s", stream=sys.stderr
     )
     for chatty in ("numba", "matplotlib", "PIL"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
-    interruption = Interruption()
+    stop_request = StopRequest()
     try:
-        with interruption:
-            return _run(options, interruption)
+        with stop_request:
+            return _run(options, stop_request)
     except KeyboardInterrupt:
         line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
-        return _failed(line, interruption.exit_code)
+        return _failed(line, stop_request.exit_code)
     except EXPECTED as error:
         return _failed(*line_and_code(error))
 
@@ -65,15 +63,15 @@ def _failed(line: str, exit_code: int) -> int:
 
 
 def _way_on(folder: Path) -> str:
-    from g3r.run.output_folder import UnfinishedRun
+    from g3r.run.output_folder import OutputFolder
 
-    kept = UnfinishedRun(folder).stages.is_dir()
+    kept = OutputFolder(folder).stages.is_dir()
     return "; --resume goes on from the last finished stage" if kept else ""
 
 
-def _run(options: argparse.Namespace, interruption: Interruption) -> int:
+def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
     from g3r.output.result import OUTPUT_NAMES, check_output_folder, is_partial
-    from g3r.run.output_folder import UnfinishedRun
+    from g3r.run.output_folder import OutputFolder
 
     folder = Path(options.output)
     replaces = options.force or (options.resume and is_partial(folder))
@@ -81,7 +79,7 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
     with _lines_held_back():
         earlier = _earlier(options)
         stacks = _load(options, earlier)
-        from g3r.output.earlier_run import made_of
+        from g3r.output.earlier_run import provenance
         from g3r.planning.memory_limit import plan_for_stacks
         from g3r.reconstruct import GaussianReconstructor
         from g3r.run.stage_store import Stages
@@ -94,9 +92,7 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
         reconstructor.settings = plan.settings
         budget = _budget(options, earlier)
         if budget and options.resume:
-            raise InputError(
-                f"{options.config}: --resume: a run with a time budget keeps no stages; leave it out"
-            )
+            raise InputError(f"{options.config}: --resume: a run with a time budget keeps no stages; leave it out")
         differences = earlier.differences(inputs) if earlier else []
     for difference in differences:
         logging.getLogger("g3r").warning(difference)
@@ -104,22 +100,19 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
         reconstructor.progress = progress
         if options.dry_run:
             return _dry_run(stacks, plan, folder)
-        with UnfinishedRun(folder, OUTPUT_NAMES) as unfinished:
+        with OutputFolder(folder, OUTPUT_NAMES) as unfinished:
             check_output_folder(folder, replace=replaces)  # an earlier result may have come back
             thickness = [stack.thickness_mm for stack in stacks]
-            told = made_of(
-                settings, inputs, threads=n_threads, thickness=thickness, memory=options.max_memory
-            )
+            told = provenance(settings, inputs, threads=n_threads, thickness=thickness, memory=options.max_memory)
             stages = Stages(None, None if budget else unfinished.stages, told, resume=options.resume)
-            result = reconstructor.reconstruct(
-                stacks, budget=budget, stages=stages, interruption=interruption
-            )
+            result = reconstructor.reconstruct(stacks, budget=budget, stages=stages, stop_request=stop_request)
             result.record["command"] = {
                 "stacks": [stack.name for stack in stacks],
                 "preset": None if options.time_budget or options.config else options.preset,
-                "seed": settings.seed, "threads": n_threads,
-                "space": "standard" if settings.motion.standard_orientation else "scanner",
-            }  # fmt: skip
+                "seed": settings.seed,
+                "threads": n_threads,
+                "space": "standard" if settings.registration.standard_orientation else "scanner",
+            }
             result.record["inputs"] = inputs.record()
             result.record["memory"] = plan.record()
             result.record["notes"] += plan.changes
@@ -140,20 +133,21 @@ def _run(options: argparse.Namespace, interruption: Interruption) -> int:
     if budget is not None and budget.missed:
         logging.getLogger("g3r").warning(
             "time budget of %g s: took %.0f s; registration, volume and files need at least that here",
-            budget.given_s, time.monotonic() - STARTED_S,
-        )  # fmt: skip
+            budget.given_s,
+            time.monotonic() - STARTED_S,
+        )
     _say_what_was_done(result, folder)
-    return _said_of_interruption(result, folder, interruption) if interruption.asked() else 0
+    return _said_of_interruption(result, folder, stop_request) if stop_request.is_requested() else 0
 
 
-def _said_of_interruption(result: ReconstructionResult, folder: Path, interruption: Interruption) -> int:
+def _said_of_interruption(result: ReconstructionResult, folder: Path, stop_request: StopRequest) -> int:
     if result.record["partial"]:
         cut = result.record["interrupted"]
         where = f"interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}"
         line = f"{where}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
     else:
         line = f"interrupted when the fit had ended: the result in {folder} is whole"
-    return _failed(line, interruption.exit_code)
+    return _failed(line, stop_request.exit_code)
 
 
 def _say_what_was_done(result: ReconstructionResult, folder: Path) -> None:
@@ -187,9 +181,7 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
     earlier = read_run(options.config)
     n_then, n_now = len(earlier.thickness_mm), len(options.stacks)
     if n_then != n_now and not options.thickness:
-        raise InputError(
-            f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it"
-        )
+        raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
     return earlier
 
 
@@ -227,7 +219,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
     return replace(
         preset,
-        motion=replace(preset.motion, standard_orientation=options.space == "standard", seed=options.seed),
+        registration=replace(preset.registration, standard_orientation=options.space == "standard", seed=options.seed),
         resolution_mm=options.resolution,
         prior_voxel_mm=options.prior_voxel,
         seed=options.seed,
@@ -236,14 +228,14 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
 
 def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
-    from g3r.output.earlier_run import FileMark, Inputs
+    from g3r.output.earlier_run import FileHash, Inputs
     from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
 
     return Inputs(
-        tuple(map(FileMark.of, options.stacks)),
-        tuple(map(FileMark.of, options.masks or [])),
-        FileMark.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
-        FileMark.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+        tuple(map(FileHash.of, options.stacks)),
+        tuple(map(FileHash.of, options.masks or [])),
+        FileHash.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
+        FileHash.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
     )
 
 

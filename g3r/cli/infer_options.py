@@ -23,46 +23,52 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
     parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
     parser.add_argument(
-        "--thickness", nargs="+", type=float, metavar="MM",
+        "--thickness",
+        nargs="+",
+        type=float,
+        metavar="MM",
         help="slice thickness, one for all or one per stack (default: the distance of slices)",
-    )  # fmt: skip
+    )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
     parser.add_argument(
-        "--pose-ckpt",
-        metavar="POSE.pt",
-        help="pose network and mean heads from g3r-export (default: shipped)",
+        "--pose-ckpt", metavar="POSE.pt", help="pose network and mean heads from g3r-export (default: shipped)"
     )
     parser.add_argument(
-        "--space", choices=("standard", "scanner"),
+        "--space",
+        choices=("standard", "scanner"),
         help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--prior-voxel", type=float, metavar="MM",
+        "--prior-voxel",
+        type=float,
+        metavar="MM",
         help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
-    )  # fmt: skip
+    )
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
     parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")
     parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
     parser.add_argument(
-        "--time-budget", type=float, metavar="SECONDS",
+        "--time-budget",
+        type=float,
+        metavar="SECONDS",
         help="in place of --preset: the best that can be done from the start of the command to its files",
-    )  # fmt: skip
+    )
     parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
     parser.add_argument(
-        "--config", metavar="RUN.json",
+        "--config",
+        metavar="RUN.json",
         help="settings and threads of an earlier result, in place of the options that decide them",
-    )  # fmt: skip
+    )
     parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
-    parser.add_argument(
-        "--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused"
-    )
+    parser.add_argument("--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused")
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
     parser.add_argument(
-        "--keep-header-text", action="store_true",
+        "--keep-header-text",
+        action="store_true",
         help="carry free text of the stacks' headers (may name patients, dates) into the results",
-    )  # fmt: skip
+    )
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
     parser.add_argument(
@@ -78,13 +84,9 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse_args(argv)
     n_stacks = len(options.stacks)
     if options.masks is not None and len(options.masks) != n_stacks:
-        parser.error(
-            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order"
-        )
+        parser.error(f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order")
     if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
-        parser.error(
-            f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack"
-        )
+        parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
     if options.seed is not None and options.seed < 0:
         parser.error(f"--seed {options.seed}; expected 0 or above")
     if options.threads is not None and options.threads < 1:

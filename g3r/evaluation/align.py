@@ -45,13 +45,13 @@ class Alignment:
         volume_from_reference: one pose; maps a world point of the reference to that of the volume.
         ncc: absolute correlation in the mask that the registration reached.
         rotation_deg: angle of the motion.
-        shift_mm: how far the middle of the mask moves.
+        translation_mm: how far the middle of the mask moves.
     """
 
     volume_from_reference: RigidPose
     ncc: float
     rotation_deg: float
-    shift_mm: float
+    translation_mm: float
 
 
 def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> Alignment:
@@ -89,22 +89,18 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> A
         )
     _, transform = _register(fixed, moving, fixed_mask, best[1], levels=(2, 1), n_iterations=200)
     # sampled metrics leave about a tenth of a voxel, which shows from 32 dB up: end on all voxels
-    ncc, transform = _register(
-        fixed, moving, fixed_mask, transform, levels=(1,), n_iterations=60, step_mm=0.1
-    )
+    ncc, transform = _register(fixed, moving, fixed_mask, transform, levels=(1,), n_iterations=60, step_mm=0.1)
     pose = _pose(transform)
     center = reference.grid.world(np.argwhere(mask).mean(0))
     return Alignment(
         pose,
         ncc,
         rotation_deg=float(np.rad2deg(np.linalg.norm(pose.rotvec_rad()))),
-        shift_mm=float(np.linalg.norm(pose.apply(center[None])[0] - center)),
+        translation_mm=float(np.linalg.norm(pose.apply(center[None])[0] - center)),
     )
 
 
-def resample(
-    volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | None = None
-) -> NDArray[np.float32]:
+def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | None = None) -> NDArray[np.float32]:
     """A volume's values [I, J, K] at the voxels of another grid, by cubic B-splines; zero where it ends.
 
     Where the grids are the same and nothing moves, the values are returned untouched.
@@ -125,32 +121,30 @@ def _starts(fixed: sitk.Image, moving: sitk.Image) -> Iterator[sitk.Euler3DTrans
     """Start transforms about the middle of the reference's grid, the likeliest first."""
     index = [(n - 1) / 2 for n in fixed.GetSize()]
     middle_mm = fixed.TransformContinuousIndexToPhysicalPoint(index)
-    shift_mm = _mass_shift_mm(fixed, moving)
-    yield _euler(middle_mm, (0.0, 0.0, 0.0), shift_mm)
+    translation_mm = _mass_translation_mm(fixed, moving)
+    yield _euler(middle_mm, (0.0, 0.0, 0.0), translation_mm)
     yield _euler(middle_mm, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     for angles_deg in itertools.product(START_ANGLES_DEG, repeat=3):
         if any(angles_deg):
-            yield _euler(middle_mm, tuple(np.deg2rad(angles_deg)), shift_mm)
+            yield _euler(middle_mm, tuple(np.deg2rad(angles_deg)), translation_mm)
 
 
-def _mass_shift_mm(fixed: sitk.Image, moving: sitk.Image) -> tuple[float, ...]:
+def _mass_translation_mm(fixed: sitk.Image, moving: sitk.Image) -> tuple[float, ...]:
     """From the reference's centre of mass to the volume's; zero where a mass is not positive."""
     try:
         moments = sitk.CenteredTransformInitializerFilter.MOMENTS
-        return sitk.CenteredTransformInitializer(
-            fixed, moving, sitk.Euler3DTransform(), moments
-        ).GetTranslation()
+        return sitk.CenteredTransformInitializer(fixed, moving, sitk.Euler3DTransform(), moments).GetTranslation()
     except RuntimeError:
         return (0.0, 0.0, 0.0)
 
 
 def _euler(
-    center_mm: Sequence[float], angles_rad: Sequence[float], shift_mm: Sequence[float]
+    center_mm: Sequence[float], angles_rad: Sequence[float], translation_mm: Sequence[float]
 ) -> sitk.Euler3DTransform:
     transform = sitk.Euler3DTransform()
     transform.SetCenter(center_mm)
     transform.SetRotation(*(float(a) for a in angles_rad))
-    transform.SetTranslation(shift_mm)
+    transform.SetTranslation(translation_mm)
     return transform
 
 
@@ -202,9 +196,7 @@ def _to_sitk(volume: Volume) -> sitk.Image:
     spacing = volume.grid.spacing_mm
     direction = LPS_FROM_RAS @ volume.affine[:3, :3] / spacing
     if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:
-        raise InputError(
-            f"{volume.name}: header is sheared (axes not orthogonal); resample it on an ordinary grid"
-        )
+        raise InputError(f"{volume.name}: header is sheared (axes not orthogonal); resample it on an ordinary grid")
     data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0).astype(np.float32)
     image = sitk.GetImageFromArray(np.ascontiguousarray(data.transpose(2, 1, 0)))
     image.SetSpacing(spacing.tolist())

@@ -113,10 +113,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
     # frames may be left-handed; the motion between two of the same hand is proper all the same
     rotation = np.stack([r @ frames[key[0]].T for key, r in zip(keys, true_frame, strict=True)])
     middle = np.stack(
-        [
-            grids[n].world([(grids[n].shape[0] - 1) / 2, (grids[n].shape[1] - 1) / 2, float(k)])
-            for n, k in keys
-        ]
+        [grids[n].world([(grids[n].shape[0] - 1) / 2, (grids[n].shape[1] - 1) / 2, float(k)]) for n, k in keys]
     )
     return PoseTable(keys, RigidPose(rotation, true_center - np.einsum("kij,kj->ki", rotation, middle)))
 

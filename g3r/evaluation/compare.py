@@ -45,9 +45,7 @@ def compare(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align
         logger.warning("%s: %d values are not finite and count as 0", volume.name, n_bad)
     inside = reference.data[mask]
     if not np.isfinite(inside).all():
-        raise InputError(
-            f"{reference.name}: has values that are not finite in the mask; choose another reference"
-        )
+        raise InputError(f"{reference.name}: has values that are not finite in the mask; choose another reference")
     if np.percentile(inside, 99.9) <= 0:
         raise InputError(f"{reference.name}: is not positive in the mask; check that the mask belongs to it")
     alignment = align_rigid(volume, reference, mask) if align else None

@@ -72,9 +72,7 @@ def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: N
             is not positive anywhere in the mask.
     """
     if not volume.shape == reference.shape == mask.shape:
-        raise ValueError(
-            f"shapes differ: volume {volume.shape}, reference {reference.shape}, mask {mask.shape}"
-        )
+        raise ValueError(f"shapes differ: volume {volume.shape}, reference {reference.shape}, mask {mask.shape}")
     if not mask.any():
         raise ValueError("the mask is empty")
     if not (np.isfinite(volume[mask]).all() and np.isfinite(reference[mask]).all()):

@@ -18,7 +18,7 @@ from g3r.geometry.rigid import fit_rigid
 
 POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
-FEWEST_PIXELS = 30
+MIN_PIXELS = 30
 """Slices with fewer mask pixels are left out: no method can place them, and they hold no anatomy."""
 
 POINTS_PER_SLICE = 64
@@ -85,9 +85,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
         raise InputError(f"{path.name}: is not a text table; expected tab-separated slice poses") from None
     missing = [c for c in ("stack", "slice", *POSE_COLUMNS) if not rows or c not in rows[0]]
     if missing:
-        raise InputError(
-            f"{path.name}: has no column {', '.join(missing)}; expected a tab-separated pose table"
-        )
+        raise InputError(f"{path.name}: has no column {', '.join(missing)}; expected a tab-separated pose table")
     try:
         keys = tuple((int(row["stack"]), int(row["slice"])) for row in rows)
         values = np.array([[float(row[c]) for c in POSE_COLUMNS] for row in rows])
@@ -105,7 +103,7 @@ def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey,
     for stack, path in enumerate(mask_paths):
         mask = load_volume(path)
         inside = np.nan_to_num(mask.data) > 0.5
-        for k in np.flatnonzero(inside.sum((0, 1)) >= FEWEST_PIXELS):
+        for k in np.flatnonzero(inside.sum((0, 1)) >= MIN_PIXELS):
             index = np.argwhere(inside[:, :, k])
             index = index[:: max(1, len(index) // POINTS_PER_SLICE)]
             points[stack, int(k)] = mask.grid.world(np.c_[index, np.full(len(index), k)])

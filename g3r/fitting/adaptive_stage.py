@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import volume_from_pixels
-from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings, VolumeTarget, fit_prior, solve_peaks_on
+from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings, VolumeTarget, fit_prior, solve_amplitudes_on
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.densification import (
-    crowded,
-    find_blobs,
-    joined,
+    concatenated,
+    exceeds_density,
+    find_extrema,
     local_rms,
-    with_twins_merged,
-    without_faint,
+    pruned,
+    with_duplicates_merged,
 )
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
@@ -39,12 +39,12 @@ class AdaptiveSettings:
         growth: a round makes at most so many Gaussians of one.
         n_rounds: at most so many rounds.
         filter_share: sigma of the filter that finds blobs, over the mean spacing of the Gaussians there are.
-        smallest_share: least sigma of a new Gaussian, over the finest spacing.
-        spare: a Gaussian is dropped, and a pair merged, where that changes the volume by less than so many
+        min_share: least sigma of a new Gaussian, over the finest spacing.
+        prune_tolerance: a Gaussian is dropped, and a pair merged, where that changes the volume by less than so many
             times bound^2 in a cell of the finest lattice.
         round_steps: optimiser steps before each look at the residual.
         last_steps: and after the last; those of `PriorStageSettings` when None.
-        peak_iterations: conjugate-gradient steps for the peaks at the start of each round, and at the end.
+        amplitude_iterations: conjugate-gradient steps for the amplitudes at the start of each round, and at the end.
     """
 
     bound: float = 0.05
@@ -52,11 +52,11 @@ class AdaptiveSettings:
     growth: float = 1.7
     n_rounds: int = 6
     filter_share: float = 0.2
-    smallest_share: float = 0.25
-    spare: float = 0.1
+    min_share: float = 0.25
+    prune_tolerance: float = 0.1
     round_steps: int = 45
     last_steps: int | None = None
-    peak_iterations: int = 8
+    amplitude_iterations: int = 8
 
 
 @dataclass
@@ -129,14 +129,14 @@ def fit_adaptive(
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     last_steps = stage.n_steps if settings.last_steps is None else settings.last_steps
     at_most = settings.n_rounds * settings.round_steps + last_steps
-    spare = settings.spare * settings.bound**2 * finest_spacing_mm**3
+    prune_tolerance = settings.prune_tolerance * settings.bound**2 * finest_spacing_mm**3
     window_mm = WINDOW_SHARE * finest_spacing_mm
     cloud = seed_cloud(volume, mask, grid, settings.start * finest_spacing_mm)
     done = Refinement(settings.bound, len(cloud))
 
     def fitted(cloud: GaussianCloud, n_steps: int) -> GaussianCloud:
         before = done.steps
-        run = replace(stage, n_steps=n_steps, peak_iterations=settings.peak_iterations)
+        run = replace(stage, n_steps=n_steps, amplitude_iterations=settings.amplitude_iterations)
         # the rounds to come take as many steps as they would without a deadline, of what time is left
         by_then = deadline.part(n_steps / max(1, at_most - before)) if deadline else None
         cloud, loss = fit_prior(cloud, target, run, rng, lambda n, _: progress(before + n, at_most), by_then)
@@ -153,20 +153,22 @@ def fit_adaptive(
         residual = left(cloud)
         spacing_mm = (mask.sum() * grid.voxel_volume_mm3 / max(len(cloud), 1)) ** (1 / 3)
         filter_mm = max(settings.filter_share * spacing_mm, float(grid.spacing_mm.max()))
-        blobs = find_blobs(residual, mask, grid, filter_mm, settings.smallest_share * finest_spacing_mm)
+        blobs = find_extrema(residual, mask, grid, filter_mm, settings.min_share * finest_spacing_mm)
         over = local_rms(residual, mask, grid, window_mm) > settings.bound
         blobs = blobs.take(over[tuple(blobs.index.T)])
-        blobs = blobs.take(~crowded(cloud, grid.world(blobs.index), finest_spacing_mm))
+        blobs = blobs.take(~exceeds_density(cloud, grid.world(blobs.index), finest_spacing_mm))
         most = max(1, int((settings.growth - 1) * len(cloud)))
         blobs = blobs.take(np.sort(np.argsort(-blobs.gain, kind="stable")[:most]))
         if not len(blobs):
             break
-        cloud = _thinned(cloud, spare, done)
-        cloud = joined(cloud, blobs.cloud(grid, cloud.origin_mm))
+        cloud = _thinned(cloud, prune_tolerance, done)
+        cloud = concatenated(cloud, blobs.cloud(grid, cloud.origin_mm))
         done.n_added += len(blobs)
         done.n_rounds += 1
-    cloud = _thinned(fitted(cloud, last_steps), spare, done)
-    cloud = solve_peaks_on(cloud, target, settings.peak_iterations, stage.cutoff_sigma, stage.record_bytes)
+    cloud = _thinned(fitted(cloud, last_steps), prune_tolerance, done)
+    cloud = solve_amplitudes_on(
+        cloud, target, settings.amplitude_iterations, stage.cutoff_sigma, stage.projection_bytes
+    )
     residual = left(cloud)
     done.rms = float(np.sqrt((residual[mask] ** 2).mean()))
     done.share_over_bound = float((local_rms(residual, mask, grid, window_mm)[mask] > settings.bound).mean())
@@ -174,10 +176,10 @@ def fit_adaptive(
     return cloud, done
 
 
-def _thinned(cloud: GaussianCloud, spare: float, done: Refinement) -> GaussianCloud:
+def _thinned(cloud: GaussianCloud, prune_tolerance: float, done: Refinement) -> GaussianCloud:
     """The cloud without what would not be missed; the counts are kept."""
-    kept = without_faint(cloud, spare)
-    merged = with_twins_merged(kept, spare)
+    kept = pruned(cloud, prune_tolerance)
+    merged = with_duplicates_merged(kept, prune_tolerance)
     done.n_dropped += len(cloud) - len(kept)
     done.n_merged += len(kept) - len(merged)
     return merged

@@ -19,7 +19,7 @@ LENGTH_MM = 40.0
 N_TERMS = 5
 
 
-class StackShading:
+class StackBiasField:
     """Log-fields of all stacks, linear in coefficients [n_stacks, 5].
 
     The terms, `basis` [5, P], are x, y, x^2, xy, y^2, each with zero mean over a stack's masked pixels.

@@ -18,7 +18,7 @@ RISE = 1.5
 
 LEVEL_SHARE = 0.15
 """... and has risen by so much of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (the
-peaks that they begin with are a least-squares optimum, and the loss is L1), with ten times the step sizes by
+amplitudes that they begin with are a least-squares optimum, and the loss is L1), with ten times the step sizes by
 0.4 (docs/numerics.md)."""
 
 SHORTER = 0.3
@@ -28,7 +28,7 @@ KEEP_EVERY = 5
 """Steps between two copies of the parameters, if the loss is the lowest by then."""
 
 
-class Safeguard:
+class DivergenceGuard:
     """Takes the steps of a fit, and takes them back if they lead up or out of the numbers.
 
     The parameters with the lowest loss are kept, in one copy that is renewed every few steps at most. A loss
@@ -102,6 +102,8 @@ class Safeguard:
         self._last_loss = math.inf
         logger.warning(
             "loss rose from %.4g to %.4g: back to the best state, steps at %.3g of their size",
-            self._best_loss, loss, self.step_factor,
-        )  # fmt: skip
+            self._best_loss,
+            loss,
+            self.step_factor,
+        )
         return False

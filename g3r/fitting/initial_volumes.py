@@ -16,7 +16,7 @@ from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 
 MARGIN_MM = 5.0
 """Of the prior's grid around the masked pixels."""
@@ -35,9 +35,7 @@ class FitStart:
     scale: float
 
     @classmethod
-    def of(
-        cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
-    ) -> FitStart:
+    def of(cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float) -> FitStart:
         """The start for slices in their poses.
 
         Args:
@@ -47,9 +45,9 @@ class FitStart:
             voxel_mm: of the grid.
         """
         grid = grid_around(slices, voxel_mm, margin_mm=MARGIN_MM)
-        trust = weight[slices.pixel_plane]
-        coarse, density = coarse_and_density(slices, grid, gain, trust)
-        sharp = sharpened_volume(slices, grid, coarse, gain, trust)
+        slice_weight = weight[slices.pixel_plane]
+        coarse, density = coarse_and_density(slices, grid, gain, slice_weight)
+        sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
         scale = normalisation_scale(coarse, density)
         slices = slices.scaled(1 / scale)
         mask = foreground_mask(slices, grid, weight)
@@ -69,17 +67,14 @@ def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
     return slices.scaled(1 / scale), scale
 
 
-def with_pixels_of(slices: Slices, motion: MotionEstimate) -> MotionEstimate:
+def with_pixels_of(slices: Slices, motion: Registration) -> Registration:
     """A motion estimate with the pixels of the slices to be fitted.
 
     Raises:
         InputError: the two are not about the same slices.
     """
     found = motion.slices
-    if not (
-        np.array_equal(found.stack_id, slices.stack_id)
-        and np.array_equal(found.slice_index, slices.slice_index)
-    ):
+    if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
         raise InputError(
             f"motion of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
             "register the same stacks with the same masks"

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from g3r.gaussians.kernels import clear, set_up_plane, sweep_plane
+from g3r.gaussians.kernels import clear, rasterise_plane, set_up_plane
 from g3r.gaussians.kernels_backward import gather_plane
 from g3r.gaussians.simd import N_LANES
 
@@ -73,10 +73,33 @@ def _exp(e):
 
 @numba.njit(parallel=True, cache=True)
 def image_l1(
-    shapes, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact, images,
-    records, target, weight, trust, factor, with_pose, basis, coefficients, buffers, plane_gradient,
-    field_gradient, residual,
-):  # fmt: skip
+    shapes,
+    amplitude,
+    rotation,
+    center,
+    gain,
+    psf,
+    shape,
+    spacing,
+    offset,
+    start,
+    order,
+    cut,
+    exact,
+    images,
+    projections,
+    target,
+    weight,
+    slice_weight,
+    factor,
+    with_pose,
+    basis,
+    coefficients,
+    buffers,
+    plane_gradient,
+    field_gradient,
+    residual,
+):
     """L1 of rendered planes and its gradients, plane after plane: each is rendered, compared and gathered.
 
     The loss is factor sum_k trust_k residual_k with residual_k the sum of weight |pixel - target| over plane
@@ -86,25 +109,34 @@ def image_l1(
     """
     n_workers = len(images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], records[worker]
+        image, mine = images[worker], projections[worker]
         for k in range(worker, len(rotation), n_workers):
             n_x, n_y = shape[k, 0], shape[k, 1]
             pitch = n_y + N_LANES
             clear(image, n_x, n_y)
             n = set_up_plane(
-                shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
-                gain[k], cut, exact, mine,
-            )  # fmt: skip
-            sweep_plane(mine, n, peak, cut, n_x, n_y, image)
-            total, scale = 0.0, f32(factor * trust[k])
+                shapes,
+                order,
+                start[k],
+                start[k + 1],
+                rotation[k],
+                center[k],
+                psf[k],
+                shape[k],
+                spacing[k],
+                gain[k],
+                cut,
+                exact,
+                mine,
+            )
+            rasterise_plane(mine, n, amplitude, cut, n_x, n_y, image)
+            total, scale = 0.0, f32(factor * slice_weight[k])
             slopes = field_gradient[k]
             slopes[:] = 0.0
             for x in range(n_x):
                 row, begin = x * pitch, offset[k] + x * n_y
                 if basis.shape[1]:
-                    total += _shaded_row(
-                        image, row, target, weight, begin, n_y, scale, basis, coefficients[k], slopes
-                    )
+                    total += _shaded_row(image, row, target, weight, begin, n_y, scale, basis, coefficients[k], slopes)
                 else:
                     total += _row(image, row, target, weight, begin, n_y, scale)
                 image[row + n_y : row + pitch] = f32(0.0)
@@ -113,9 +145,22 @@ def image_l1(
             plane_gradient[k] = 0.0
             if scale != f32(0.0):
                 gather_plane(
-                    mine, n, shapes, peak, rotation[k], center[k], psf[k], shape[k], spacing[k], cut, exact,
-                    image, buffers[worker], plane_gradient[k], with_pose,
-                )  # fmt: skip
+                    mine,
+                    n,
+                    shapes,
+                    amplitude,
+                    rotation[k],
+                    center[k],
+                    psf[k],
+                    shape[k],
+                    spacing[k],
+                    cut,
+                    exact,
+                    image,
+                    buffers[worker],
+                    plane_gradient[k],
+                    with_pose,
+                )
 
 
 @numba.njit(parallel=True, cache=True, fastmath=SUMS)
@@ -152,13 +197,13 @@ def adam(values, gradient, first, second, step, beta_1, beta_2, correction, root
 
 
 @numba.njit(parallel=True, cache=True)
-def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, least_psf_mm2):
+def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, min_psf_mm2):
     """Largest change that a pair's distance from its cut-off can have seen, in units of its sigma.
 
     `then` [N, 12] is what `remember` wrote. With n a unit vector, the distance along n changes by at most
     |mean - then| + common_mm (what planes moved), and sigma_n = sqrt(n^T Sigma n + D) by at most
     max|s - s_then| + angle (s_max - s_min), the steepest that |S n| can be on the unit sphere. sigma_n
-    is at least sqrt(s_min^2 + least_psf_mm2).
+    is at least sqrt(s_min^2 + min_psf_mm2).
     """
     largest = 0.0
     for j in numba.prange(len(mean)):
@@ -173,7 +218,7 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, le
         s_min, s_max = then[j, 10], then[j, 11]
         wider = s_max * (math.exp(grown) - 1.0) + angle * (s_max - s_min)
         distance = math.sqrt(x * x + y * y + z * z) + common_mm + cutoff_sigma * wider
-        largest = max(largest, distance / math.sqrt(s_min * s_min + least_psf_mm2))
+        largest = max(largest, distance / math.sqrt(s_min * s_min + min_psf_mm2))
     return largest
 
 

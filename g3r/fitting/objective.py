@@ -18,14 +18,14 @@ from g3r.fitting import kernels
 from g3r.fitting.parameters import FitParameters
 from g3r.gaussians.kernels import N_GRADIENTS, N_PLANE_GRADIENTS, SHAPE_COLUMNS, derive_shapes
 from g3r.gaussians.kernels_backward import shape_gradients
-from g3r.gaussians.overlap import PairFinder, PairList, Workspace
+from g3r.gaussians.overlap import OverlapFinder, OverlapList, Workspace
 from g3r.gaussians.render import CUTOFF_SIGMA
 
 PAIR_MARGIN_SIGMA = 1.0
 """Pair lists are built this much beyond the cut-off, and again before anything has moved by as much."""
 
 N_FIELD_TERMS = 5
-"""Coefficients of an intensity field (`shading`)."""
+"""Coefficients of an intensity field (`bias_field`)."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -67,7 +67,7 @@ class ImageTerm:
         self.with_pose, self.exact, self.cutoff_sigma = with_pose, exact, cutoff_sigma
         self.basis = np.zeros((N_FIELD_TERMS, 0), np.float32) if basis is None else basis
         self.weight_of_plane = np.add.reduceat(weight, planes.offset[:-1], dtype=np.float64)
-        self.finder: PairFinder | None = None
+        self.finder: OverlapFinder | None = None
         self.work: Workspace | None = None
         self.choose(np.arange(len(planes)))
 
@@ -77,46 +77,63 @@ class ImageTerm:
         self.planes, self.offset = self.every.take(index), self.every.offset[index]
         self.total = self.weight_of_plane[index]
         self.rotation, self.center_mm = self.planes.rotation, self.planes.center_mm - self.origin_mm
-        self.gain, self.trust = np.ones(n), np.ones(n)
+        self.gain, self.slice_weight = np.ones(n), np.ones(n)
         self.coefficients = np.zeros((n, N_FIELD_TERMS), np.float32)
         self.plane_gradient = np.zeros((n, N_PLANE_GRADIENTS))
         self.field_gradient = np.zeros((n, N_FIELD_TERMS), np.float32)
         self.residual = np.zeros(n)
-        self.pairs: PairList | None = None
+        self.pairs: OverlapList | None = None
 
     @property
-    def least_psf_mm2(self) -> float:
+    def min_psf_mm2(self) -> float:
         """Least variance of the PSF in any direction."""
         return float(self.planes.psf_var_mm2.min(initial=np.inf))
 
-    def find_pairs(self, shapes: NDArray[np.float64]) -> None:
+    def find_overlaps(self, shapes: NDArray[np.float64]) -> None:
         """Search the pairs of the present planes, with the margin."""
-        self.finder = self.finder or PairFinder(len(shapes))
+        self.finder = self.finder or OverlapFinder(len(shapes))
         cutoff = self.cutoff_sigma + PAIR_MARGIN_SIGMA
         self.pairs = self.finder.find(shapes, self.planes, self.rotation, self.center_mm, cutoff)
-        if self.work is None or self.work.records.shape[1] < self.pairs.most:
+        if self.work is None or self.work.projections.shape[1] < self.pairs.most:
             self.work = Workspace.of(self.every, self.pairs.most + self.pairs.most // 8)
 
     def add(
-        self,
-        shapes: NDArray[np.float64],
-        peak: NDArray[np.float32],
-        buffers: NDArray[np.float64],
-        factor: float,
+        self, shapes: NDArray[np.float64], amplitude: NDArray[np.float32], buffers: NDArray[np.float64], factor: float
     ) -> float:
         """The term, as a mean; adds factor times its gradient to the buffers of the Gaussians."""
         assert self.pairs is not None, "begin first"
         assert self.work is not None
-        total = max(float(self.trust @ self.total), TINY)
+        total = max(float(self.slice_weight @ self.total), TINY)
         planes = self.planes
         kernels.image_l1(
-            shapes, peak, self.rotation, self.center_mm, self.gain, planes.psf_var_mm2, planes.shape,
-            planes.spacing_mm, self.offset, self.pairs.start, self.pairs.gaussian, self.cutoff_sigma**2,
-            self.exact, self.work.images, self.work.records, self.value, self.weight, self.trust,
-            factor / total, self.with_pose, self.basis, self.coefficients, buffers, self.plane_gradient,
-            self.field_gradient, self.residual,
-        )  # fmt: skip
-        return float(self.trust @ self.residual) / total
+            shapes,
+            amplitude,
+            self.rotation,
+            self.center_mm,
+            self.gain,
+            planes.psf_var_mm2,
+            planes.shape,
+            planes.spacing_mm,
+            self.offset,
+            self.pairs.start,
+            self.pairs.gaussian,
+            self.cutoff_sigma**2,
+            self.exact,
+            self.work.images,
+            self.work.projections,
+            self.value,
+            self.weight,
+            self.slice_weight,
+            factor / total,
+            self.with_pose,
+            self.basis,
+            self.coefficients,
+            buffers,
+            self.plane_gradient,
+            self.field_gradient,
+            self.residual,
+        )
+        return float(self.slice_weight @ self.residual) / total
 
 
 class CloudObjective:
@@ -149,30 +166,36 @@ class CloudObjective:
         self.buffers[:] = 0.0
         if any(term.pairs is None for term in self.terms) or self._have_moved():
             for term in self.terms:
-                term.find_pairs(self.shapes)
+                term.find_overlaps(self.shapes)
             kernels.remember(*self._geometry, self.then)  # type: ignore[call-arg]
             self.n_searches += 1
 
     def _have_moved(self) -> bool:
         # the largest shift of any plane goes with the narrowest PSF of all: too early rather than too late
         farthest = kernels.farthest_move(  # type: ignore[call-arg]
-            *self._geometry, self.then, max(term.cutoff_sigma for term in self.terms),
-            max(term.moved_mm for term in self.terms), min(term.least_psf_mm2 for term in self.terms),
-        )  # fmt: skip
+            *self._geometry,
+            self.then,
+            max(term.cutoff_sigma for term in self.terms),
+            max(term.moved_mm for term in self.terms),
+            min(term.min_psf_mm2 for term in self.terms),
+        )
         return farthest > PAIR_MARGIN_SIGMA
 
     def add(self, term: ImageTerm, factor: float) -> float:
         """An image term (without the factor); its gradient times the factor goes into the sum."""
-        return term.add(self.shapes, self.parameters.value["peak"], self.buffers, factor)
+        return term.add(self.shapes, self.parameters.value["amplitude"], self.buffers, factor)
 
     def finish(self) -> float:
         """The scale regulariser times its weight; writes the gradient of the sum of all terms."""
         value, gradient = self.parameters.value, self.parameters.gradient
         shape_gradients(
-            value["log_scale"], value["quaternion_wxyz"], self.buffers, gradient["peak"], gradient["mean_mm"],
-            gradient["log_scale"], gradient["quaternion_wxyz"],
-        )  # fmt: skip
-        share = self.scale_weight / max(1, value["log_scale"].size)
-        return share * kernels.scale_penalty(
-            value["log_scale"], self.seed_log_scale, share, gradient["log_scale"]
+            value["log_scale"],
+            value["quaternion_wxyz"],
+            self.buffers,
+            gradient["amplitude"],
+            gradient["mean_mm"],
+            gradient["log_scale"],
+            gradient["quaternion_wxyz"],
         )
+        share = self.scale_weight / max(1, value["log_scale"].size)
+        return share * kernels.scale_penalty(value["log_scale"], self.seed_log_scale, share, gradient["log_scale"])

@@ -24,25 +24,25 @@ NOT_FINITE = "the loss of the fit is not finite; lower the step sizes or check t
 class LearningRates:
     """Adam step sizes: about the largest change of a parameter in one step.
 
-    mean_share is relative to a Gaussian's own seed sigma and peak_share to the mean absolute peak, so that
+    mean_share is relative to a Gaussian's own seed sigma and amplitude_share to the mean absolute amplitude, so that
     neither depends on the spacing of the seeds or the intensities. Turns are in rad, shifts in mm.
     """
 
     mean_share: float = 0.04
     log_scale: float = 0.02
     quaternion: float = 0.02
-    peak_share: float = 0.04
+    amplitude_share: float = 0.04
     log_gain: float = 0.002
-    shading: float = 0.008
-    turn_rad: float = 1e-3
-    shift_mm: float = 0.03
+    bias_field: float = 0.008
+    rotation_rad: float = 1e-3
+    translation_mm: float = 0.03
 
 
 class FitParameters:
     """A cloud under optimisation by Adam, with further blocks of parameters where they are given.
 
     Values, gradients and Adam's two means are flat float32 buffers, taken once; `value` and `gradient` are
-    views of them by name: mean_mm [N, 3], log_scale [N, 3], quaternion_wxyz [N, 4], peak [N], and the rest
+    views of them by name: mean_mm [N, 3], log_scale [N, 3], quaternion_wxyz [N, 4], amplitude [N], and the rest
     as given.
 
     Args:
@@ -59,9 +59,9 @@ class FitParameters:
     ) -> None:
         self.origin_mm = cloud.origin_mm
         sigma = float(cloud.log_scale.mean().exp()) if len(cloud) else 1.0
-        height = float(cloud.peak.abs().mean()) if len(cloud) else 1.0
-        names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
-        steps = (rates.mean_share * sigma, rates.log_scale, rates.quaternion, rates.peak_share * height)
+        height = float(cloud.amplitude.abs().mean()) if len(cloud) else 1.0
+        names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
+        steps = (rates.mean_share * sigma, rates.log_scale, rates.quaternion, rates.amplitude_share * height)
         start = {
             name: (tensor.detach().numpy(), step)
             for name, tensor, step in zip(names, cloud.parameters, steps, strict=True)
@@ -83,7 +83,7 @@ class FitParameters:
 
     def __len__(self) -> int:
         """Number of Gaussians."""
-        return len(self.value["peak"])
+        return len(self.value["amplitude"])
 
     @property
     def values(self) -> NDArray[np.float32]:
@@ -107,7 +107,7 @@ class FitParameters:
         Raises:
             NumericalError: it has left the numbers that a cloud may have.
         """
-        names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+        names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         copies = [torch.from_numpy(self.value[name].copy()) for name in names]
         try:
             return GaussianCloud.of(copies, self.origin_mm)

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
-from g3r.fitting.divergence_guard import Safeguard
+from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
-from g3r.gaussians import GaussianCloud, solve_peaks
-from g3r.gaussians.amplitudes import RECORD_BYTES_AT_MOST
+from g3r.gaussians import GaussianCloud, solve_amplitudes
+from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
-from g3r.run.deadline import Deadline, paced
+from g3r.run.deadline import Deadline, timed_steps
 
 NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
@@ -27,22 +27,22 @@ class PriorStageSettings:
     """How stage 1 runs.
 
     Args:
-        n_steps: optimiser steps after the peaks are solved for.
-        peak_iterations: conjugate-gradient steps for the peaks.
+        n_steps: optimiser steps after the amplitudes are solved for.
+        amplitude_iterations: conjugate-gradient steps for the amplitudes.
         plane_share: share of the volume's planes in a step.
         scale_weight: weight of the scale regulariser.
         steps_per_draw: steps between two draws of the planes.
         cutoff_sigma: where a Gaussian ends.
-        record_bytes: see `solve_peaks`; less memory, more seconds, the same result.
+        projection_bytes: see `solve_amplitudes`; less memory, more seconds, the same result.
     """
 
     n_steps: int = 30
-    peak_iterations: int = 12
+    amplitude_iterations: int = 12
     plane_share: float = 0.34
     scale_weight: float = 0.01
     steps_per_draw: int = 10
     cutoff_sigma: float = CUTOFF_SIGMA
-    record_bytes: int = RECORD_BYTES_AT_MOST
+    projection_bytes: int = MAX_PROJECTION_BYTES
 
 
 @dataclass(frozen=True)
@@ -94,26 +94,24 @@ def fit_prior(
 ) -> tuple[GaussianCloud, list[float]]:
     """Fit a seeded cloud to the prior volume.
 
-    Peaks first, by least squares on every second plane; then Adam on everything with the L1 loss on random
+    Amplitudes first, by least squares on every second plane; then Adam on everything with the L1 loss on random
     planes and the scale regulariser; fewer steps if they would end after the deadline. A loss that rises is
-    answered by going back to the best state with shorter steps (`Safeguard`).
+    answered by going back to the best state with shorter steps (`DivergenceGuard`).
 
     Returns:
         The fitted cloud, and the image loss of each step.
     """
     every_second = target.take(np.arange(0, len(target.planes), 2))
-    cloud = solve_peaks_on(
-        cloud, every_second, settings.peak_iterations, settings.cutoff_sigma, settings.record_bytes
+    cloud = solve_amplitudes_on(
+        cloud, every_second, settings.amplitude_iterations, settings.cutoff_sigma, settings.projection_bytes
     )
     parameters = FitParameters(cloud, LearningRates())
-    term = ImageTerm(
-        target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma
-    )
+    term = ImageTerm(target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma)
     objective = CloudObjective(parameters, [term], settings.scale_weight)
-    guard = Safeguard(parameters, float(np.average(np.abs(target.value), weights=target.weight)))
+    guard = DivergenceGuard(parameters, float(np.average(np.abs(target.value), weights=target.weight)))
     history = []
     n_planes = max(1, round(settings.plane_share * len(target.planes)))
-    for step, fraction in paced(settings.n_steps, deadline):
+    for step, fraction in timed_steps(settings.n_steps, deadline):
         progress(step, settings.n_steps)
         if step % settings.steps_per_draw == 0:
             term.choose(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
@@ -126,15 +124,20 @@ def fit_prior(
     return parameters.cloud(), history
 
 
-def solve_peaks_on(
+def solve_amplitudes_on(
     cloud: GaussianCloud,
     target: VolumeTarget,
     n_iterations: int,
     cutoff_sigma: float = CUTOFF_SIGMA,
-    record_bytes: int = RECORD_BYTES_AT_MOST,
+    projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> GaussianCloud:
-    """Peaks of a cloud by least squares on the planes of a volume."""
-    return solve_peaks(
-        cloud, target.planes, target.value, target.weight, n_iterations=n_iterations,
-        cutoff_sigma=cutoff_sigma, record_bytes=record_bytes,
-    )  # fmt: skip
+    """Amplitudes of a cloud by least squares on the planes of a volume."""
+    return solve_amplitudes(
+        cloud,
+        target.planes,
+        target.value,
+        target.weight,
+        n_iterations=n_iterations,
+        cutoff_sigma=cutoff_sigma,
+        projection_bytes=projection_bytes,
+    )

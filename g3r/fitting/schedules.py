@@ -27,13 +27,9 @@ class AnnealedWeight:
 
     def __post_init__(self) -> None:
         if not (self.start >= 0 and self.end >= 0 and math.isfinite(self.start) and math.isfinite(self.end)):
-            raise InputError(
-                f"distillation weights {self.start}, {self.end}; expected finite and not negative"
-            )
+            raise InputError(f"distillation weights {self.start}, {self.end}; expected finite and not negative")
         if not 0 <= self.tau_1 <= self.tau_2 <= 1:
-            raise InputError(
-                f"distillation tau_1 {self.tau_1}, tau_2 {self.tau_2}; expected 0 <= tau_1 <= tau_2 <= 1"
-            )
+            raise InputError(f"distillation tau_1 {self.tau_1}, tau_2 {self.tau_2}; expected 0 <= tau_1 <= tau_2 <= 1")
 
     def at(self, fraction: float) -> float:
         """The weight at a fraction of the fit."""

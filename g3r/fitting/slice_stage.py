@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.bias_field import N_TERMS, StackShading
-from g3r.fitting.divergence_guard import Safeguard
+from g3r.fitting.bias_field import N_TERMS, StackBiasField
+from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.slice_term import SliceTerm
-from g3r.gaussians import GaussianCloud, solve_peaks
-from g3r.gaussians.amplitudes import RECORD_BYTES_AT_MOST
+from g3r.gaussians import GaussianCloud, solve_amplitudes
+from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
-from g3r.run.deadline import Deadline, paced
+from g3r.run.deadline import Deadline, timed_steps
 
-MOST_PRIOR_STRENGTH = 1.0
+MAX_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""
 
 
@@ -32,8 +32,8 @@ class SliceStageSettings:
 
     Args:
         n_steps: optimiser steps.
-        peak_iterations: conjugate-gradient steps for the peaks at the start; 0 leaves them as stage 1 did.
-        peak_damping: pull of those towards the prior's peaks (relative).
+        amplitude_iterations: conjugate-gradient steps for the amplitudes at the start; 0 leaves them as stage 1 did.
+        amplitude_damping: pull of those towards the prior's amplitudes (relative).
         scale_weight: weight of the scale regulariser.
         distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
         prior_error: mean absolute error of the prior, in normalised intensities (0.054 from one, 0.043 from
@@ -45,17 +45,17 @@ class SliceStageSettings:
             the mean residual by its own size would; keeps slices put that the data say nothing about.
         reweight_every: steps between two estimates of the trust in slices.
         steps_per_draw: steps between two draws of the prior's planes.
-        optimise_shading: whether stacks have a smooth intensity field each (two stacks or more).
-        shading_ridge: weight of the mean squared coefficient of the fields.
-        amplitude: "exact", or "printed" for comparison.
+        optimise_bias_field: whether stacks have a smooth intensity field each (two stacks or more).
+        bias_field_ridge: weight of the mean squared coefficient of the fields.
+        attenuation: "exact", or "printed" for comparison.
         cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
-        record_bytes: see `solve_peaks`; less memory, more seconds, the same result.
+        projection_bytes: see `solve_amplitudes`; less memory, more seconds, the same result.
         rates: step sizes.
     """
 
     n_steps: int = 100
-    peak_iterations: int = 6
-    peak_damping: float = 0.05
+    amplitude_iterations: int = 6
+    amplitude_damping: float = 0.05
     scale_weight: float = 0.02
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.2, 0.02))
     prior_error: float = 0.05
@@ -64,11 +64,11 @@ class SliceStageSettings:
     pose_prior_mm: float = 10.0
     reweight_every: int = 20
     steps_per_draw: int = 10
-    optimise_shading: bool = True
-    shading_ridge: float = 0.005
-    amplitude: str = "exact"
+    optimise_bias_field: bool = True
+    bias_field_ridge: float = 0.005
+    attenuation: str = "exact"
     cutoff_sigma: float = CUTOFF_SIGMA
-    record_bytes: int = RECORD_BYTES_AT_MOST
+    projection_bytes: int = MAX_PROJECTION_BYTES
     rates: LearningRates = field(default_factory=LearningRates)
 
 
@@ -76,9 +76,9 @@ class SliceStageSettings:
 class SliceFit:
     """Result of stage 2.
 
-    cloud; slices in their last poses; gain [K], weight [K]; loss of each step, marked `step_back` where the
-    loss had risen and the step was back to the best state (`Safeguard`); coefficients of each stack's shading
-    (see `StackShading`; empty where it was not estimated).
+    cloud; slices in their last poses; gain [K], weight [K]; loss of each step, marked `rollback` where the
+    loss had risen and the step was back to the best state (`DivergenceGuard`); coefficients of each stack's shading
+    (see `StackBiasField`; empty where it was not estimated).
     """
 
     cloud: GaussianCloud
@@ -86,7 +86,7 @@ class SliceFit:
     gain: NDArray[np.float64]
     weight: NDArray[np.float64]
     history: list[dict[str, float]]
-    shading: list[list[float]]
+    bias_field: list[list[float]]
 
 
 def fit_slices(
@@ -119,27 +119,33 @@ def fit_slices(
     Raises:
         NumericalError: a loss that is not finite from the start.
     """
-    trust = weight.astype(np.float32)
-    if settings.peak_iterations:
-        cloud = solve_peaks(
-            cloud, slices.planes, slices.value, slices.mask * trust[slices.planes.plane_id()], gain=gain,
-            n_iterations=settings.peak_iterations, damping=settings.peak_damping,
-            amplitude=settings.amplitude, cutoff_sigma=settings.cutoff_sigma,
-            record_bytes=settings.record_bytes,
-        )  # fmt: skip
+    slice_weight = weight.astype(np.float32)
+    if settings.amplitude_iterations:
+        cloud = solve_amplitudes(
+            cloud,
+            slices.planes,
+            slices.value,
+            slices.mask * slice_weight[slices.planes.plane_id()],
+            gain=gain,
+            n_iterations=settings.amplitude_iterations,
+            damping=settings.amplitude_damping,
+            attenuation=settings.attenuation,
+            cutoff_sigma=settings.cutoff_sigma,
+            projection_bytes=settings.projection_bytes,
+        )
     several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
-    shading = StackShading(slices) if settings.optimise_shading and several else None
-    parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, shading, settings))
-    loss = SliceLoss(parameters, slices, gain, trust.astype(np.float64), shading, prior, settings)
-    guard = Safeguard(parameters, loss.level)
+    bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
+    parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, bias_field, settings))
+    loss = SliceLoss(parameters, slices, gain, slice_weight.astype(np.float64), bias_field, prior, settings)
+    guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
-    for step, fraction in paced(settings.n_steps, deadline):
+    for step, fraction in timed_steps(settings.n_steps, deadline):
         progress(step, settings.n_steps)
         if step % settings.steps_per_draw == 0:
             loss.draw(rng)
         value, entry = loss.evaluate(fraction)
         if not guard.step(value, cosine_decay(fraction)):
-            entry |= {"step_back": 1.0}
+            entry |= {"rollback": 1.0}
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
@@ -154,9 +160,9 @@ def fit_slices(
         parameters.cloud(),
         slices.with_pose(term.moved_planes().pose),
         term.gain,
-        term.trust,
+        term.slice_weight,
         history,
-        parameters.value["shading"].astype(float).tolist() if shading else [],
+        parameters.value["shading"].astype(float).tolist() if bias_field else [],
     )
 
 
@@ -169,8 +175,8 @@ class SliceLoss:
         parameters: with the blocks that are fitted along.
         slices: K slices.
         gain: [K] where no block holds it.
-        trust: [K] in each slice.
-        shading: fields of the stacks, or None.
+        slice_weight: [K] in each slice.
+        bias_field: fields of the stacks, or None.
         prior: distillation target, or None.
         settings: weights of the terms.
     """
@@ -180,23 +186,22 @@ class SliceLoss:
         parameters: FitParameters,
         slices: Slices,
         gain: NDArray[np.float64],
-        trust: NDArray[np.float64],
-        shading: StackShading | None,
+        slice_weight: NDArray[np.float64],
+        bias_field: StackBiasField | None,
         prior: VolumeTarget | None,
         settings: SliceStageSettings,
     ) -> None:
         self.settings = settings
         self.term = SliceTerm(
-            slices, gain, trust, parameters, shading, settings.amplitude == "exact", settings.cutoff_sigma
+            slices, gain, slice_weight, parameters, bias_field, settings.attenuation == "exact", settings.cutoff_sigma
         )
         self.level = float(np.abs(slices.masked_value).mean()) if len(slices.masked_value) else 0.0
         self.distilled: ImageTerm | None = None
         terms: list[ImageTerm] = [self.term]
         if prior is not None:
             self.distilled = ImageTerm(
-                prior.planes, prior.value, prior.weight, parameters.origin_mm,
-                cutoff_sigma=settings.cutoff_sigma,
-            )  # fmt: skip
+                prior.planes, prior.value, prior.weight, parameters.origin_mm, cutoff_sigma=settings.cutoff_sigma
+            )
             # the distance is a mean over the prior's trust, so this makes the term the mean over the head of
             # trust times difference: well-measured heads feel little of it, sparsely measured ones much
             self.prior_share = float(prior.weight[prior.weight > 0].mean())
@@ -223,7 +228,7 @@ class SliceLoss:
             loss += strength * self.prior_share * distance
             entry |= {"distillation": distance, "distillation_weight": strength}
         loss += self.objective.finish()
-        loss += self.term.finish(image, settings.pose_prior_mm, settings.shading_ridge)
+        loss += self.term.finish(image, settings.pose_prior_mm, settings.bias_field_ridge)
         return loss, entry
 
     def reweight(self) -> float:
@@ -234,17 +239,17 @@ class SliceLoss:
 
 
 def _blocks(
-    slices: Slices, gain: NDArray[np.float64], shading: StackShading | None, settings: SliceStageSettings
+    slices: Slices, gain: NDArray[np.float64], bias_field: StackBiasField | None, settings: SliceStageSettings
 ) -> dict[str, tuple[NDArray[np.floating], float]]:
     """What is fitted along with the cloud: start values and step sizes."""
     n, rates = len(slices), settings.rates
     blocks: dict[str, tuple[NDArray[np.floating], float]] = {}
     if settings.optimise_poses:
-        blocks |= {"turn": (np.zeros((n, 3)), rates.turn_rad), "shift": (np.zeros((n, 3)), rates.shift_mm)}
-    if n > 1:  # the gain of a single slice cannot be told from the peaks
+        blocks |= {"turn": (np.zeros((n, 3)), rates.rotation_rad), "shift": (np.zeros((n, 3)), rates.translation_mm)}
+    if n > 1:  # the gain of a single slice cannot be told from the amplitudes
         blocks["log_gain"] = (np.log(gain), rates.log_gain)
-    if shading:
-        blocks["shading"] = (np.zeros((len(shading.stacks), N_TERMS)), rates.shading)
+    if bias_field:
+        blocks["shading"] = (np.zeros((len(bias_field.stacks), N_TERMS)), rates.bias_field)
     return blocks
 
 
@@ -264,4 +269,4 @@ def prior_strength(settings: SliceStageSettings, fraction: float, residual: floa
     annealed = settings.distillation.at(fraction)
     if settings.prior_error <= 0 or not settings.distillation.start > 0:
         return annealed
-    return max(annealed, min(residual / settings.prior_error, MOST_PRIOR_STRENGTH))
+    return max(annealed, min(residual / settings.prior_error, MAX_PRIOR_STRENGTH))

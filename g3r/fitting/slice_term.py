@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
-from g3r.fitting.bias_field import StackShading
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.objective import TINY, ImageTerm
 from g3r.fitting.parameters import FitParameters
 from g3r.gaussians.render import CUTOFF_SIGMA, right_jacobian
@@ -26,7 +26,7 @@ class SliceTerm(ImageTerm):
         gain: [K] intensity factors.
         weight: [K] trust.
         parameters: of the fit.
-        shading: fields of the stacks; None where there are none.
+        bias_field: fields of the stacks; None where there are none.
         exact: the amplitude, as in `render`.
         cutoff_sigma: where a Gaussian ends.
     """
@@ -37,23 +37,29 @@ class SliceTerm(ImageTerm):
         gain: NDArray[np.float64],
         weight: NDArray[np.float64],
         parameters: FitParameters,
-        shading: StackShading | None = None,
+        bias_field: StackBiasField | None = None,
         exact: bool = True,
         cutoff_sigma: float = CUTOFF_SIGMA,
     ) -> None:
         super().__init__(
-            slices.planes, slices.value, slices.mask.astype(np.float32), parameters.origin_mm,
-            basis=shading.basis if shading else None, with_pose="turn" in parameters.value, exact=exact,
+            slices.planes,
+            slices.value,
+            slices.mask.astype(np.float32),
+            parameters.origin_mm,
+            basis=bias_field.basis if bias_field else None,
+            with_pose="turn" in parameters.value,
+            exact=exact,
             cutoff_sigma=cutoff_sigma,
-        )  # fmt: skip
+        )
         self.parameters = parameters
-        self.gain, self.trust = gain.astype(np.float64), weight.astype(np.float64)
+        self.gain, self.slice_weight = gain.astype(np.float64), weight.astype(np.float64)
         self.start_center_mm = self.center_mm
         _, self.stack = np.unique(slices.stack_id, return_inverse=True)
         corner_mm = np.sqrt(((self.planes.shape * self.planes.spacing_mm / 2) ** 2).sum(1))
         self.radius_mm = float(corner_mm.mean()) / 2
-        far = [np.linalg.norm(points, axis=1).max(initial=0.0) for points in
-               (parameters.value["mean_mm"], self.center_mm)]  # fmt: skip
+        far = [
+            np.linalg.norm(points, axis=1).max(initial=0.0) for points in (parameters.value["mean_mm"], self.center_mm)
+        ]
         # of a Gaussian from a plane's centre: what a turn moves it by, over its angle
         self.reach_mm = float(sum(far))
 
@@ -66,8 +72,7 @@ class SliceTerm(ImageTerm):
             self.center_mm = self.start_center_mm + shift
             if self.pairs is not None:
                 # the angle between two rotations is at most the distance of their rotation vectors
-                turned, shifted = (np.linalg.norm(a - b, axis=1) for a, b in
-                                   zip((turn, shift), self.then, strict=True))  # fmt: skip
+                turned, shifted = (np.linalg.norm(a - b, axis=1) for a, b in zip((turn, shift), self.then, strict=True))
                 self.moved_mm = float((shifted + turned * self.reach_mm).max(initial=0.0))
         if "log_gain" in value:
             log_gain = value["log_gain"].astype(np.float64)
@@ -75,14 +80,14 @@ class SliceTerm(ImageTerm):
         if "shading" in value:
             self.coefficients = value["shading"][self.stack]
 
-    def find_pairs(self, shapes: NDArray[np.float64]) -> None:
-        """As `ImageTerm.find_pairs`; movement is measured from here on."""
-        super().find_pairs(shapes)
+    def find_overlaps(self, shapes: NDArray[np.float64]) -> None:
+        """As `ImageTerm.find_overlaps`; movement is measured from here on."""
+        super().find_overlaps(shapes)
         if self.with_pose:
             self.then = [self.parameters.value[name].astype(np.float64) for name in ("turn", "shift")]
             self.moved_mm = 0.0
 
-    def finish(self, image: float, pose_prior_mm: float, shading_ridge: float) -> float:
+    def finish(self, image: float, pose_prior_mm: float, bias_field_ridge: float) -> float:
         """Write the gradients of poses, gains and fields after `add`; returns the terms of those alone.
 
         Args:
@@ -90,7 +95,7 @@ class SliceTerm(ImageTerm):
                 slice over pose_prior_mm^2.
             pose_prior_mm: a slice that moves this far pays as much as a change of the image term by its own
                 size would.
-            shading_ridge: weight of the mean squared coefficient of the fields.
+            bias_field_ridge: weight of the mean squared coefficient of the fields.
         """
         value, gradient = self.parameters.value, self.parameters.gradient
         loss = 0.0
@@ -110,18 +115,18 @@ class SliceTerm(ImageTerm):
             c = value["shading"].astype(np.float64)
             total = np.zeros_like(c)
             np.add.at(total, self.stack, self.field_gradient)
-            loss += shading_ridge * float(np.mean(c**2))
-            gradient["shading"][...] = total + 2 * shading_ridge / c.size * c
+            loss += bias_field_ridge * float(np.mean(c**2))
+            gradient["shading"][...] = total + 2 * bias_field_ridge / c.size * c
         return loss
 
     @property
     def mean_residual(self) -> float:
         """Mean absolute residual at the last `add` under the present trust."""
-        return float(self.trust @ self.residual) / max(float(self.trust @ self.total), TINY)
+        return float(self.slice_weight @ self.residual) / max(float(self.slice_weight @ self.total), TINY)
 
     def reweight(self) -> None:
         """Trust in each slice from its mean absolute residual at the last `add`."""
-        self.trust = slice_weights(self.residual / np.maximum(self.total, 1)).astype(np.float32).astype(float)
+        self.slice_weight = slice_weights(self.residual / np.maximum(self.total, 1)).astype(np.float32).astype(float)
 
     def moved_planes(self) -> Planes:
         """The slices' planes at the present poses."""

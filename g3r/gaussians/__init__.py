@@ -1,8 +1,8 @@
 """3D Gaussians and their renderer."""
 
-from g3r.gaussians.amplitudes import solve_peaks
+from g3r.gaussians.amplitudes import solve_amplitudes
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.overlap import find_pairs
+from g3r.gaussians.overlap import find_overlaps
 from g3r.gaussians.render import render
 
-__all__ = ["GaussianCloud", "find_pairs", "render", "solve_peaks"]
+__all__ = ["GaussianCloud", "find_overlaps", "render", "solve_amplitudes"]

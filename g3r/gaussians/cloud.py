@@ -20,10 +20,10 @@ from g3r.errors import InputError
 SIGMA_RANGE_MM = (1e-6, 1e6)
 """Beyond it nothing of a head is described, and the kernels' integers and float32 would end."""
 
-LARGEST_LOG_SCALE = 13.816
+MAX_LOG_SCALE = 13.816
 """Logarithm of the largest sigma, and of one over the least."""
 
-LEAST_QUATERNION = 1e-15
+MIN_QUATERNION = 1e-15
 """Shorter ones have no direction, and gradients that go with one over their length."""
 
 
@@ -35,7 +35,7 @@ class GaussianCloud:
         mean_mm: [N, 3] centres relative to the origin.
         log_scale: [N, 3] natural logarithm of the standard deviations in mm.
         quaternion_wxyz: [N, 4] orientation; normalised on use, must not be near zero.
-        peak: [N] c_j, height without any PSF; may be negative.
+        amplitude: [N] c_j, height without any PSF; may be negative.
         origin_mm: [3] float64 world position of the local origin. Centres are kept relative to it so that
             float32 loses no digits when the scanner's origin is far away.
 
@@ -47,7 +47,7 @@ class GaussianCloud:
     mean_mm: Tensor
     log_scale: Tensor
     quaternion_wxyz: Tensor
-    peak: Tensor
+    amplitude: Tensor
     origin_mm: NDArray[np.float64]
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class GaussianCloud:
             ("mean_mm", (n, 3)),
             ("log_scale", (n, 3)),
             ("quaternion_wxyz", (n, 4)),
-            ("peak", (n,)),
+            ("amplitude", (n,)),
         ):
             found = tuple(getattr(self, name).shape)
             if found != shape:
@@ -66,25 +66,25 @@ class GaussianCloud:
         object.__setattr__(self, "origin_mm", np.array(self.origin_mm, dtype=np.float64).reshape(3))
         if not np.isfinite(self.origin_mm).all():
             raise ValueError("origin_mm holds values that are not finite")
-        if n and float(self.log_scale.detach().abs().max()) > LARGEST_LOG_SCALE:
+        if n and float(self.log_scale.detach().abs().max()) > MAX_LOG_SCALE:
             low, high = SIGMA_RANGE_MM
             raise ValueError(f"a sigma is out of range; expected {low:g} to {high:g} mm")
-        if n and float(self.quaternion_wxyz.detach().double().norm(dim=1).min()) < LEAST_QUATERNION:
-            raise ValueError(f"a quaternion is shorter than {LEAST_QUATERNION:g}; expected about one")
+        if n and float(self.quaternion_wxyz.detach().double().norm(dim=1).min()) < MIN_QUATERNION:
+            raise ValueError(f"a quaternion is shorter than {MIN_QUATERNION:g}; expected about one")
 
     @classmethod
     def of(cls, parameters: Sequence[Tensor], origin_mm: NDArray[np.float64]) -> GaussianCloud:
         """A cloud from the four tensors in the order of `parameters`."""
-        mean_mm, log_scale, quaternion_wxyz, peak = parameters
-        return cls(mean_mm, log_scale, quaternion_wxyz, peak, origin_mm)
+        mean_mm, log_scale, quaternion_wxyz, amplitude = parameters
+        return cls(mean_mm, log_scale, quaternion_wxyz, amplitude, origin_mm)
 
     def __len__(self) -> int:
         return len(self.mean_mm)
 
     @property
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Centres, log-scales, quaternions, peaks."""
-        return self.mean_mm, self.log_scale, self.quaternion_wxyz, self.peak
+        """Centres, log-scales, quaternions, amplitudes."""
+        return self.mean_mm, self.log_scale, self.quaternion_wxyz, self.amplitude
 
     def take(self, index: Tensor) -> GaussianCloud:
         """The Gaussians at an index tensor or mask."""
@@ -98,15 +98,15 @@ class GaussianCloud:
         """The same cloud in float64."""
         return GaussianCloud.of([p.double() for p in self.parameters], self.origin_mm)
 
-    def with_peak(self, peak: Tensor) -> GaussianCloud:
+    def with_amplitude(self, amplitude: Tensor) -> GaussianCloud:
         """The same shapes with other heights."""
-        return replace(self, peak=peak)
+        return replace(self, amplitude=amplitude)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as .npz with float32 arrays named like the fields (atomically)."""
         arrays = {
             name: getattr(self, name).detach().cpu().numpy().astype(np.float32)
-            for name in ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+            for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays, origin_mm=self.origin_mm)
@@ -124,7 +124,7 @@ class GaussianCloud:
         """
         try:
             with np.load(path, allow_pickle=False) as data:
-                names = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+                names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
                 return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
@@ -137,8 +137,14 @@ def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
     scaled = quaternion_wxyz / largest
     w, x, y, z = (scaled / scaled.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, 1).reshape(-1, 3, 3)

@@ -25,44 +25,42 @@ NEIGHBOURHOOD = 8
 
 
 @dataclass(frozen=True)
-class Blobs:
+class ResidualExtrema:
     """Extrema of a residual, each described as a Gaussian.
 
     index [M, 3] voxels; axes [M, 3, 3] principal axes in world space (columns, right-handed); sigma_mm [M, 3]
-    along them; peak [M]; gain [M] by about how much each lowers the squared residual (times mm^3).
+    along them; amplitude [M]; gain [M] by about how much each lowers the squared residual (times mm^3).
     """
 
     index: NDArray[np.int64]
     axes: NDArray[np.float64]
     sigma_mm: NDArray[np.float64]
-    peak: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
     gain: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.index)
 
-    def take(self, chosen: NDArray[np.integer] | NDArray[np.bool_]) -> Blobs:
+    def take(self, chosen: NDArray[np.integer] | NDArray[np.bool_]) -> ResidualExtrema:
         """The blobs at an index array or a mask."""
-        return Blobs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return ResidualExtrema(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     def cloud(self, grid: VolumeGrid, origin_mm: NDArray[np.float64]) -> GaussianCloud:
         """Gaussians of these shapes, at part of their height (`FIRST_SHARE`)."""
         xyzw = Rotation.from_matrix(self.axes).as_quat() if len(self) else np.zeros((0, 4))
         arrays = (
-            grid.world(self.index) - origin_mm, np.log(self.sigma_mm), xyzw[:, [3, 0, 1, 2]],
-            FIRST_SHARE * self.peak,
-        )  # fmt: skip
+            grid.world(self.index) - origin_mm,
+            np.log(self.sigma_mm),
+            xyzw[:, [3, 0, 1, 2]],
+            FIRST_SHARE * self.amplitude,
+        )
         tensors = [torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in arrays]
         return GaussianCloud.of(tensors, origin_mm)
 
 
-def find_blobs(
-    residual: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    grid: VolumeGrid,
-    filter_mm: float,
-    smallest_mm: float,
-) -> Blobs:
+def find_extrema(
+    residual: NDArray[np.float32], mask: NDArray[np.bool_], grid: VolumeGrid, filter_mm: float, min_mm: float
+) -> ResidualExtrema:
     """The local extrema of a smoothed residual inside a mask, with the shapes that the residual has there.
 
     Where a Gaussian blob of covariance C is smoothed with variance s^2, the logarithm of the result has the
@@ -74,7 +72,7 @@ def find_blobs(
         mask: [I, J, K].
         grid: their grid (voxels about as long as wide).
         filter_mm: sigma of the filter.
-        smallest_mm: least sigma of a blob; the largest is `WIDEST` filters.
+        min_mm: least sigma of a blob; the largest is `WIDEST` filters.
     """
     voxel = float(grid.spacing_mm.mean())
     sigma = filter_mm / voxel
@@ -92,13 +90,13 @@ def find_blobs(
     index = np.argwhere(top)
     # C + s^2 along each axis; a direction in which the residual does not fall gets the widest
     total = 1 / np.maximum(eigenvalue, 1 / (sigma**2 * (1 + WIDEST**2)))
-    variance = np.clip(total - sigma**2, (smallest_mm / voxel) ** 2, (WIDEST * sigma) ** 2)
-    peak = value * np.sqrt(((variance + sigma**2) / variance).prod(1))
+    variance = np.clip(total - sigma**2, (min_mm / voxel) ** 2, (WIDEST * sigma) ** 2)
+    amplitude = value * np.sqrt(((variance + sigma**2) / variance).prod(1))
     axes = (grid.affine[:3, :3] / grid.spacing_mm) @ vectors
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     sigma_mm = np.sqrt(variance) * voxel
-    gain = peak**2 * np.pi**1.5 * sigma_mm.prod(1)
-    return Blobs(index, axes, sigma_mm, peak, gain)
+    gain = amplitude**2 * np.pi**1.5 * sigma_mm.prod(1)
+    return ResidualExtrema(index, axes, sigma_mm, amplitude, gain)
 
 
 def local_rms(
@@ -112,7 +110,7 @@ def local_rms(
     return np.sqrt(np.maximum(mean_square, 0)) * mask
 
 
-def crowded(
+def exceeds_density(
     cloud: GaussianCloud, points_mm: NDArray[np.float64], finest_spacing_mm: float
 ) -> NDArray[np.bool_]:
     """Whether Gaussians stand as close around points [M, 3] as on a lattice of the finest spacing."""
@@ -124,39 +122,39 @@ def crowded(
     return np.asarray(count >= NEIGHBOURHOOD)
 
 
-def joined(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
+def concatenated(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
     """The Gaussians of two clouds of one origin."""
     pairs = zip(first.parameters, second.parameters, strict=True)
     return GaussianCloud.of([torch.cat([a.detach(), b.detach()]) for a, b in pairs], first.origin_mm)
 
 
-def without_faint(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
+def pruned(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
     """The cloud without the Gaussians whose integral of the square is below a tolerance (mm^3).
 
-    Taking one away changes the volume by so much, and by less once its neighbours' peaks are solved for.
+    Taking one away changes the volume by so much, and by less once its neighbours' amplitudes are solved for.
     """
     return cloud.take(torch.from_numpy(_energy(cloud) >= tolerance))
 
 
-def with_twins_merged(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
+def with_duplicates_merged(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
     """The cloud with pairs replaced by one Gaussian where that changes it by less than a tolerance (mm^3).
 
-    Pairs are nearest neighbours of each other with peaks of one sign. The one has their common mass, mean and
+    Pairs are nearest neighbours of each other with amplitudes of one sign. The one has their common mass, mean and
     covariance; the change is the integral of the squared difference, in closed form from the products of
     Gaussians.
     """
     if len(cloud) < 2:
         return cloud
     mean = cloud.mean_mm.detach().double().numpy()
-    peak = cloud.peak.detach().double().numpy()
+    amplitude = cloud.amplitude.detach().double().numpy()
     nearest = cKDTree(mean).query(mean, k=2)[1][:, 1]
     own = np.arange(len(cloud))
-    first = np.flatnonzero((nearest[nearest] == own) & (own < nearest) & (peak * peak[nearest] > 0))
+    first = np.flatnonzero((nearest[nearest] == own) & (own < nearest) & (amplitude * amplitude[nearest] > 0))
     second = nearest[first]
     if not len(first):
         return cloud
     covariance = _covariance(cloud)
-    mass = peak * np.sqrt(np.linalg.det(covariance))
+    mass = amplitude * np.sqrt(np.linalg.det(covariance))
     share = (mass[first] / (mass[first] + mass[second]))[:, None]
     middle = share * mean[first] + (1 - share) * mean[second]
     spread = np.zeros((len(first), 3, 3))
@@ -164,8 +162,8 @@ def with_twins_merged(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
         away = mean[part] - middle
         spread += weight[:, :, None] * (covariance[part] + away[:, :, None] * away[:, None, :])
     height = (mass[first] + mass[second]) / np.sqrt(np.linalg.det(spread))
-    a = (peak[first], mean[first], covariance[first])
-    b = (peak[second], mean[second], covariance[second])
+    a = (amplitude[first], mean[first], covariance[first])
+    b = (amplitude[second], mean[second], covariance[second])
     c = (-height, middle, spread)
     change = np.sum([_product(x, y) for x in (a, b, c) for y in (a, b, c)], axis=0)
     ok = np.asarray(change < tolerance)
@@ -178,14 +176,14 @@ def with_twins_merged(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
     quaternion = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
     arrays = (middle[ok], 0.5 * np.log(variance), quaternion, height[ok])
     merged = [torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32)) for x in arrays]
-    return joined(cloud.take(torch.from_numpy(keep)), GaussianCloud.of(merged, cloud.origin_mm))
+    return concatenated(cloud.take(torch.from_numpy(keep)), GaussianCloud.of(merged, cloud.origin_mm))
 
 
 Term = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def _product(first: Term, second: Term) -> NDArray[np.float64]:
-    """Integral of the product of Gaussians (peak [M], mean [M, 3], covariance [M, 3, 3]), in mm^3."""
+    """Integral of the product of Gaussians (amplitude [M], mean [M, 3], covariance [M, 3, 3]), in mm^3."""
     total = first[2] + second[2]
     away = first[1] - second[1]
     exponent = -0.5 * np.einsum("mi,mi->m", away, np.linalg.solve(total, away[:, :, None])[:, :, 0])
@@ -202,4 +200,4 @@ def _covariance(cloud: GaussianCloud) -> NDArray[np.float64]:
 def _energy(cloud: GaussianCloud) -> NDArray[np.float64]:
     """Integral of the square of each Gaussian [N], in mm^3."""
     log_volume = cloud.log_scale.detach().double().sum(1).numpy()
-    return np.asarray(cloud.peak.detach().double().numpy() ** 2 * np.pi**1.5 * np.exp(log_volume))
+    return np.asarray(cloud.amplitude.detach().double().numpy() ** 2 * np.pi**1.5 * np.exp(log_volume))

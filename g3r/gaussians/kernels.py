@@ -23,24 +23,33 @@ LOOSE = {"contract", "arcp", "nsz"}
 SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
 
-MOST_PIXELS = 1e9
+MAX_PIXELS = 1e9
 """Ellipses that reach further than that are not drawn: 32 bits number the pixels. `render` refuses them."""
 
-# Gradient columns of a Gaussian in the buffers: peak, mean (3), covariance xx xy xz yy yz zz, log-volume.
+# Gradient columns of a Gaussian in the buffers: amplitude, mean (3), covariance xx xy xz yy yz zz, log-volume.
 N_GRADIENTS = 11
 # Gradient columns of a plane: body-frame rotation (3), world translation (3), log-gain.
 N_PLANE_GRADIENTS = 7
 
 PAIR = np.dtype(
     [
-        ("unit", np.float32), ("e_0", np.float32), ("q_x", np.float32), ("q_u", np.float32),
-        ("slope", np.float32), ("x", np.float32), ("y", np.float32), ("half_x", np.float32),
-        ("half_y", np.float32), ("row", np.int32), ("column", np.int32), ("gaussian", np.int32),
+        ("unit", np.float32),
+        ("e_0", np.float32),
+        ("q_x", np.float32),
+        ("q_u", np.float32),
+        ("slope", np.float32),
+        ("x", np.float32),
+        ("y", np.float32),
+        ("half_x", np.float32),
+        ("half_y", np.float32),
+        ("row", np.int32),
+        ("column", np.int32),
+        ("gaussian", np.int32),
     ]
-)  # fmt: skip
+)
 """The 2D Gaussian that a pair leaves on its plane, in pixels.
 
-Height over the peak (with gain); exponent as in `lanes`; centre at (row + x, column + y); half the sides of
+Height over the amplitude (with gain); exponent as in `lanes`; centre at (row + x, column + y); half the sides of
 the box around the ellipse at the cut-off; number of the Gaussian.
 """
 
@@ -72,8 +81,8 @@ def observe(shapes, j, r, t, psf):
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
-def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut, exact, records):
-    """Describe the pairs of a plane that touch it, one after the other in `records`; returns their number."""
+def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut, exact, projections):
+    """Describe the pairs of a plane that touch it, one after the other in `projections`; returns their number."""
     n_x, n_y = size[0], size[1]
     over_x, over_y = 1.0 / spacing[0], 1.0 / spacing[1]
     sx, sy = spacing[0], spacing[1]
@@ -95,14 +104,14 @@ def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut,
         half_x, half_y = math.sqrt(c2 * cxx) * over_x, math.sqrt(c2 * cyy) * over_y
         if not (px + half_x >= 0.0 and py + half_y >= 0.0 and px - half_x < n_x and py - half_y < n_y):
             continue
-        if not (half_x < MOST_PIXELS and half_y < MOST_PIXELS):
+        if not (half_x < MAX_PIXELS and half_y < MAX_PIXELS):
             continue
         unit = gain
         if exact:
             unit *= shapes[j, 9] * math.sqrt(iz / det)
         over_cxx = 1.0 / cxx
         row, column = math.floor(px), math.floor(py)
-        record = records[n]
+        record = projections[n]
         record.unit = f32(unit)
         record.e_0 = f32(e_0)
         record.q_x = f32(-0.5 * sx * sx * over_cxx)
@@ -146,13 +155,13 @@ def strip_columns(record, n_y):
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
-def sweep_plane(records, n, peak, cut, n_x, n_y, image):
+def rasterise_plane(projections, n, amplitude, cut, n_x, n_y, image):
     """Add the Gaussians of `n` records to the padded image of their plane."""
     pitch = n_y + N_LANES
     limit = f32(-0.5 * cut)
     for i in range(n):
-        record = records[i]
-        height = record.unit * f32(peak[record.gaussian])
+        record = projections[i]
+        height = record.unit * f32(amplitude[record.gaussian])
         start, stop = strip_columns(record, n_y)
         for column in range(start, stop + 1, N_LANES):
             dy = f32(column) - record.y
@@ -161,9 +170,8 @@ def sweep_plane(records, n, peak, cut, n_x, n_y, image):
             dx = f32(row) - record.x
             first = (record.row + row) * pitch + record.column + column
             add_strip(
-                image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy,
-                limit, height,
-            )  # fmt: skip
+                image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy, limit, height
+            )
 
 
 @numba.njit(forceinline=True)
@@ -195,24 +203,49 @@ def unload(image, pixels, offset, n_x, n_y):
 
 @numba.njit(parallel=True, cache=True)
 def forward(
-    shapes, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact, images,
-    records, out,
-):  # fmt: skip
+    shapes,
+    amplitude,
+    rotation,
+    center,
+    gain,
+    psf,
+    shape,
+    spacing,
+    offset,
+    start,
+    order,
+    cut,
+    exact,
+    images,
+    projections,
+    out,
+):
     """Every pair's Gaussian, gain included, on the flat pixels `out`.
 
     images and records are scratch space, one row for each worker (`Workspace`).
     """
     n_workers = len(images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], records[worker]
+        image, mine = images[worker], projections[worker]
         for k in range(worker, len(rotation), n_workers):
             n_x, n_y = shape[k, 0], shape[k, 1]
             clear(image, n_x, n_y)
             n = set_up_plane(
-                shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
-                gain[k], cut, exact, mine,
-            )  # fmt: skip
-            sweep_plane(mine, n, peak, cut, n_x, n_y, image)
+                shapes,
+                order,
+                start[k],
+                start[k + 1],
+                rotation[k],
+                center[k],
+                psf[k],
+                shape[k],
+                spacing[k],
+                gain[k],
+                cut,
+                exact,
+                mine,
+            )
+            rasterise_plane(mine, n, amplitude, cut, n_x, n_y, image)
             unload(image, out, offset[k], n_x, n_y)
 
 
@@ -235,9 +268,7 @@ def derive_shapes(mean, log_scale, quaternion, shapes):
 @numba.njit(forceinline=True)
 def quaternion_matrix(quaternion, j):
     """Rotation (tuple of rows) of quaternion j, which is normalised first."""
-    w, x, y, z = (
-        float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]),
-    )  # fmt: skip
+    w, x, y, z = (float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]))
     n = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
     return (

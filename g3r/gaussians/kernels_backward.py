@@ -7,15 +7,7 @@ import math
 import numba
 import numpy as np
 
-from g3r.gaussians.kernels import (
-    LOOSE,
-    load,
-    observe,
-    quaternion_matrix,
-    set_up_plane,
-    strip_columns,
-    strip_rows,
-)
+from g3r.gaussians.kernels import LOOSE, load, observe, quaternion_matrix, set_up_plane, strip_columns, strip_rows
 from g3r.gaussians.simd import N_LANES, strip_moments
 
 f32 = np.float32
@@ -43,7 +35,7 @@ def pair_moments(record, cut, n_x, n_y, image):
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
 def gather_plane(
-    records, n, shapes, peak, r, t, psf, size, spacing, cut, exact, image, buffer, plane, with_pose
+    projections, n, shapes, amplitude, r, t, psf, size, spacing, cut, exact, image, buffer, plane, with_pose
 ):
     """Gradients of sum(image * pixels of the plane), added to those of its Gaussians and of the plane.
 
@@ -55,7 +47,7 @@ def gather_plane(
     sx, sy = spacing[0], spacing[1]
     p0 = p1 = p2 = p3 = p4 = p5 = p6 = 0.0
     for i in range(n):
-        record = records[i]
+        record = projections[i]
         m0, m1, m2, m3, m4, m5 = pair_moments(record, cut, n_x, n_y, image)
         j = record.gaussian
         mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(shapes, j, r, t, psf)
@@ -65,9 +57,9 @@ def gather_plane(
         over_det = 1.0 / (cxx * cyy - cxy * cxy)
         ixx, ixy, iyy = cyy * over_det, -cxy * over_det, cxx * over_det
         g0 = float(record.unit) * m0
-        height = float(record.unit) * peak[j]
+        height = float(record.unit) * amplitude[j]
         whole = height * m0
-        amplitude = whole if exact else 0.0
+        attenuation = whole if exact else 0.0
         # dL/dcentre = C^-1 M1, dL/dC = (C^-1 M2 C^-1 - M0 C^-1) / 2
         hx, hy = height * sx, height * sy
         gx, gy = hx * m1, hy * m2
@@ -75,15 +67,15 @@ def gather_plane(
         dx, dy = ixx * gx + ixy * gy, ixy * gx + iyy * gy
         axx, axy = ixx * gxx + ixy * gxy, ixx * gxy + ixy * gyy
         ayx, ayy = ixy * gxx + iyy * gxy, ixy * gxy + iyy * gyy
-        txx = 0.5 * (axx * ixx + axy * ixy - amplitude * ixx)
-        txy = 0.5 * (axx * ixy + axy * iyy - amplitude * ixy)
-        tyy = 0.5 * (ayx * ixy + ayy * iyy - amplitude * iyy)
+        txx = 0.5 * (axx * ixx + axy * ixy - attenuation * ixx)
+        txy = 0.5 * (axx * ixy + axy * iyy - attenuation * ixy)
+        tyy = 0.5 * (ayx * ixy + ayy * iyy - attenuation * iyy)
         # back through k, to S and m
         wx, wy = txx * kx + txy * ky, txy * kx + tyy * ky
         dkx, dky = -mz * dx - 2.0 * szz * wx, -mz * dy - 2.0 * szz * wy
         dz = -(kx * dx + ky * dy) - whole * mz * iz
         txz, tyz = 0.5 * dkx * iz, 0.5 * dky * iz
-        tzz = 0.5 * iz * (whole * mz * mz * iz - amplitude) - (wx * kx + wy * ky) - (dkx * kx + dky * ky) * iz
+        tzz = 0.5 * iz * (whole * mz * mz * iz - attenuation) - (wx * kx + wy * ky) - (dkx * kx + dky * ky) * iz
         world_x = r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz
         world_y = r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz
         world_z = r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz
@@ -108,7 +100,7 @@ def gather_plane(
         q1 = r[2, 0] * txy + r[2, 1] * tyy + r[2, 2] * tyz
         q2 = r[2, 0] * txz + r[2, 1] * tyz + r[2, 2] * tzz
         out[9] += q0 * r[2, 0] + q1 * r[2, 1] + q2 * r[2, 2]
-        out[10] += amplitude
+        out[10] += attenuation
         if with_pose:
             # body-frame turn dL/dw = dL/dm x m + 2 (A_23, A_31, A_12), A = T S' - S' T, S' = S - D
             ux, uy, uz = sxx - psf[0], syy - psf[1], szz - psf[2]
@@ -133,35 +125,73 @@ def gather_plane(
 
 @numba.njit(parallel=True, cache=True)
 def backward(
-    shapes, peak, rotation, center, gain, psf, shape, spacing, offset, start, order, cut, exact, images,
-    records, weight, buffers, plane_gradient,
-):  # fmt: skip
+    shapes,
+    amplitude,
+    rotation,
+    center,
+    gain,
+    psf,
+    shape,
+    spacing,
+    offset,
+    start,
+    order,
+    cut,
+    exact,
+    images,
+    projections,
+    weight,
+    buffers,
+    plane_gradient,
+):
     """Gradients of sum(weight * pixels) by the moments of each pair.
 
     buffers [n_workers, N, 11] and plane_gradient [K, 7] are added to; columns as in `kernels`.
     """
     n_workers = len(images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], records[worker]
+        image, mine = images[worker], projections[worker]
         for k in range(worker, len(rotation), n_workers):
             n_x, n_y = shape[k, 0], shape[k, 1]
             load(image, weight, offset[k], n_x, n_y)
             n = set_up_plane(
-                shapes, order, start[k], start[k + 1], rotation[k], center[k], psf[k], shape[k], spacing[k],
-                gain[k], cut, exact, mine,
-            )  # fmt: skip
+                shapes,
+                order,
+                start[k],
+                start[k + 1],
+                rotation[k],
+                center[k],
+                psf[k],
+                shape[k],
+                spacing[k],
+                gain[k],
+                cut,
+                exact,
+                mine,
+            )
             gather_plane(
-                mine, n, shapes, peak, rotation[k], center[k], psf[k], shape[k], spacing[k], cut, exact,
-                image, buffers[worker], plane_gradient[k], True,
-            )  # fmt: skip
+                mine,
+                n,
+                shapes,
+                amplitude,
+                rotation[k],
+                center[k],
+                psf[k],
+                shape[k],
+                spacing[k],
+                cut,
+                exact,
+                image,
+                buffers[worker],
+                plane_gradient[k],
+                True,
+            )
 
 
 @numba.njit(forceinline=True)
 def _quaternion_gradient(quaternion, j, rows, out):
     """Gradient in quaternion j of sum(rows * R), which the normalisation keeps at right angles to it."""
-    w, x, y, z = (
-        float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]),
-    )  # fmt: skip
+    w, x, y, z = (float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]))
     length = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
@@ -177,12 +207,12 @@ def _quaternion_gradient(quaternion, j, rows, out):
 
 
 @numba.njit
-def _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
+def _shape_gradient(j, log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad):
     for worker in range(1, len(buffers)):
         for column in range(buffers.shape[2]):
             buffers[0, j, column] += buffers[worker, j, column]
     g = buffers[0, j]
-    peak_grad[j] = g[0]
+    amplitude_grad[j] = g[0]
     mean_grad[j, 0], mean_grad[j, 1], mean_grad[j, 2] = g[1], g[2], g[3]
     r = quaternion_matrix(quaternion, j)
     v0 = 2 * math.exp(2 * float(log_scale[j, 0]))
@@ -207,11 +237,11 @@ def _along(t, r, a):
 
 
 @numba.njit(parallel=True, cache=True)
-def shape_gradients(log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad):
+def shape_gradients(log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad):
     """Sum the workers' buffers (into the first) and turn dL/dSigma into gradients of log-scales and turns.
 
     Sigma = M M^T with M = R diag(s): dL/dM = 2 T M, dL/dln s_a = sum_i dM_ia M_ia (+ the log-volume's),
     dL/dR = dM diag(s).
     """
     for j in numba.prange(len(log_scale)):
-        _shape_gradient(j, log_scale, quaternion, buffers, peak_grad, mean_grad, scale_grad, quaternion_grad)
+        _shape_gradient(j, log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad)

@@ -38,9 +38,13 @@ def _mark(x, y, z, xx, xy, xz, yy, yz, zz, r, t, psf, half, cut, marks):
             a, b, c = r[0, axis], r[1, axis], r[2, axis]
             m = dx * a + dy * b + dz * c
             s = (
-                xx[j] * a * a + yy[j] * b * b + zz[j] * c * c
-                + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c) + psf[axis] + spare
-            )  # fmt: skip
+                xx[j] * a * a
+                + yy[j] * b * b
+                + zz[j] * c * c
+                + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c)
+                + psf[axis]
+                + spare
+            )
             reach = max(abs(m) - slack - half[axis], f32(0.0))
             touches &= reach * reach <= cut * s
         marks[j] = touches
@@ -59,9 +63,22 @@ def find(columns, rotation, center, psf, half, cut, marks, start, order):
         mark = marks[worker]
         for k in range(worker, n_planes, n_workers):
             _mark(
-                columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[6],
-                columns[7], columns[8], rotation[k], center[k], psf[k], half[k], cut, mark,
-            )  # fmt: skip
+                columns[0],
+                columns[1],
+                columns[2],
+                columns[3],
+                columns[4],
+                columns[5],
+                columns[6],
+                columns[7],
+                columns[8],
+                rotation[k],
+                center[k],
+                psf[k],
+                half[k],
+                cut,
+                mark,
+            )
             if counting:
                 n = 0
                 for j in range(len(mark)):

@@ -16,7 +16,7 @@ from g3r.gaussians.simd import N_LANES
 
 
 @dataclass(frozen=True)
-class PairList:
+class OverlapList:
     """Gaussians of plane k: `gaussian[start[k] : start[k + 1]]`, ascending."""
 
     start: NDArray[np.int64]
@@ -31,18 +31,18 @@ class PairList:
         return int(np.diff(self.start).max(initial=0))
 
 
-def find_pairs(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> PairList:
+def find_overlaps(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> OverlapList:
     """All pairs whose ellipsoid at the cut-off may meet the plane's rectangle.
 
     Pass a larger cut-off than the renderer's to keep the list valid while Gaussians and poses move a little:
     pairs that no longer touch cost a set-up and no pixels.
     """
     shapes = CloudArrays.of(cloud).shapes
-    finder = PairFinder(len(cloud))
+    finder = OverlapFinder(len(cloud))
     return finder.find(shapes, planes, planes.rotation, planes.center_mm - cloud.origin_mm, cutoff_sigma)
 
 
-class PairFinder:
+class OverlapFinder:
     """Finds pairs again and again, in memory taken once."""
 
     def __init__(self, n_gaussians: int) -> None:
@@ -57,7 +57,7 @@ class PairFinder:
         rotation: NDArray[np.float64],
         center_mm: NDArray[np.float64],
         cutoff_sigma: float,
-    ) -> PairList:
+    ) -> OverlapList:
         """The pairs of derived shapes [N, 10] with planes; the list is valid until the next call.
 
         Args:
@@ -82,27 +82,25 @@ class PairFinder:
             self.order = np.empty(n_pairs + n_pairs // 8, np.int32)
         if n_pairs:
             kernels_pairs.find(*arguments, self.order[:n_pairs])  # type: ignore[call-arg]
-        return PairList(start, self.order[:n_pairs])
+        return OverlapList(start, self.order[:n_pairs])
 
 
 @dataclass(frozen=True)
 class CloudArrays:
-    """What the kernels read of a cloud: derived shapes [N, 10] float64, peaks, and what they come from."""
+    """What the kernels read of a cloud: derived shapes [N, 10] float64, amplitudes, and what they come from."""
 
     shapes: NDArray[np.float64]
-    peak: NDArray[np.float32]
+    amplitude: NDArray[np.float32]
     log_scale: NDArray[np.floating]
     quaternion: NDArray[np.floating]
 
     @classmethod
     def of(cls, cloud: GaussianCloud) -> CloudArrays:
         """Views and derived arrays of a cloud on the CPU."""
-        mean, log_scale, quaternion, peak = (
-            np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters
-        )
+        mean, log_scale, quaternion, amplitude = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters)
         shapes = np.empty((len(mean), kernels.SHAPE_COLUMNS))
         kernels.derive_shapes(mean, log_scale, quaternion, shapes)
-        return cls(shapes, peak.astype(np.float32), log_scale, quaternion)
+        return cls(shapes, amplitude.astype(np.float32), log_scale, quaternion)
 
 
 @dataclass(frozen=True)
@@ -110,14 +108,14 @@ class Workspace:
     """Scratch space of the kernels, a row for each worker: a padded image, and the records of a plane."""
 
     images: NDArray[np.float32]
-    records: NDArray[np.void]
+    projections: NDArray[np.void]
 
     @classmethod
-    def of(cls, planes: Planes, most_pairs: int) -> Workspace:
+    def of(cls, planes: Planes, max_pairs: int) -> Workspace:
         """Room for the largest plane and the longest list of pairs of one plane."""
         n_workers = numba.get_num_threads()
         padded = planes.shape[:, 0] * (planes.shape[:, 1] + N_LANES) + N_LANES
         return cls(
             np.zeros((n_workers, int(padded.max(initial=1))), np.float32),
-            np.zeros((n_workers, most_pairs), kernels.PAIR),
+            np.zeros((n_workers, max_pairs), kernels.PAIR),
         )

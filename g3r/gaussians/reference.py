@@ -19,7 +19,7 @@ def render_reference(
     planes: Planes,
     twist: Tensor | None = None,
     log_gain: Tensor | None = None,
-    amplitude: str = "exact",
+    attenuation: str = "exact",
 ) -> Tensor:
     """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without any cut-off; see `g3r.gaussians.render`.
 
@@ -30,13 +30,13 @@ def render_reference(
     Cholesky factor of S would lose twice the digits and fail in float32 at axis ratios of a few thousand.
     """
     with torch.autocast(cloud.mean_mm.device.type, enabled=False):
-        return _render(cloud, planes, twist, log_gain, amplitude)
+        return _render(cloud, planes, twist, log_gain, attenuation)
 
 
 def _render(
-    cloud: GaussianCloud, planes: Planes, twist: Tensor | None, log_gain: Tensor | None, amplitude: str
+    cloud: GaussianCloud, planes: Planes, twist: Tensor | None, log_gain: Tensor | None, attenuation: str
 ) -> Tensor:
-    mean, log_scale, quaternion, peak = cloud.parameters
+    mean, log_scale, quaternion, amplitude = cloud.parameters
     like: dict[str, Any] = {"dtype": mean.dtype, "device": mean.device}
     exact: dict[str, Any] = {"dtype": torch.float64, "device": mean.device}
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None, :]
@@ -53,10 +53,10 @@ def _render(
         psf_sigma = torch.as_tensor(np.sqrt(planes.psf_var_mm2[k]), **like)
         wide = torch.cat([rotation.T @ root, torch.diag(psf_sigma).expand(len(mean), 3, 3)], 2)
         upper = torch.linalg.qr(wide.transpose(1, 2))[1]
-        if amplitude == "exact":
+        if attenuation == "exact":
             factor = (log_scale.sum(1) - upper.diagonal(dim1=1, dim2=2).abs().log().sum(1)).exp()
         else:
-            factor = torch.ones_like(peak)
+            factor = torch.ones_like(amplitude)
         gain = 1.0 if log_gain is None else log_gain[k].to(**like).exp()
         block = uv[planes.offset[k] : planes.offset[k + 1]]
         step = max(1, PAIRS_AT_ONCE // max(1, len(mean)))
@@ -65,7 +65,7 @@ def _render(
             d = u[None] - local_mean[:, None]  # [N, p, 3]
             white = torch.linalg.solve_triangular(upper.mT, d.transpose(1, 2), upper=False)
             value = torch.exp(-0.5 * (white * white).sum(1))
-            pixels.append(gain * ((peak * factor) @ value))
+            pixels.append(gain * ((amplitude * factor) @ value))
     return torch.cat(pixels) if pixels else mean.new_zeros(0)
 
 

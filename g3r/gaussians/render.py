@@ -13,17 +13,17 @@ from torch import Tensor
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import kernels, kernels_backward
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.overlap import CloudArrays, PairList, Workspace, find_pairs
+from g3r.gaussians.overlap import CloudArrays, OverlapList, Workspace, find_overlaps
 from g3r.gaussians.reference import render_reference
 from g3r.geometry import RigidPose
 
 CUTOFF_SIGMA = 3.2
-"""Gaussians end here by default; at 3.2 sigma a Gaussian has fallen to 0.6 % of its peak."""
+"""Gaussians end here by default; at 3.2 sigma a Gaussian has fallen to 0.6 % of its amplitude."""
 
-LARGEST_CUTOFF_SIGMA = 6.0
+MAX_CUTOFF_SIGMA = 6.0
 """The polynomial exponential holds to here (e = -18)."""
 
-AMPLITUDES = ("exact", "printed")
+ATTENUATIONS = ("exact", "printed")
 
 
 def render(
@@ -33,9 +33,9 @@ def render(
     twist: Tensor | None = None,
     log_gain: Tensor | None = None,
     backend: str = "numba",
-    amplitude: str = "exact",
+    attenuation: str = "exact",
     cutoff_sigma: float = CUTOFF_SIGMA,
-    pairs: PairList | None = None,
+    pairs: OverlapList | None = None,
 ) -> Tensor:
     """Pixels of planes through their PSF, differentiable in cloud, poses and gains.
 
@@ -49,9 +49,9 @@ def render(
         log_gain: [K] logarithm of the intensity factor of each plane.
         backend: "numba" (CPU, gradients by moments), or "reference" (plain torch, dense, any dtype, no
             cut-off).
-        amplitude: "exact", or "printed" for B = 1 as G3R Eq. 5 stands in print (for comparison).
+        attenuation: "exact", or "printed" for B = 1 as G3R Eq. 5 stands in print (for comparison).
         cutoff_sigma: where a Gaussian ends, up to 6 (numba only).
-        pairs: list from `find_pairs`, to be used again while nothing moves far (numba only).
+        pairs: list from `find_overlaps`, to be used again while nothing moves far (numba only).
 
     Returns:
         [P] pixels, plane after plane, in C order inside a plane.
@@ -62,31 +62,27 @@ def render(
 
     Source: G3R Eq. 3 and 5 with the amplitude factor (docs/method.md); gradients derived there.
     """
-    if amplitude not in AMPLITUDES:
-        raise ValueError(f"amplitude {amplitude!r}; expected one of {AMPLITUDES}")
+    if attenuation not in ATTENUATIONS:
+        raise ValueError(f"amplitude {attenuation!r}; expected one of {ATTENUATIONS}")
     if cloud.mean_mm.dtype not in (torch.float32, torch.float64):
-        raise ValueError(
-            f"Gaussians in {cloud.mean_mm.dtype}; expected float32 or float64: no geometry in less"
-        )
+        raise ValueError(f"Gaussians in {cloud.mean_mm.dtype}; expected float32 or float64: no geometry in less")
     for name, change in (("twist", twist), ("log_gain", log_gain)):
         if change is not None and not bool(torch.isfinite(change.detach()).all()):
             raise ValueError(f"{name} holds values that are not finite")
     if backend == "reference":
-        return render_reference(cloud, planes, twist, log_gain, amplitude)
+        return render_reference(cloud, planes, twist, log_gain, attenuation)
     if backend != "numba":
         raise ValueError(f"backend {backend!r}; expected 'numba' or 'reference'")
-    if not 0 < cutoff_sigma <= LARGEST_CUTOFF_SIGMA:
-        raise ValueError(f"cutoff_sigma {cutoff_sigma}; expected above 0 and at most {LARGEST_CUTOFF_SIGMA}")
+    if not 0 < cutoff_sigma <= MAX_CUTOFF_SIGMA:
+        raise ValueError(f"cutoff_sigma {cutoff_sigma}; expected above 0 and at most {MAX_CUTOFF_SIGMA}")
     if len(cloud) and len(planes):
         widest = float(cloud.log_scale.detach().max().double().exp() / planes.spacing_mm.min())
-        if widest > kernels.MOST_PIXELS / 10:
-            raise ValueError(
-                f"a sigma is {widest:.2g} pixels wide; expected at most {kernels.MOST_PIXELS / 10:g}"
-            )
+        if widest > kernels.MAX_PIXELS / 10:
+            raise ValueError(f"a sigma is {widest:.2g} pixels wide; expected at most {kernels.MAX_PIXELS / 10:g}")
     if pairs is None:
-        pairs = find_pairs(cloud, moved_planes(planes, twist), cutoff_sigma)
+        pairs = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
     pixels = _Render.apply(
-        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, amplitude == "exact"
+        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, attenuation == "exact"
     )
     return pixels
 
@@ -101,13 +97,20 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
 
 
 def plane_arguments(
-    planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: PairList
+    planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: OverlapList
 ) -> tuple[Any, ...]:
     """Arguments of the kernels that describe planes and pairs."""
     return (
-        planes.rotation, center, gain, planes.psf_var_mm2, planes.shape, planes.spacing_mm, planes.offset,
-        pairs.start, pairs.gaussian,
-    )  # fmt: skip
+        planes.rotation,
+        center,
+        gain,
+        planes.psf_var_mm2,
+        planes.shape,
+        planes.spacing_mm,
+        planes.offset,
+        pairs.start,
+        pairs.gaussian,
+    )
 
 
 class _Render(torch.autograd.Function):
@@ -117,52 +120,58 @@ class _Render(torch.autograd.Function):
         mean: Tensor,
         log_scale: Tensor,
         quaternion: Tensor,
-        peak: Tensor,
+        amplitude: Tensor,
         twist: Tensor | None,
         log_gain: Tensor | None,
         origin_mm: NDArray[np.float64],
         planes: Planes,
-        pairs: PairList,
+        pairs: OverlapList,
         cutoff_sigma: float,
         exact: bool,
     ) -> Tensor:
         moved = moved_planes(planes, twist)
         gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
-        arrays = CloudArrays.of(GaussianCloud(mean, log_scale, quaternion, peak, origin_mm))
+        arrays = CloudArrays.of(GaussianCloud(mean, log_scale, quaternion, amplitude, origin_mm))
         described = plane_arguments(moved, moved.center_mm - origin_mm, gain, pairs)
         work = Workspace.of(planes, pairs.most)
         out = np.zeros(planes.n_pixels, np.float32)
         kernels.forward(  # type: ignore[call-arg]
-            arrays.shapes, arrays.peak, *described, cutoff_sigma**2, exact, work.images, work.records, out
+            arrays.shapes, arrays.amplitude, *described, cutoff_sigma**2, exact, work.images, work.projections, out
         )
         ctx.saved = (arrays, described, work, cutoff_sigma, exact, twist)
-        ctx.like = [
-            None if p is None else p.dtype for p in (mean, log_scale, quaternion, peak, twist, log_gain)
-        ]
+        ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, amplitude, twist, log_gain)]
         return torch.from_numpy(out).to(mean.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         arrays, described, work, cutoff_sigma, exact, twist = ctx.saved
-        n, n_planes = len(arrays.peak), len(described[0])
+        n, n_planes = len(arrays.amplitude), len(described[0])
         buffers = np.zeros((len(work.images), n, kernels.N_GRADIENTS))
         plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
         weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
         kernels_backward.backward(  # type: ignore[call-arg]
-            arrays.shapes, arrays.peak, *described, cutoff_sigma**2, exact, work.images, work.records, weight,
-            buffers, plane_gradient,
-        )  # fmt: skip
-        peak, mean = np.empty(n), np.empty((n, 3))
+            arrays.shapes,
+            arrays.amplitude,
+            *described,
+            cutoff_sigma**2,
+            exact,
+            work.images,
+            work.projections,
+            weight,
+            buffers,
+            plane_gradient,
+        )
+        amplitude, mean = np.empty(n), np.empty((n, 3))
         scale, quaternion = np.empty((n, 3)), np.empty((n, 4))
         kernels_backward.shape_gradients(
-            arrays.log_scale, arrays.quaternion, buffers, peak, mean, scale, quaternion
+            arrays.log_scale, arrays.quaternion, buffers, amplitude, mean, scale, quaternion
         )
         pose = plane_gradient[:, :6]
         if twist is not None:
             # the kernels differentiate in a turn on top of the present one: exp(w + dw) = exp(w) exp(J_r dw)
             jacobian = right_jacobian(twist.detach().double().numpy()[:, :3])
             pose = np.concatenate([np.einsum("kji,kj->ki", jacobian, pose[:, :3]), pose[:, 3:]], axis=1)
-        arrays_out = (mean, scale, quaternion, peak, pose, plane_gradient[:, 6])
+        arrays_out = (mean, scale, quaternion, amplitude, pose, plane_gradient[:, 6])
         gradients = [
             None if dtype is None else torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
             for array, dtype in zip(arrays_out, ctx.like, strict=True)

@@ -1,4 +1,4 @@
-"""Where the first Gaussians stand: on a lattice in the foreground, flattened across edges."""
+"""Where the first Gaussians stand: on a lattice in the foreground, bias_corrected across edges."""
 
 from __future__ import annotations
 
@@ -14,20 +14,17 @@ from g3r.geometry import VolumeGrid
 SCALE_PER_SPACING = 0.6
 """Sigma of a seed over the lattice spacing: neighbours overlap so that a constant comes out flat to 2 %."""
 
-MOST_ANISOTROPY = 1.6
+MAX_ANISOTROPY = 1.6
 """Largest ratio of a seed's sigma to that of a round one of equal volume."""
 
 
 def seed_cloud(
-    volume: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    grid: VolumeGrid,
-    spacing_mm: float,
+    volume: NDArray[np.float32], mask: NDArray[np.bool_], grid: VolumeGrid, spacing_mm: float
 ) -> GaussianCloud:
     """Gaussians on a body-centred lattice inside the mask, shaped by the local structure of a volume.
 
-    Each Gaussian is flattened across the edge that it stands on (structure tensor), keeping its
-    volume. Peaks are first guesses that reproduce the local mean.
+    Each Gaussian is bias_corrected across the edge that it stands on (structure tensor), keeping its
+    volume. Amplitudes are first guesses that reproduce the local mean.
 
     Args:
         volume: [I, J, K], of order one.
@@ -44,23 +41,21 @@ def seed_cloud(
     if not mask.any():
         raise ValueError("the foreground is empty")
     voxel = float(grid.spacing_mm.mean())
-    gradient = np.stack(
-        [gaussian_filter(volume, 1.0, order=np.eye(3, dtype=int)[a]) / voxel for a in range(3)]
-    )
+    gradient = np.stack([gaussian_filter(volume, 1.0, order=np.eye(3, dtype=int)[a]) / voxel for a in range(3)])
     strength = gaussian_filter(np.sqrt((gradient**2).sum(0)), spacing_mm / voxel)
     corners = grid.world(np.argwhere(mask))
     low, high = corners.min(0), corners.max(0)
     points = _inside(_lattice(low, high, spacing_mm), mask, grid)
     log_scale, quaternion = _shapes(gradient, grid, points, spacing_mm, strength)
-    # a lattice of Gaussians of mean volume h^3 adds up to peak (2 pi)^1.5 s1 s2 s3 / h^3
+    # a lattice of Gaussians of mean volume h^3 adds up to amplitude (2 pi)^1.5 s1 s2 s3 / h^3
     overlap = (2 * np.pi) ** 1.5 * np.exp(log_scale.sum(1)) / spacing_mm**3
-    peak = _sample(volume, grid, points) / overlap
+    amplitude = _sample(volume, grid, points) / overlap
     origin = grid.center_mm
 
     def tensor(array: NDArray[np.float64]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
-    return GaussianCloud(tensor(points - origin), tensor(log_scale), tensor(quaternion), tensor(peak), origin)
+    return GaussianCloud(tensor(points - origin), tensor(log_scale), tensor(quaternion), tensor(amplitude), origin)
 
 
 def _lattice(low: NDArray[np.float64], high: NDArray[np.float64], spacing_mm: float) -> NDArray[np.float64]:
@@ -78,9 +73,7 @@ def _inside(points: NDArray[np.float64], mask: NDArray[np.bool_], grid: VolumeGr
     return points[ok]
 
 
-def _sample(
-    volume: NDArray[np.floating], grid: VolumeGrid, points: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _sample(volume: NDArray[np.floating], grid: VolumeGrid, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return map_coordinates(volume, grid.index(points).T, order=1, mode="nearest", output=np.float64)
 
 
@@ -105,7 +98,7 @@ def _shapes(
     floor = 0.1 * float(np.mean(strength**2)) + 1e-12
     ratio = (energy + floor) ** -0.25
     ratio /= np.exp(np.log(ratio).mean(1, keepdims=True))
-    ratio = np.clip(ratio, 1 / MOST_ANISOTROPY, MOST_ANISOTROPY)
+    ratio = np.clip(ratio, 1 / MAX_ANISOTROPY, MAX_ANISOTROPY)
     ratio /= np.exp(np.log(ratio).mean(1, keepdims=True))
     vectors[:, :, 2] *= np.sign(np.linalg.det(vectors))[:, None]
     xyzw = Rotation.from_matrix(vectors).as_quat()

@@ -38,9 +38,7 @@ class VolumeGrid:
         object.__setattr__(self, "affine", affine)
 
     @classmethod
-    def isotropic(
-        cls, low_mm: ArrayLike, high_mm: ArrayLike, spacing_mm: float, margin_mm: float = 0.0
-    ) -> VolumeGrid:
+    def isotropic(cls, low_mm: ArrayLike, high_mm: ArrayLike, spacing_mm: float, margin_mm: float = 0.0) -> VolumeGrid:
         """The axis-aligned RAS grid with cubic voxels that covers the box from low to high plus a margin."""
         low = np.asarray(low_mm, dtype=np.float64) - margin_mm
         high = np.asarray(high_mm, dtype=np.float64) + margin_mm

@@ -18,15 +18,15 @@ from g3r.errors import NumericalError
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
-from g3r.output.record import left_out_terms, run_record
+from g3r.output.record import inactive_terms, run_record
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.time_budget import TimeBudget
 from g3r.pose_network.checkpoint import PoseCheckpoint
 from g3r.prior.checkpoint import PriorCheckpoint
-from g3r.registration import MotionEstimate
-from g3r.registration.quality import StackConfidence, registration_trusted
-from g3r.run.allocator import give_back
+from g3r.registration import Registration
+from g3r.registration.quality import StackQuality, registration_reliable
+from g3r.run.allocator import release_memory
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
 from g3r.uncertainty import estimate_uncertainty
 from g3r.uncertainty.prior_share import estimate_prior_share, on_grid
@@ -68,8 +68,8 @@ class RunSoFar:
     settings: ReconstructionSettings
     prior_meta: PriorCheckpoint | None
     pose_meta: PoseCheckpoint | None
-    motion: MotionEstimate
-    confidences: list[StackConfidence]
+    motion: Registration
+    qualities: list[StackQuality]
     volume: PriorVolume
     intensity: float
     stages: Stages
@@ -106,23 +106,35 @@ def finished(run: RunSoFar, first: PriorCloud, fit: SliceFit) -> ReconstructionR
     if settings.use_prior:
         with clock("prior share"):
             prior_share = estimate_prior_share(
-                fit, start.density, start.grid, mask, grid, stage_rng(settings.seed, "prior share"),
-                settings.share_probes, record_bytes=settings.slice_stage.record_bytes,
-            )  # fmt: skip
-            give_back()
+                fit,
+                start.density,
+                start.grid,
+                mask,
+                grid,
+                stage_rng(settings.seed, "prior share"),
+                settings.share_probes,
+                projection_bytes=settings.slice_stage.projection_bytes,
+            )
+            release_memory()
     with clock("uncertainty"):
         uncertainty = estimate_uncertainty(
-            volume, mask, grid, fit, prior=run.volume.prior, density=start.density, prior_grid=start.grid,
-            prior_share=prior_share, with_prior=settings.use_prior, intensity=run.intensity,
-            trusted=registration_trusted(run.confidences),
-        )  # fmt: skip
+            volume,
+            mask,
+            grid,
+            fit,
+            prior=run.volume.prior,
+            density=start.density,
+            prior_grid=start.grid,
+            prior_share=prior_share,
+            with_prior=settings.use_prior,
+            intensity=run.intensity,
+            reliable=registration_reliable(run.qualities),
+        )
     record = _record(run, first, fit) | {"partial": False, "uncertainty": uncertainty.record}
     return _result(run, fit, volume, mask, grid, record, uncertainty.expected_error, prior_share)
 
 
-def cut_short(
-    run: RunSoFar, cut: Cut, first: PriorCloud | None, fit: SliceFit | None
-) -> ReconstructionResult:
+def cut_short(run: RunSoFar, cut: Cut, first: PriorCloud | None, fit: SliceFit | None) -> ReconstructionResult:
     """The best volume of a run that was interrupted: what stage 2 of the fit has so far, else the prior.
 
     Args:
@@ -175,17 +187,26 @@ def _rendered(
 def _record(run: RunSoFar, first: PriorCloud, fit: SliceFit) -> dict[str, Any]:
     settings, stages = run.settings, run.stages
     record = run_record(
-        settings, run.prior_meta, run.pose_meta, run.stacks, run.volume.start.slices, run.motion,
-        run.confidences, fit, stages.clock, run.notes, run.warnings,
-    )  # fmt: skip
+        settings,
+        run.prior_meta,
+        run.pose_meta,
+        run.stacks,
+        run.volume.start.slices,
+        run.motion,
+        run.qualities,
+        fit,
+        stages.clock,
+        run.notes,
+        run.warnings,
+    )
     record["resumed"] = stages.resumed
     record["time_budget"] = run.budget.record() if run.budget else None
     record["gaussians"] = first.counts | {"n_final": len(fit.cloud)}
-    record["left_out"] = left_out_terms(run.volume.start.slices, settings, first.counts)
+    record["left_out"] = inactive_terms(run.volume.start.slices, settings, first.counts)
     record["loss"] = {"fit to prior": first.history, "fit to slices": fit.history}
-    if record["n_steps_back"]:
+    if record["n_rollbacks"]:
         run.warnings.append(
-            f"the loss of the fit rose: {record['n_steps_back']} times it went back to its best state and on "
+            f"the loss of the fit rose: {record['n_rollbacks']} times it went back to its best state and on "
             "with shorter steps; look at the volume"
         )
     for warning in run.warnings:
@@ -205,7 +226,20 @@ def _result(
 ) -> ReconstructionResult:
     start, intensity = run.volume.start, np.float32(run.intensity)
     return ReconstructionResult(
-        volume * intensity, mask, grid, run.volume.prior * intensity, start.coarse * intensity,
-        start.density, start.grid, fit.cloud, run.intensity, fit.slices, fit.gain, fit.weight, run.motion.ncc,
-        uncertainty, prior_share, record,
-    )  # fmt: skip
+        volume * intensity,
+        mask,
+        grid,
+        run.volume.prior * intensity,
+        start.coarse * intensity,
+        start.density,
+        start.grid,
+        fit.cloud,
+        run.intensity,
+        fit.slices,
+        fit.gain,
+        fit.weight,
+        run.motion.ncc,
+        uncertainty,
+        prior_share,
+        record,
+    )

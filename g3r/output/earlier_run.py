@@ -15,18 +15,18 @@ from g3r._version import __version__
 from g3r.errors import InputError
 from g3r.planning.presets import ReconstructionSettings
 
-LARGEST_RECORD_BYTES = 50_000_000
+MAX_RECORD_BYTES = 50_000_000
 
 
 @dataclass(frozen=True)
-class FileMark:
+class FileHash:
     """A file by its name and the SHA-256 of its bytes."""
 
     name: str
     sha256: str
 
     @classmethod
-    def of(cls, path: str | os.PathLike[str]) -> FileMark:
+    def of(cls, path: str | os.PathLike[str]) -> FileHash:
         """Of a file.
 
         Raises:
@@ -46,12 +46,12 @@ class Inputs:
     stacks, masks (empty without): one per stack; prior, pose_network: None where not used.
     """
 
-    stacks: tuple[FileMark, ...]
-    masks: tuple[FileMark, ...] = ()
-    prior: FileMark | None = None
-    pose_network: FileMark | None = None
+    stacks: tuple[FileHash, ...]
+    masks: tuple[FileHash, ...] = ()
+    prior: FileHash | None = None
+    pose_network: FileHash | None = None
 
-    def named(self) -> dict[str, FileMark]:
+    def named(self) -> dict[str, FileHash]:
         """All of them, by what they are."""
         marks = {f"stack {n + 1}": mark for n, mark in enumerate(self.stacks)}
         marks |= {f"mask {n + 1}": mark for n, mark in enumerate(self.masks)}
@@ -66,11 +66,11 @@ class Inputs:
     def of_record(cls, record: Mapping[str, Any]) -> Inputs:
         """What `record` gave."""
 
-        def marks(name: str) -> tuple[FileMark, ...]:
-            return tuple(FileMark(**mark) for mark in record[name])
+        def marks(name: str) -> tuple[FileHash, ...]:
+            return tuple(FileHash(**mark) for mark in record[name])
 
-        def mark(name: str) -> FileMark | None:
-            return FileMark(**record[name]) if record[name] else None
+        def mark(name: str) -> FileHash | None:
+            return FileHash(**record[name]) if record[name] else None
 
         return cls(marks("stacks"), marks("masks"), mark("prior"), mark("pose_network"))
 
@@ -112,7 +112,7 @@ def read_run(path: str | os.PathLike[str]) -> EarlierRun:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > LARGEST_RECORD_BYTES:
+        if path.stat().st_size > MAX_RECORD_BYTES:
             raise InputError(f"{path}: is too large for a run.json; pass one that g3r-infer wrote")
         record = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -137,7 +137,7 @@ def read_run(path: str | os.PathLike[str]) -> EarlierRun:
         ) from None
 
 
-def made_of(settings: ReconstructionSettings, inputs: Inputs, **further: object) -> dict[str, str]:
+def provenance(settings: ReconstructionSettings, inputs: Inputs, **further: object) -> dict[str, str]:
     """Everything that decides a result, by name: what a run must have in common with one that it resumes.
 
     Args:

@@ -14,15 +14,15 @@ import numpy as np
 import torch
 
 from g3r._version import __version__
-from g3r.acquisition.planes import SMALLEST_SLICE_PIXELS, Slices
+from g3r.acquisition.planes import MIN_SLICE_PIXELS, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.slice_stage import SliceFit
 from g3r.planning.memory_estimate import peak_bytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.pose_network.checkpoint import PoseCheckpoint
 from g3r.prior.checkpoint import PriorCheckpoint
-from g3r.registration import MotionEstimate
-from g3r.registration.quality import StackConfidence, registration_summary, registration_trusted
+from g3r.registration import Registration
+from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 
 logger = logging.getLogger(__name__)
 
@@ -33,8 +33,8 @@ def run_record(
     pose: PoseCheckpoint | None,
     stacks: Sequence[Stack],
     slices: Slices,
-    motion: MotionEstimate,
-    confidences: list[StackConfidence],
+    motion: Registration,
+    qualities: list[StackQuality],
     fit: SliceFit,
     clock: Clock,
     notes: list[str],
@@ -46,39 +46,30 @@ def run_record(
     place = {int(stack): k for k, stack in enumerate(np.unique(slices.stack_id))}
     return {
         "g3r": __version__,
-        "versions": {
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-        },
+        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         "settings": asdict(settings),
         "prior": asdict(prior) if prior else None,
-        "pose_network": {"training_data": pose.training_data, "g3r_version": pose.g3r_version}
-        if pose
-        else None,
+        "pose_network": {"training_data": pose.training_data, "g3r_version": pose.g3r_version} if pose else None,
         "stacks": [
             {
                 "name": stack.name,
                 "thickness_mm": stack.thickness_mm,
                 "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
                 "n_slices": int(chosen.sum()),
-                "pose_confidence": confidences[n].record(),
+                "pose_confidence": qualities[n].record(),
                 "interleave": motion.interleave[place[n]] if n in place else None,
-                "n_runs": motion.n_runs[place[n]] if n in place else None,
-                "n_doubted_slices": int((fit.weight[chosen] < 0.5).sum()),
+                "n_segments": motion.n_segments[place[n]] if n in place else None,
+                "n_downweighted_slices": int((fit.weight[chosen] < 0.5).sum()),
             }
             for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
         ],
-        "shading": fit.shading,
+        "shading": fit.bias_field,
         "n_gaussians": len(fit.cloud),
-        "n_steps_back": sum("step_back" in entry for entry in fit.history),
-        "registration": {
-            "trusted": registration_trusted(confidences),
-            "summary": registration_summary(confidences),
-        },
+        "n_rollbacks": sum("rollback" in entry for entry in fit.history),
+        "registration": {"trusted": registration_reliable(qualities), "summary": registration_summary(qualities)},
         "motion": {
-            "start": motion.hypothesis,
-            "held_out_correlation_by_start": motion.hypotheses,
+            "start": motion.initialisation,
+            "held_out_correlation_by_start": motion.initialisations,
             "orientation": "scanner" if motion.orientation is None else "standard",
             "correlation_with_mean_head": motion.orientation and motion.orientation.correlation,
             "rounds": motion.history,
@@ -108,7 +99,7 @@ class Clock:
         logger.info("%s: %.1f s", stage, self.seconds[stage])
 
 
-def left_out_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
+def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
     """A line for each stack of which slices were left out for want of masked pixels."""
     lines = []
     for n, stack in enumerate(stacks):
@@ -116,15 +107,11 @@ def left_out_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
         missing = sorted(set(marked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
         if missing:
             numbers = ", ".join(map(str, missing))
-            lines.append(
-                f"{stack.name}: slices {numbers} left out, fewer than {SMALLEST_SLICE_PIXELS} masked pixels"
-            )
+            lines.append(f"{stack.name}: slices {numbers} left out, fewer than {MIN_SLICE_PIXELS} masked pixels")
     return lines
 
 
-def left_out_terms(
-    slices: Slices, settings: ReconstructionSettings, counts: dict[str, Any]
-) -> list[dict[str, str]]:
+def inactive_terms(slices: Slices, settings: ReconstructionSettings, counts: dict[str, Any]) -> list[dict[str, str]]:
     """Which terms of the model are absent, each with the reason: what the data cannot determine.
 
     Args:
@@ -142,7 +129,7 @@ def left_out_terms(
         absent("gain of the slice", "a single slice: its gain cannot be told from the peaks")
     if single:
         absent("shading", "a single stack cannot tell it from anatomy")
-    elif not stage.optimise_shading:
+    elif not stage.optimise_bias_field:
         absent("shading", "switched off in the settings")
     if not stage.optimise_poses:
         absent(

@@ -18,14 +18,12 @@ from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
-from g3r.run.output_folder import UnfinishedRun
+from g3r.run.output_folder import OutputFolder
 
 if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
     from g3r.gaussians import GaussianCloud
 
-SLICE_COLUMNS = (
-    "stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason",
-)  # fmt: skip
+SLICE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason")
 
 FULL_WEIGHT = 0.99
 """Slices trusted less than this get a reason in slices.tsv."""
@@ -35,9 +33,18 @@ LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
 stack's median of pixels is small; one that correlates less than the third with the volume does not fit."""
 
 OUTPUT_NAMES = (
-    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
-    "uncertainty.nii.gz", "prior_share.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
-)  # fmt: skip
+    "volume.nii.gz",
+    "mask.nii.gz",
+    "prior.nii.gz",
+    "coarse.nii.gz",
+    "density.nii.gz",
+    "uncertainty.nii.gz",
+    "prior_share.nii.gz",
+    "gaussians.npz",
+    "slices.tsv",
+    "run.json",
+    "sections.png",
+)
 
 CAPTIONS = {
     "density": "1: covered by one gapless stack",
@@ -88,9 +95,7 @@ class ReconstructionResult:
     record: dict[str, Any] = field(default_factory=dict)
     header_text: HeaderText | None = None
 
-    def save(
-        self, folder: str | os.PathLike[str], *, replace: bool = False, run: UnfinishedRun | None = None
-    ) -> None:
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False, run: OutputFolder | None = None) -> None:
         """Write every output into a folder; it appears whole or not at all.
 
         Args:
@@ -104,18 +109,18 @@ class ReconstructionResult:
         folder = Path(folder)
         if run is None:
             check_output_folder(folder, replace=replace)
-            with UnfinishedRun(folder, OUTPUT_NAMES) as run:
+            with OutputFolder(folder, OUTPUT_NAMES) as run:
                 self.save(folder, replace=replace, run=run)
             return
         check_output_folder(folder, replace=replace)
         try:
-            run.make_room(self._most_bytes() + PICTURE_BYTES)
+            run.make_room(self._max_bytes() + PICTURE_BYTES)
             with run.result() as beside:
                 self._write(beside)
         except OSError as error:
-            raise cannot_be_written(folder, error, self._most_bytes()) from None
+            raise cannot_be_written(folder, error, self._max_bytes()) from None
 
-    def _most_bytes(self) -> int:
+    def _max_bytes(self) -> int:
         """What the files take together if nothing could be compressed, but for the picture and tables."""
         arrays = [getattr(self, one.name) for one in fields(self)]
         arrays += [tensor.numpy() for tensor in self.cloud.parameters]
@@ -152,9 +157,15 @@ class ReconstructionResult:
             on_mask = {name: getattr(self, name) * self.mask for name in ("coarse", "density", "prior")}
             rows = {**on_mask, **rows}
         save_sections(
-            folder / "sections.png", rows, self.grid.affine, self.mask, maps=CAPTIONS, captions=CAPTIONS,
-            ranges=ranges, title=self._title(),
-        )  # fmt: skip
+            folder / "sections.png",
+            rows,
+            self.grid.affine,
+            self.mask,
+            maps=CAPTIONS,
+            captions=CAPTIONS,
+            ranges=ranges,
+            title=self._title(),
+        )
 
     def _title(self) -> str:
         """Of the picture: what must be known before it is believed."""
@@ -190,9 +201,7 @@ class ReconstructionResult:
         return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
 
 
-def check_output_folder(
-    folder: Path, *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()
-) -> None:
+def check_output_folder(folder: Path, *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
     """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
 
     Args:
@@ -209,9 +218,7 @@ def check_output_folder(
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
         if folder.exists() and any(folder.iterdir()) and not replace:
-            raise InputError(
-                f"{folder}: is not empty; pass --force to replace an earlier result, or choose another"
-            )
+            raise InputError(f"{folder}: is not empty; pass --force to replace an earlier result, or choose another")
         target = Path(os.path.realpath(folder))
         parent = next(path for path in target.parents if path.exists())
         if not parent.is_dir():

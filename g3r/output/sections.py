@@ -173,13 +173,7 @@ def _draw(
             extent = (0.0, size_mm[view.across], 0.0, size_mm[view.up])
             colors = "inferno" if one.is_map else "gray"
             image = panel.imshow(
-                shown,
-                cmap=colors,
-                vmin=low,
-                vmax=high,
-                origin="lower",
-                extent=extent,
-                interpolation="bilinear",
+                shown, cmap=colors, vmin=low, vmax=high, origin="lower", extent=extent, interpolation="bilinear"
             )
             slack = (height_mm - size_mm[view.up]) / 2
             panel.set_ylim(-slack, size_mm[view.up] + slack)

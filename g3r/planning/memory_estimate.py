@@ -17,7 +17,7 @@ import numpy as np
 
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.voxel_operator import MOST_SCATTER_BUFFERS
+from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
 from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
@@ -82,21 +82,21 @@ def estimate_memory(
         settings: of the reconstruction.
         n_threads: of the kernels.
         process_bytes: what the process holds before; as it is now when None.
-        at_once: with `give_back_at_once`.
+        at_once: with `release_memory_eagerly`.
     """
     sizes = sizes_of(slices, settings)
     start = held_bytes() if process_bytes is None else process_bytes
-    buffers = min(n_threads, MOST_SCATTER_BUFFERS)
+    buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
     resting = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
     volumes = resting + VOLUMES_PER_VOXEL * voxels
-    records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes)
+    records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
-    prior_records = min(PAIR_BYTES * sizes.n_pairs, settings.prior_stage.record_bytes)
+    prior_records = min(PAIR_BYTES * sizes.n_pairs, settings.prior_stage.projection_bytes)
     outputs = volumes + OUTPUTS_PER_VOXEL * output + cloud
     stages = {
         "loading": resting,
-        "motion": resting + MOTION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
+        "motion": resting + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
         "coarse volumes": volumes + COARSE_PER_PIXEL * n_pixels + 4 * (COARSE_VOLUMES + buffers) * voxels,
     }
     if settings.use_prior:
@@ -110,7 +110,7 @@ def estimate_memory(
     }
     if settings.use_prior:
         stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
-    stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + EVIDENCE_PER_VOXEL * output
+    stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
     stages["writing"] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
 
@@ -119,13 +119,13 @@ def estimate_memory(
 LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 110_000_000, 70_000_000
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
-MOTION_PER_PIXEL = 150
+REGISTRATION_PER_PIXEL = 150
 COARSE_PER_PIXEL, COARSE_VOLUMES = 130, 5
 NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with, and per voxel
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
-SHARE_PER_PIXEL, SHARE_PER_VOXEL, EVIDENCE_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
+SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
 
 
 def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
@@ -145,10 +145,14 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
     per_stack = reach_mm / float(slices.thickness_mm.min())
     in_prior = reach_mm / voxel_mm
     return ProblemSizes(
-        slices.planes.n_pixels, n_stacks, grid.shape, n_voxels,
-        n_voxels * (voxel_mm / settings.resolution_mm) ** 3, n_gaussians,
+        slices.planes.n_pixels,
+        n_stacks,
+        grid.shape,
+        n_voxels,
+        n_voxels * (voxel_mm / settings.resolution_mm) ** 3,
+        n_gaussians,
         n_gaussians * max(n_stacks * per_stack, in_prior),
-    )  # fmt: skip
+    )
 
 
 def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> float:

@@ -21,12 +21,12 @@ from g3r.planning.memory_estimate import (
 )
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
-from g3r.run.allocator import can_give_back_at_once, give_back_at_once
+from g3r.run.allocator import can_release_memory_eagerly, release_memory_eagerly
 
 logger = logging.getLogger(__name__)
 
-LEAST_RECORD_BYTES = 20_000_000
-STAGES_WITH_RECORDS = ("fit to prior", "fit to slices", "prior share")
+MIN_PROJECTION_BYTES = 20_000_000
+STAGES_WITH_PROJECTIONS = ("fit to prior", "fit to slices", "prior share")
 PLANNED_HALO_VOXELS = 48
 PLANNED_TILES = (128, 96, 64, 48, 32, 16)
 """Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""
@@ -37,7 +37,7 @@ class MemoryPlan:
     """Settings that stay below a limit.
 
     settings; their estimate; limit_bytes (None: no limit); what was changed, as sentences for run.json;
-    whether freed memory has to be given back at once (`give_back_at_once`).
+    whether freed memory has to be given back at once (`release_memory_eagerly`).
     """
 
     settings: ReconstructionSettings
@@ -95,9 +95,7 @@ def plan_memory(
     return plan
 
 
-def plan_for_stacks(
-    stacks: Sequence[Stack], settings: ReconstructionSettings, limit_bytes: int | None
-) -> MemoryPlan:
+def plan_for_stacks(stacks: Sequence[Stack], settings: ReconstructionSettings, limit_bytes: int | None) -> MemoryPlan:
     """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
 
     Raises:
@@ -107,7 +105,7 @@ def plan_for_stacks(
 
     plan = plan_memory(slices_from_stacks(stacks), settings, limit_bytes, numba.get_num_threads())
     if plan.at_once:
-        give_back_at_once()
+        release_memory_eagerly()
     logger.info(plan.estimate.line())
     for change in plan.changes:
         logger.info(change)
@@ -115,8 +113,9 @@ def plan_for_stacks(
     if limit_bytes is None and free is not None and more > free:
         logger.warning(
             "%s more of memory needed, %s available: choose a coarser --resolution or --max-memory",
-            gigabytes(more), gigabytes(free),
-        )  # fmt: skip
+            gigabytes(more),
+            gigabytes(free),
+        )
     return plan
 
 
@@ -128,22 +127,20 @@ class Estimator(Protocol):
         ...
 
 
-def _lowered(
-    slices: Slices, settings: ReconstructionSettings, limit: int | None, estimate: Estimator
-) -> MemoryPlan:
+def _lowered(slices: Slices, settings: ReconstructionSettings, limit: int | None, estimate: Estimator) -> MemoryPlan:
     """Settings changed until they need no more than the limit, or nothing is left to change."""
     found = estimate(settings)
     if limit is None or found.peak <= limit:
         return MemoryPlan(settings, found, limit, [])
     changes = []
-    at_once = can_give_back_at_once()
+    at_once = can_release_memory_eagerly()
     if at_once:
         changes.append("memory limit: freed memory is given back at once (slower)")
     stages = estimate(settings, at_once).stages
-    with_records = max(stages.get(name, 0) for name in STAGES_WITH_RECORDS)
-    less = _fewer_records(settings, sizes_of(slices, settings), with_records - limit)
+    with_records = max(stages.get(name, 0) for name in STAGES_WITH_PROJECTIONS)
+    less = _fewer_projections(settings, sizes_of(slices, settings), with_records - limit)
     if less is not settings:
-        kept = less.slice_stage.record_bytes
+        kept = less.slice_stage.projection_bytes
         changes.append(f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)")
     tiled = _smaller_tiles(less, lambda of: estimate(of, at_once).peak, limit)
     if tiled is not less:
@@ -152,18 +149,18 @@ def _lowered(
     return MemoryPlan(tiled, estimate(tiled, at_once), limit, changes, at_once)
 
 
-def _fewer_records(
+def _fewer_projections(
     settings: ReconstructionSettings, sizes: ProblemSizes, excess_bytes: int
 ) -> ReconstructionSettings:
     """Settings whose records of pairs take so many bytes less."""
-    own = round(min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.record_bytes))
-    kept = max(own - max(excess_bytes, 0), LEAST_RECORD_BYTES)
+    own = round(min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes))
+    kept = max(own - max(excess_bytes, 0), MIN_PROJECTION_BYTES)
     if kept >= own:
         return settings
     return replace(
         settings,
-        prior_stage=replace(settings.prior_stage, record_bytes=kept),
-        slice_stage=replace(settings.slice_stage, record_bytes=kept),
+        prior_stage=replace(settings.prior_stage, projection_bytes=kept),
+        slice_stage=replace(settings.slice_stage, projection_bytes=kept),
     )
 
 
@@ -174,9 +171,7 @@ def _smaller_tiles(
     for edge in PLANNED_TILES:
         if peak(best) <= limit:
             break
-        tiled = replace(
-            settings, prior_whole_voxels=0, prior_tile_voxels=edge, prior_halo_voxels=PLANNED_HALO_VOXELS
-        )
+        tiled = replace(settings, prior_whole_voxels=0, prior_tile_voxels=edge, prior_halo_voxels=PLANNED_HALO_VOXELS)
         if peak(tiled) < peak(best):
             best = tiled
     return best

@@ -10,7 +10,7 @@ from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.prior.inference import HALO_VOXELS, MAX_WHOLE_VOXELS, TILE_VOXELS
-from g3r.registration import MotionSettings
+from g3r.registration import RegistrationSettings
 
 ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
 """About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
@@ -26,7 +26,7 @@ class ReconstructionSettings:
             (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
         adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the
             whole lattice of that spacing.
-        motion: registration.
+        registration: poses from the slices.
         prior_stage: stage 1.
         slice_stage: stage 2.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
@@ -42,7 +42,7 @@ class ReconstructionSettings:
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.14
     adaptive: AdaptiveSettings | None = ADAPTIVE
-    motion: MotionSettings = field(default_factory=MotionSettings)
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     prior_views: int = 4
@@ -65,15 +65,15 @@ PRESETS: dict[str, ReconstructionSettings] = {
         adaptive=None,
         prior_views=1,
         share_probes=1,
-        motion=replace(
-            _BALANCED.motion,
+        registration=replace(
+            _BALANCED.registration,
             n_candidates=1200,
             network_as_reserve=True,
             stacks=False,
             attempts=1,
             n_rounds=5,
             finest_voxel_mm=1.6,
-            pixels_at_most=200_000,
+            max_pixels=200_000,
         ),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=40),
@@ -83,7 +83,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=2.5,
         adaptive=None,
         prior_views=1,
-        motion=replace(_BALANCED.motion, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
+        registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),
@@ -93,7 +93,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=1.96,
         adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
         prior_views=8,
-        motion=replace(_BALANCED.motion, n_rounds=20),
+        registration=replace(_BALANCED.registration, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=160),
     ),

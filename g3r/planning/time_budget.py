@@ -24,15 +24,15 @@ from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
 from g3r.planning.presets import PRESETS, ReconstructionSettings
-from g3r.run.deadline import Deadline, Pace
+from g3r.run.deadline import Deadline, LoopRecord
 
 logger = logging.getLogger(__name__)
 
-MOTION_FROM_S = {"draft": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
+REGISTRATION_FROM_S = {"draft": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
 """Budget from which on registration searches as in a preset: about the whole command's own seconds on two
 cores, from one preset to the next."""
 
-MOTION_SHARE = 0.5
+REGISTRATION_SHARE = 0.5
 """Of the time left, the most that registration may take."""
 
 PRIOR_STAGE_SHARE = 0.35
@@ -88,25 +88,26 @@ class TimeBudget:
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
-        return cls(replace(Deadline.after(seconds - spent_s), pace=Pace()), seconds)
+        return cls(replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord()), seconds)
 
     @property
     def missed(self) -> bool:
         """Whether more was taken than promised: a tenth and two seconds over the budget."""
         return self.deadline.remaining_s < -(0.1 * self.given_s + 2.0)
 
-    def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
+    def for_registration(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
         """Settings with the registration of the preset that the budget allows, and its deadline."""
         left = self.deadline.remaining_s
-        name = max((n for n, least in MOTION_FROM_S.items() if self.given_s >= least), key=MOTION_FROM_S.get)  # type: ignore[arg-type]
+        allowed = [name for name, min_s in REGISTRATION_FROM_S.items() if self.given_s >= min_s]
+        name = max(allowed, key=lambda name: REGISTRATION_FROM_S[name])
         chosen = replace(
-            PRESETS[name].motion,
-            standard_orientation=settings.motion.standard_orientation,
-            seed=settings.motion.seed,
+            PRESETS[name].registration,
+            standard_orientation=settings.registration.standard_orientation,
+            seed=settings.registration.seed,
         )
         self.choices["motion"] = name
         logger.info("time budget: %.0f s left, registration as in %s", left, name)
-        return replace(settings, motion=chosen), self.deadline.part(MOTION_SHARE)
+        return replace(settings, registration=chosen), self.deadline.part(REGISTRATION_SHARE)
 
     def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
         """Settings with as many views of the prior as fit, at most those of `accurate`.
@@ -150,16 +151,17 @@ class TimeBudget:
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
             left = max(0.0, self.deadline.remaining_s - reserve_s)
-            fitting = (
-                n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left
-            )
+            fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left)
             chosen = next(fitting, "draft")
             if chosen != "draft":
                 break
         self.choices |= {
-            "fit": chosen, "step_s": round(step_s, 4), "n_gaussians_timed": len(cloud),
-            "reserve_s": round(reserve_s, 2), "left_s": round(left, 2),
-        }  # fmt: skip
+            "fit": chosen,
+            "step_s": round(step_s, 4),
+            "n_gaussians_timed": len(cloud),
+            "reserve_s": round(reserve_s, 2),
+            "left_s": round(left, 2),
+        }
         logger.info("time budget: %.0f s left for the fit, Gaussians as in %s", left, chosen)
         return self._chosen(settings, chosen, probes, reserve_s)
 
@@ -176,18 +178,20 @@ class TimeBudget:
     ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
         preset = PRESETS[name]
         settings = replace(
-            settings, gaussian_spacing_pixels=preset.gaussian_spacing_pixels, adaptive=preset.adaptive,
+            settings,
+            gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
+            adaptive=preset.adaptive,
             share_probes=probes,
-            prior_stage=replace(preset.prior_stage, record_bytes=settings.prior_stage.record_bytes),
+            prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
-        )  # fmt: skip
+        )
         both = self.deadline.part(1.0, reserve_s)
         return settings, both.part(PRIOR_STAGE_SHARE), both
 
     def record(self) -> dict[str, Any]:
         """For run.json."""
-        pace = self.deadline.pace
-        return {"seconds": self.given_s, **self.choices, "pace": pace.loops if pace else []}
+        loop_record = self.deadline.loop_record
+        return {"seconds": self.given_s, **self.choices, "pace": loop_record.loops if loop_record else []}
 
 
 class RepeatedBudget(TimeBudget):
@@ -199,10 +203,10 @@ class RepeatedBudget(TimeBudget):
 
     def __init__(self, record: Mapping[str, Any]) -> None:
         told = {name: value for name, value in record.items() if name not in ("seconds", "pace")}
-        deadline = Deadline(pace=Pace(record["pace"], repeating=True))
+        deadline = Deadline(loop_record=LoopRecord(record["pace"], repeating=True))
         super().__init__(deadline, record["seconds"], told)
 
-    def for_motion(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
+    def for_registration(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
         """The settings as they are."""
         return settings, self.deadline
 
@@ -229,17 +233,17 @@ def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: f
     step = step_s * number**COST_EXPONENT
     adaptive = preset.adaptive
     if adaptive is None:
-        first = PRIOR_STEP * (preset.prior_stage.n_steps + preset.prior_stage.peak_iterations)
+        first = PRIOR_STEP * (preset.prior_stage.n_steps + preset.prior_stage.amplitude_iterations)
     else:
         rounds = adaptive.n_rounds + 1
         last = preset.prior_stage.n_steps if adaptive.last_steps is None else adaptive.last_steps
         first = PRIOR_STEP * (adaptive.n_rounds * adaptive.round_steps + last)
-        first += PEAK_STEP * rounds * adaptive.peak_iterations
+        first += AMPLITUDE_STEP * rounds * adaptive.amplitude_iterations
     stage = preset.slice_stage
-    return step * (first + PEAK_STEP * stage.peak_iterations + stage.n_steps)
+    return step * (first + AMPLITUDE_STEP * stage.amplitude_iterations + stage.n_steps)
 
 
-PRIOR_STEP, PEAK_STEP = 0.35, 0.8
+PRIOR_STEP, AMPLITUDE_STEP = 0.35, 0.8
 """Seconds of a step of stage 1, and of one conjugate-gradient step for the peaks, over a step of stage 2."""
 
 
@@ -249,7 +253,7 @@ def timed_step(cloud: GaussianCloud, slices: Slices, rng: np.random.Generator) -
     ones = np.ones(len(part))
     seconds = []
     for n_steps in (1, 1, 4):  # the first loads the kernels; the last difference leaves out the set-up
-        settings = SliceStageSettings(n_steps=n_steps, peak_iterations=0)
+        settings = SliceStageSettings(n_steps=n_steps, amplitude_iterations=0)
         start = time.perf_counter()
         fit_slices(cloud, part, ones, ones, None, settings, rng)
         seconds.append(time.perf_counter() - start)

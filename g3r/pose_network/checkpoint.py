@@ -37,15 +37,20 @@ FORMAT_VERSION = 1
 TEMPLATE_KEY = "template"
 """The network's buffer of mean heads."""
 
-LARGEST_ARGUMENTS = {
-    "template_shape": 1024, "template_spacing_mm": 100, "image_size": 1024, "pixel_mm": 100, "channels": 4096,
-    "width": 8192, "n_blocks": 64, "n_heads": 64, "n_refinements": 16,
-}  # fmt: skip
+MAX_ARGUMENTS = {
+    "template_shape": 1024,
+    "template_spacing_mm": 100,
+    "image_size": 1024,
+    "pixel_mm": 100,
+    "channels": 4096,
+    "width": 8192,
+    "n_blocks": 64,
+    "n_heads": 64,
+    "n_refinements": 16,
+}
 """Beyond these a network takes minutes to build, and is none of ours."""
 
-_ANOTHER_FILE = (
-    "pass a pose network made by g3r-export, or leave it out to use the weights that ship with g3r"
-)
+_ANOTHER_FILE = "pass a pose network made by g3r-export, or leave it out to use the weights that ship with g3r"
 
 
 @dataclass(frozen=True)
@@ -110,9 +115,7 @@ def save_pose_checkpoint(path: str | Path, network: "PoseNetwork", meta: PoseChe
         InputError: the file cannot be written.
     """
     if dict(meta.network_arguments) != network.arguments():
-        raise ValueError(
-            f"meta describes {dict(meta.network_arguments)}, the network is {network.arguments()}"
-        )
+        raise ValueError(f"meta describes {dict(meta.network_arguments)}, the network is {network.arguments()}")
     weights = {name: _rounded(name, value) for name, value in plain_weights(network).items()}
     template = torch.from_numpy(meta.template.volume).half()
     weights[TEMPLATE_KEY] = template.permute(1, 2, 3, 0).contiguous()
@@ -154,12 +157,12 @@ def load_pose_network(path: str | Path) -> "tuple[PoseNetwork, PoseCheckpoint]":
     from g3r.pose_network.network import PoseNetwork  # MONAI: only once the file has proved good
 
     try:
-        arguments = plain_arguments(content, LARGEST_ARGUMENTS)
+        arguments = plain_arguments(content, MAX_ARGUMENTS)
     except KeyError as error:
         raise InputError(f"{path}: is damaged (entry {error} is missing); copy or export it again") from error
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {one_line(error)}; copy or export it again") from error
-    network = built(path, lambda: PoseNetwork(**arguments), lambda: _fewest_values(arguments), content, KIND)
+    network = built(path, lambda: PoseNetwork(**arguments), lambda: _min_values(arguments), content, KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))
     return network.eval(), _describe(path, content, network)
 
@@ -185,7 +188,7 @@ def _describe(path: Path, content: Mapping[str, Any], network: "PoseNetwork") ->
         raise InputError(f"{path}: {one_line(error)}; copy or export it again") from error
 
 
-def _fewest_values(arguments: Mapping[str, Any]) -> float:
+def _min_values(arguments: Mapping[str, Any]) -> float:
     """A lower bound on the number of a network's weights: of its template, token layers, units and blocks."""
     third, width = arguments["channels"][-1], arguments["width"]
     token = third * (arguments["image_size"] // 8) ** 2 * width

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-SMALLEST_SINGULAR_SUM = 0.05
+MIN_SINGULAR_SUM = 0.05
 """Below it (two singular values cancel: the rotation is not determined) gradients are held back."""
 
 
@@ -30,7 +30,7 @@ class _NearestRotation(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         rotation, singular, right = ctx.saved_tensors
         turned = right @ rotation.transpose(1, 2) @ gradients[0] @ right.transpose(1, 2)
-        pairs = (singular[:, :, None] + singular[:, None]).clamp_min(SMALLEST_SINGULAR_SUM)
+        pairs = (singular[:, :, None] + singular[:, None]).clamp_min(MIN_SINGULAR_SUM)
         antisymmetric = (turned - turned.transpose(1, 2)) / pairs
         return rotation @ right.transpose(1, 2) @ antisymmetric @ right
 
@@ -47,15 +47,19 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Rotations [S, 3, 3] of vectors [S, 3]: the unit quaternion along (1, v / 2); about v rad when small."""
-    quaternion = torch.nn.functional.normalize(
-        torch.cat([torch.ones_like(vector[:, :1]), vector / 2], dim=1), dim=1
-    )
+    quaternion = torch.nn.functional.normalize(torch.cat([torch.ones_like(vector[:, :1]), vector / 2], dim=1), dim=1)
     w, x, y, z = quaternion.unbind(1)
     entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(entries, 1).reshape(-1, 3, 3)
 
 
@@ -116,13 +120,7 @@ def sample_rows(volume: Tensor, points_mm: Tensor, spacing_mm: float, offset: Te
 
 
 def scattered(
-    points_mm: Tensor,
-    value: Tensor,
-    weight: Tensor,
-    group: Tensor,
-    n_groups: int,
-    shape: int,
-    spacing_mm: float,
+    points_mm: Tensor, value: Tensor, weight: Tensor, group: Tensor, n_groups: int, shape: int, spacing_mm: float
 ) -> Tensor:
     """Weighted sums and weights of points in cubes of voxels centred on the origin, [G, I, J, K, 2].
 
@@ -173,8 +171,6 @@ def best_age(heads: Tensor, value: Tensor, group: Tensor, n_groups: int) -> Tens
         n_groups: G.
     """
     pixel = value[..., None]
-    moments = torch.stack(
-        [pixel.expand_as(heads), heads, pixel**2 * torch.ones_like(heads), heads**2, pixel * heads]
-    )
+    moments = torch.stack([pixel.expand_as(heads), heads, pixel**2 * torch.ones_like(heads), heads**2, pixel * heads])
     v, h, vv, hh, vh = group_mean(moments.mean(2).permute(1, 0, 2), group, n_groups).unbind(1)
     return ((vh - v * h) / ((vv - v**2) * (hh - h**2)).clamp_min(1e-12).sqrt()).argmax(1)

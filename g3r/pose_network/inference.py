@@ -27,7 +27,7 @@ The network sees all four and the answers are averaged, which takes a fifth off 
 """
 VIEW_SCALE_MM = 3.0
 """Views further than this from the mean count less in it, in proportion."""
-TURN_ARM_MM = 25.0
+ROTATION_ARM_MM = 25.0
 """At this distance from a slice's centre a turn is measured in mm."""
 ROBUST_SCALE_MM = 3.0
 """Slices further than this from their stack's common motion count less in it, in proportion."""
@@ -35,10 +35,7 @@ ROBUST_STEPS = 12
 
 
 def predict_poses(
-    network: "PoseNetwork",
-    meta: "PoseCheckpoint",
-    slices: Slices,
-    time_rank: NDArray[np.float64] | None = None,
+    network: "PoseNetwork", meta: "PoseCheckpoint", slices: Slices, time_rank: NDArray[np.float64] | None = None
 ) -> RigidPose:
     """Pose of each slice's own frame (as `slices.planes.pose`) in the atlas frame.
 
@@ -81,7 +78,7 @@ def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
         share = (weight / weight.sum(0))[..., None]
         mean_rotation = orthonormal((share[..., None] * rotation).sum(0))
         mean_translation = (share * translation_mm).sum(0)
-        turned = np.linalg.norm(rotation - mean_rotation, axis=(2, 3)) / np.sqrt(2) * TURN_ARM_MM
+        turned = np.linalg.norm(rotation - mean_rotation, axis=(2, 3)) / np.sqrt(2) * ROTATION_ARM_MM
         off = turned + np.linalg.norm(translation_mm - mean_translation, axis=2)
         weight = 1 / np.maximum(off, VIEW_SCALE_MM)
     return RigidPose(mean_rotation, mean_translation)
@@ -107,9 +104,7 @@ def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:
     return RigidPose(orthonormal(rotation.double().cpu().numpy()), translation_mm.double().cpu().numpy())
 
 
-def stack_motions(
-    atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]
-) -> RigidPose:
+def stack_motions(atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]) -> RigidPose:
     """One motion per stack, atlas frame from world, that most of its slices agree with.
 
     The start is the slice whose own motion suits the others best in the median, so that a minority of
@@ -135,9 +130,7 @@ def stack_motions(
         for _ in range(ROBUST_STEPS):
             off = np.linalg.norm(motion.apply(source.reshape(1, -1, 3))[0] - target.reshape(-1, 3), axis=-1)
             weight = 1 / np.maximum(off.reshape(len(rows), -1).mean(1), ROBUST_SCALE_MM)
-            motion = fit_rigid(
-                source.reshape(-1, 3), target.reshape(-1, 3), np.repeat(weight, len(SLICE_POINTS_MM))
-            )
+            motion = fit_rigid(source.reshape(-1, 3), target.reshape(-1, 3), np.repeat(weight, len(SLICE_POINTS_MM)))
         rotation.append(motion.rotation[0])
         translation.append(motion.translation_mm[0])
     return RigidPose(np.array(rotation), np.array(translation))

@@ -70,9 +70,7 @@ class Encoder(nn.Module):
         first, second, third = channels
         self.stem = Convolution(2, 1, first, strides=2, kernel_size=3, act="relu", norm="batch")
         self.extra = (
-            Convolution(2, extra_channels, first, kernel_size=3, act="relu", norm="batch")
-            if extra_channels
-            else None
+            Convolution(2, extra_channels, first, kernel_size=3, act="relu", norm="batch") if extra_channels else None
         )
         into = first * (2 if extra_channels else 1)
         self.body = nn.Sequential(
@@ -160,13 +158,7 @@ class PoseNetwork(nn.Module):
         n_refinements: int = 1,
     ) -> None:
         super().__init__()
-        if (
-            len(template_shape) != 4
-            or image_size % 8
-            or len(channels) != 3
-            or width % n_heads
-            or n_refinements < 1
-        ):
+        if len(template_shape) != 4 or image_size % 8 or len(channels) != 3 or width % n_heads or n_refinements < 1:
             raise ValueError(
                 f"got {template_shape=}, {image_size=}, {channels=}, {width=}, {n_heads=}, {n_refinements=}"
             )
@@ -222,9 +214,7 @@ class PoseNetwork(nn.Module):
         with torch.autocast(batch["image"].device.type, enabled=False):
             return self._steps(batch, n_refinements, disturb)
 
-    def _steps(
-        self, batch: SliceBatch, n_refinements: int | None, disturb: Disturbance | None
-    ) -> list[PoseStep]:
+    def _steps(self, batch: SliceBatch, n_refinements: int | None, disturb: Disturbance | None) -> list[PoseStep]:
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
         n_stacks, n_sets = len(set_of_stack), int(set_of_stack.max()) + 1
         same_stack = stack[:, None] == stack

@@ -35,7 +35,7 @@ FORMAT_VERSION = 1
 VOXEL_MM_RANGE = (0.1, 10.0)
 VOXEL_MM_TOLERANCE = 1e-3
 
-LARGEST_ARGUMENTS = {"channels": 4096, "units": 64, "tail_channels": 4096}
+MAX_ARGUMENTS = {"channels": 4096, "units": 64, "tail_channels": 4096}
 """Beyond these a network takes minutes to build, and is none of ours."""
 
 _ANOTHER_FILE = "pass a file made by g3r-export, or leave --ckpt out to use the weights that ship with g3r"
@@ -81,9 +81,7 @@ class PriorCheckpoint:
         return float(self.network_arguments["beta"])
 
 
-def save_prior_checkpoint(
-    path: str | Path, network: "DensityGatedPriorNetwork", meta: PriorCheckpoint
-) -> None:
+def save_prior_checkpoint(path: str | Path, network: "DensityGatedPriorNetwork", meta: PriorCheckpoint) -> None:
     """Write weights and description to one file, whole or not at all.
 
     Args:
@@ -96,9 +94,7 @@ def save_prior_checkpoint(
         InputError: the file cannot be written.
     """
     if dict(meta.network_arguments) != network.arguments():
-        raise ValueError(
-            f"meta describes {dict(meta.network_arguments)}, the network is {network.arguments()}"
-        )
+        raise ValueError(f"meta describes {dict(meta.network_arguments)}, the network is {network.arguments()}")
     path = Path(path)
     weights = plain_weights(network)
     content = {
@@ -120,9 +116,7 @@ def save_prior_checkpoint(
     write_file(path, content)
 
 
-def load_prior(
-    path: str | Path, voxel_mm: float | None = None
-) -> "tuple[DensityGatedPriorNetwork, PriorCheckpoint]":
+def load_prior(path: str | Path, voxel_mm: float | None = None) -> "tuple[DensityGatedPriorNetwork, PriorCheckpoint]":
     """Read a prior file.
 
     Nothing in the file is executed (`weights_only=True`), and everything it claims is checked.
@@ -156,15 +150,13 @@ def load_prior(
     from g3r.prior.dgpn import DensityGatedPriorNetwork  # MONAI: only once the file has proved good
 
     arguments = meta.network_arguments
-    network = built(
-        path, lambda: DensityGatedPriorNetwork(**arguments), lambda: _fewest_values(arguments), content, KIND
-    )
+    network = built(path, lambda: DensityGatedPriorNetwork(**arguments), lambda: _min_values(arguments), content, KIND)
     check_digest(path, network.state_dict(), content.get("weights_sha256"))
     # Only the speed changes: convolutions on a CPU are up to twice as fast with channels innermost.
     return network.to(memory_format=torch.channels_last_3d).eval(), meta  # type: ignore[call-overload]
 
 
-def _fewest_values(arguments: Mapping[str, Any]) -> float:
+def _min_values(arguments: Mapping[str, Any]) -> float:
     """A lower bound on the number of a network's weights: of its residual units and its tail."""
     levels = zip(arguments["channels"], arguments["units"], strict=True)
     return 27 * (sum(2 * n * width**2 for width, n in levels) + arguments["tail_channels"] ** 2)
@@ -174,7 +166,7 @@ def _describe(path: Path, content: Mapping[str, Any]) -> PriorCheckpoint:
     """Return the description with its values checked."""
     try:
         meta = PriorCheckpoint(
-            network_arguments=plain_arguments(content, LARGEST_ARGUMENTS),
+            network_arguments=plain_arguments(content, MAX_ARGUMENTS),
             voxel_mm=number(content, "voxel_mm"),
             training_data=text(content, "training_data"),
             validation=scores(content),

@@ -98,9 +98,7 @@ def estimate_prior(
     return np.ascontiguousarray(prior)
 
 
-def _view(
-    network: DensityGatedPriorNetwork, inputs: Sequence[torch.Tensor], axes: tuple[int, ...]
-) -> torch.Tensor:
+def _view(network: DensityGatedPriorNetwork, inputs: Sequence[torch.Tensor], axes: tuple[int, ...]) -> torch.Tensor:
     """The prior as the network sees it with some axes mirrored, mirrored back."""
     dims = [2 + axis for axis in axes]
     return network(*[volume.flip(dims) for volume in inputs]).flip(dims)
@@ -111,9 +109,7 @@ def _round_up(value: int, multiple: int) -> int:
     return -(-value // multiple) * multiple
 
 
-def _tiles(
-    shape: tuple[int, ...], edge: int, halo: int
-) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+def _tiles(shape: tuple[int, ...], edge: int, halo: int) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
     """Yield (voxels a tile writes, voxels it sees); the first parts cover the volume once."""
     # an axis that a tile sees the whole of is not cut
     edges = [extent if edge + 2 * halo >= extent else edge for extent in shape]

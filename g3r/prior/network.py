@@ -61,8 +61,7 @@ class ResidualRefiner(nn.Module):
         super().__init__()
         if not channels or len(channels) != len(units) or min(*channels, *units, tail_channels) < 1:
             raise ValueError(
-                "ResidualRefiner needs one positive entry per level; "
-                f"got {channels=}, {units=}, {tail_channels=}"
+                f"ResidualRefiner needs one positive entry per level; got {channels=}, {units=}, {tail_channels=}"
             )
         self.channels = tuple(int(value) for value in channels)
         self.units = tuple(int(value) for value in units)
@@ -205,9 +204,7 @@ def _subpixel_upsample(in_channels: int, out_channels: int) -> SubpixelUpsample:
     half of all the weights. No averaging afterwards (MONAI's `apply_pad_pool`): it shifts by half a voxel.
     """
     to_subpixels = nn.Conv3d(in_channels, 8 * out_channels, kernel_size=1)
-    return SubpixelUpsample(
-        3, in_channels, out_channels, scale_factor=2, conv_block=to_subpixels, apply_pad_pool=False
-    )
+    return SubpixelUpsample(3, in_channels, out_channels, scale_factor=2, conv_block=to_subpixels, apply_pad_pool=False)
 
 
 def _tie_subpixels(conv: nn.Conv3d, factor: int) -> None:

@@ -1,6 +1,6 @@
 """Poses of stacks and slices from the images."""
 
-from g3r.registration.estimate import MotionEstimate, estimate_motion
-from g3r.registration.settings import MotionSettings
+from g3r.registration.estimate import Registration, register
+from g3r.registration.settings import RegistrationSettings
 
-__all__ = ["MotionEstimate", "MotionSettings", "estimate_motion"]
+__all__ = ["Registration", "RegistrationSettings", "register"]

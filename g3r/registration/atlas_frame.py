@@ -11,17 +11,17 @@ import numpy as np
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
-from g3r.registration.candidates import in_frame_of
+from g3r.registration.candidates import aligned_to
 from g3r.registration.normal_equations import correlation
 from g3r.registration.pose_samples import SearchPixels, perturbed
-from g3r.registration.template_search import FittedHead
+from g3r.registration.template_search import FittedTemplate
 
 logger = logging.getLogger(__name__)
 
 HEADER_REACH_MM = 2.0
 """Slices further than this from the common motion hardly take part in finding it."""
 
-SURE_CORRELATION = 0.6
+RELIABLE_CORRELATION = 0.6
 """Correlation with the mean head, outline included, below which the standard orientation is not known:
 0.7 to 0.8 for simulated heads of 24 to 34 weeks, 0.4 for heads lying the wrong way."""
 
@@ -47,7 +47,7 @@ class Orientation:
 
 
 def standard_orientation(
-    slices: Slices, heads: Sequence[FittedHead], start: RigidPose, rng: np.random.Generator
+    slices: Slices, heads: Sequence[FittedTemplate], start: RigidPose, rng: np.random.Generator
 ) -> Orientation | None:
     """Turn all slices together so that the head stands as a mean head does.
 
@@ -61,23 +61,23 @@ def standard_orientation(
         None where no orientation fits well enough to be called standard.
     """
     present = slices.world_from_header()
-    common = in_frame_of(slices, start, present) @ present.inverse()
+    common = aligned_to(slices, start, present) @ present.inverse()
     pixels = SearchPixels.of(slices)
     found = [(*_turned_to(head, pixels, common.take([0]), rng), head) for head in heads]
     best, motion, head = max(found, key=lambda one: one[0])
     logger.info("standard orientation: correlation %.2f with the mean head of %.0f weeks", best, head.weeks)
-    if best < SURE_CORRELATION:
+    if best < RELIABLE_CORRELATION:
         return None
     return Orientation(motion @ slices.planes.pose, best, head.weeks, head.scale)
 
 
 def _turned_to(
-    head: FittedHead, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
+    head: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
 ) -> tuple[float, RigidPose]:
     """Best correlation of all slices with a head, and the motion that gives it."""
     agreement = np.zeros(1)
-    for turn_deg, shift_mm in ROUNDS:
-        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, turn_deg, shift_mm, rng)
+    for rotation_deg, translation_mm in ROUNDS:
+        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
         agreement = correlation(pixels.moments(head.volume, head.grid, candidate).sum(1))
         motion = candidate.take([int(agreement.argmax())])
     return float(agreement.max()), motion

@@ -3,7 +3,7 @@
 Coils make one side of a stack brighter. Registration compares intensities of stacks that were shaded
 differently, so even 15 % of shading moves whole stacks to wrong places. A second-order polynomial fitted to a
 stack's log intensities removes it together with the anatomy's own slow trend, which registration does not
-need. Only registration sees the flattened slices: the fit to the slices models the shading itself.
+need. Only registration sees the bias_corrected slices: the fit to the slices models the shading itself.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FITTED_PIXELS = 20_000
 """Of a stack, evenly: five coefficients need no more."""
 
 
-def flattened(slices: Slices) -> Slices:
+def bias_corrected(slices: Slices) -> Slices:
     """The slices with the slow in-plane trend of each stack's intensities divided out.
 
     The trend is x, y, x^2, xy, y^2 (in the stack's header frame, about the middle of its masked pixels)

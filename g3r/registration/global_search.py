@@ -13,16 +13,16 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.candidates import (
     MARGIN,
-    Judgement,
-    choose,
-    in_frame_of,
-    judge,
-    one_motion_or_runs,
-    settle,
-    simplify,
+    HeldOutScore,
+    aligned_to,
+    best_initialisation,
+    collapse_to_rigid,
+    held_out_score,
+    one_motion_or_segments,
+    refine_segments,
 )
-from g3r.registration.placement import StackPixels
-from g3r.registration.settings import MotionSettings
+from g3r.registration.placement import StackSamples
+from g3r.registration.settings import RegistrationSettings
 from g3r.registration.stack_registration import register_stacks
 from g3r.registration.template_search import TemplatePlacement, place_in_template
 from g3r.run.deadline import Deadline
@@ -45,21 +45,21 @@ class Searched:
 
     Args:
         motion: [K] world from header.
-        hypothesis: where it started.
-        hypotheses: held-out correlation of every hypothesis, stack by stack.
+        initialisation: where it started.
+        initialisations: held-out correlation of every hypothesis, stack by stack.
         placed: the slices in the mean head; None without a template.
     """
 
     motion: RigidPose
-    hypothesis: str
-    hypotheses: dict[str, list[float]]
+    initialisation: str
+    initialisations: dict[str, list[float]]
     placed: TemplatePlacement | None
 
 
 def search(
     slices: Slices,
-    parts: list[StackPixels],
-    settings: MotionSettings,
+    samples: list[StackSamples],
+    settings: RegistrationSettings,
     template: AtlasTemplate | None,
     proposals: Mapping[str, RigidPose],
     deadline: Deadline | None = None,
@@ -68,7 +68,7 @@ def search(
 
     Args:
         slices: of all stacks.
-        parts: the same, as a search sees them.
+        samples: the same, as a search sees them.
         settings: which hypotheses, how many attempts.
         template: mean heads; None leaves them out.
         proposals: motions [K] (world from header) by other means, by name.
@@ -79,14 +79,14 @@ def search(
         fixed |= dict(proposals)
     if settings.stacks:
         fixed["stacks"] = register_stacks(slices)[0].world_from_header()
-    best: tuple[Judgement, Searched] | None = None
+    best: tuple[HeldOutScore, Searched] | None = None
     for attempt in range(max(1, settings.attempts)):
         rng = np.random.default_rng([settings.seed, attempt])
-        judgement, found = _attempt(slices, parts, settings, template, fixed, rng, deadline)
+        judgement, found = _attempt(slices, samples, settings, template, fixed, rng, deadline)
         if best is None or judgement.cost < best[0].cost:
             best = judgement, found
         least = min(p.correlation for p in best[0].prediction)
-        if least >= SETTLED or not settings.runs or (deadline is not None and deadline.has_passed()):
+        if least >= SETTLED or not settings.segments or (deadline is not None and deadline.has_passed()):
             break
         logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, least)
     assert best is not None
@@ -95,43 +95,43 @@ def search(
 
 def _attempt(
     slices: Slices,
-    parts: list[StackPixels],
-    settings: MotionSettings,
+    samples: list[StackSamples],
+    settings: RegistrationSettings,
     template: AtlasTemplate | None,
     fixed: Mapping[str, RigidPose],
     rng: np.random.Generator,
     deadline: Deadline | None,
-) -> tuple[Judgement, Searched]:
-    hypotheses, placed = dict(fixed), None
+) -> tuple[HeldOutScore, Searched]:
+    initialisations, placed = dict(fixed), None
     if template is not None:
-        placed = place_in_template(slices, parts, template, rng)
-        hypotheses["template"] = placed.motion(len(slices), parts)
-    name, judgements = choose(slices, parts, hypotheses)
+        placed = place_in_template(slices, samples, template, rng)
+        initialisations["template"] = placed.motion(len(slices), samples)
+    name, judgements = best_initialisation(slices, samples, initialisations)
     judged = {key: [p.correlation for p in value.prediction] for key, value in judgements.items()}
-    start = hypotheses[name]
+    start = initialisations[name]
     motion, judgement = start, judgements[name]
-    if settings.runs:
-        rivals = [in_frame_of(slices, start, other) for key, other in hypotheses.items() if key != name]
-        settled, placements = settle(slices, parts, start, rivals, rng, deadline)
-        settled, _ = simplify(slices, parts, settled, [one.runs.interleave for one in placements])
-        after = judge(slices, parts, settled)
+    if settings.segments:
+        rivals = [aligned_to(slices, start, other) for key, other in initialisations.items() if key != name]
+        settled, placements = refine_segments(slices, samples, start, rivals, rng, deadline)
+        settled, _ = collapse_to_rigid(slices, samples, settled, [one.segments.interleave for one in placements])
+        after = held_out_score(slices, samples, settled)
         if after.cost <= judgement.cost - MARGIN:
             motion, judgement = settled, after
     return judgement, Searched(motion, name, judged, placed)
 
 
 def search_single(
-    slices: Slices, part: StackPixels, settings: MotionSettings, template: AtlasTemplate | None
+    slices: Slices, sample: StackSamples, settings: RegistrationSettings, template: AtlasTemplate | None
 ) -> Searched:
     """Motions of the slices of one stack: no other stack holds it together, a mean head does, roughly."""
     motion = RigidPose.identity(len(slices))
     if template is None:
         return Searched(motion, "headers", {}, None)
-    placed = place_in_template(slices, [part], template, np.random.default_rng([settings.seed, 0]))
-    if not settings.runs:
+    placed = place_in_template(slices, [sample], template, np.random.default_rng([settings.seed, 0]))
+    if not settings.segments:
         return Searched(motion, "headers", {}, placed)
     only, head = placed.placement[0], placed.head
-    motion, is_one = one_motion_or_runs(
-        slices, part, only.motion, only.runs.interleave, head.volume, head.grid, SINGLE_MARGIN
+    motion, is_one = one_motion_or_segments(
+        slices, sample, only.motion, only.segments.interleave, head.volume, head.grid, SINGLE_MARGIN
     )
     return Searched(motion, "headers" if is_one else "template", {}, placed)

@@ -88,9 +88,23 @@ class SliceModel:
         loss, moments = np.zeros(n), np.zeros((n, 6))
         op = self.operator
         _accumulate(
-            self.volume, self.start, op.uv_mm, self.value, self.weight, op.index_from_plane, op.index_center,
-            op.node_index, op.node_mm, op.node_weight, gain, width, hessian, gradient, loss, moments,
-        )  # fmt: skip
+            self.volume,
+            self.start,
+            op.uv_mm,
+            self.value,
+            self.weight,
+            op.index_from_plane,
+            op.index_center,
+            op.node_index,
+            op.node_mm,
+            op.node_weight,
+            gain,
+            width,
+            hessian,
+            gradient,
+            loss,
+            moments,
+        )
         return NormalEquations(hessian, gradient, loss, moments)
 
     def residuals(self, planes: Planes, gain: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -102,9 +116,23 @@ class SliceModel:
 
 @numba.njit(parallel=True, cache=True)
 def _accumulate(
-    volume, start, uv, value, weight, index_from_plane, index_center, node_index, node_mm, node_weight, gain,
-    width, hessian, gradient, loss, moments,
-):  # fmt: skip
+    volume,
+    start,
+    uv,
+    value,
+    weight,
+    index_from_plane,
+    index_center,
+    node_index,
+    node_mm,
+    node_weight,
+    gain,
+    width,
+    hessian,
+    gradient,
+    loss,
+    moments,
+):
     n_i, n_j, n_k = volume.shape
     for k in numba.prange(len(start) - 1):
         m = index_from_plane[k]
@@ -151,21 +179,21 @@ def _accumulate(
             observed = value[p]
             residual = observed - gain[k] * model
             ratio = residual / width
-            trust = weight[p]
-            factor = trust / (1.0 + ratio * ratio)
-            total += trust * math.log1p(ratio * ratio)
-            n_used += trust
+            slice_weight = weight[p]
+            factor = slice_weight / (1.0 + ratio * ratio)
+            total += slice_weight * math.log1p(ratio * ratio)
+            n_used += slice_weight
             for a in range(N_PARAMETERS):
                 da = gain[k] * jac[a]
                 gradient[k, a] += factor * da * residual
                 for b in range(a, N_PARAMETERS):
                     hessian[k, a, b] += factor * da * gain[k] * jac[b]
-            moments[k, 0] += trust
-            moments[k, 1] += trust * observed
-            moments[k, 2] += trust * model
-            moments[k, 3] += trust * observed * observed
-            moments[k, 4] += trust * model * model
-            moments[k, 5] += trust * observed * model
+            moments[k, 0] += slice_weight
+            moments[k, 1] += slice_weight * observed
+            moments[k, 2] += slice_weight * model
+            moments[k, 3] += slice_weight * observed * observed
+            moments[k, 4] += slice_weight * model * model
+            moments[k, 5] += slice_weight * observed * model
         for a in range(N_PARAMETERS):
             for b in range(a):
                 hessian[k, a, b] = hessian[k, b, a]

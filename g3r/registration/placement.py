@@ -15,7 +15,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import correlation
 from g3r.registration.pose_samples import SearchPixels, distinct, mean_square_residual, perturbed
-from g3r.registration.segments import Runs, best_runs, changes_in_time, price_of_changes
+from g3r.registration.segments import Segments, best_segments, changes_in_time, transition_penalty
 
 CORRELATION_AREA_MM2 = 80.0
 """Area over which residuals at a search's resolution are alike: one independent sample per so much slice."""
@@ -26,7 +26,7 @@ PIXELS_OF_A_VOLUME = 100_000
 
 
 @dataclass(frozen=True)
-class StackPixels:
+class StackSamples:
     """One stack as a search sees it: its thinned pixels by the header, and its slices' numbers.
 
     Args:
@@ -44,15 +44,15 @@ class StackPixels:
     n_candidates: int = N_CANDIDATES
 
     @classmethod
-    def of_all(cls, slices: Slices, n_candidates: int = N_CANDIDATES) -> list[StackPixels]:
+    def of_all(cls, slices: Slices, n_candidates: int = N_CANDIDATES) -> list[StackSamples]:
         """An entry for each stack."""
         by_header = slices.with_pose(slices.header_pose)
-        parts = []
+        samples = []
         for stack in np.unique(slices.stack_id):
             rows = np.flatnonzero(slices.stack_id == stack)
             pixels = SearchPixels.of(by_header.take(rows))
-            parts.append(cls(int(stack), rows, pixels, slices.slice_index[rows], n_candidates))
-        return parts
+            samples.append(cls(int(stack), rows, pixels, slices.slice_index[rows], n_candidates))
+        return samples
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Placement:
     """Motions [K] of a stack's slices (world from header), the runs they form, and what they cost."""
 
     motion: RigidPose
-    runs: Runs
+    segments: Segments
 
 
 def slice_costs(
@@ -104,31 +104,25 @@ class Prediction:
 
 
 def predict(
-    part: StackPixels,
-    motion: RigidPose,
-    volume: NDArray[np.float32],
-    grid: VolumeGrid,
-    interleave: int,
+    sample: StackSamples, motion: RigidPose, volume: NDArray[np.float32], grid: VolumeGrid, interleave: int
 ) -> Prediction:
     """Compare a stack with a volume under given motions [K] (world from header)."""
-    moments = own_moments(part.pixels, volume, grid, motion)
+    moments = own_moments(sample.pixels, volume, grid, motion)
     energy = moments[:, 3] / moments[:, 0]
     relative = mean_square_residual(moments) / np.maximum(energy, 1e-30)
-    fit = (part.pixels.area_mm2 / CORRELATION_AREA_MM2) @ np.log(relative + 1e-4)
-    moves = changes_in_time(motion, part.slice_index, part.pixels.center_mm, interleave)
-    return Prediction(
-        float(fit) + price_of_changes(moves), float(correlation(moments.sum(0))), correlation(moments)
-    )
+    fit = (sample.pixels.area_mm2 / CORRELATION_AREA_MM2) @ np.log(relative + 1e-4)
+    moves = changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, interleave)
+    return Prediction(float(fit) + transition_penalty(moves), float(correlation(moments.sum(0))), correlation(moments))
 
 
-def place_again(
-    part: StackPixels,
+def refine_placement(
+    sample: StackSamples,
     motion: RigidPose,
     volume: NDArray[np.float32],
     grid: VolumeGrid,
     *,
-    turn_deg: float,
-    shift_mm: float,
+    rotation_deg: float,
+    translation_mm: float,
     rng: np.random.Generator,
     proposals: RigidPose | None = None,
 ) -> Placement:
@@ -138,16 +132,16 @@ def place_again(
     be known about which runs lie wrongly.
 
     Args:
-        part: the stack.
+        sample: the stack.
         motion: [K] present motions (world from header).
         volume: [I, J, K] made without this stack.
         grid: its grid.
-        turn_deg: standard deviation per axis of random turns.
-        shift_mm: and of random shifts.
+        rotation_deg: standard deviation per axis of random turns.
+        translation_mm: and of random shifts.
         rng: source of randomness.
         proposals: further motions to be tried as they are, such as those of another method.
     """
-    center = part.pixels.center_mm
+    center = sample.pixels.center_mm
     present = distinct(motion, center)
     if proposals is not None:
         known = RigidPose(
@@ -156,11 +150,11 @@ def place_again(
         )
     else:
         known = present
-    n_each = max(10, part.n_candidates // len(known))
-    candidate = perturbed(known, center, n_each, turn_deg, shift_mm, rng)
-    cost = slice_costs(part.pixels, volume, grid, candidate)
-    runs = best_runs(cost, candidate, part.slice_index, center, keep=np.arange(len(known)))
-    return Placement(candidate.take(runs.choice), runs)
+    n_each = max(10, sample.n_candidates // len(known))
+    candidate = perturbed(known, center, n_each, rotation_deg, translation_mm, rng)
+    cost = slice_costs(sample.pixels, volume, grid, candidate)
+    segments = best_segments(cost, candidate, sample.slice_index, center, keep=np.arange(len(known)))
+    return Placement(candidate.take(segments.choice), segments)
 
 
 def volume_without(

@@ -57,8 +57,8 @@ def perturbed(
     motion: RigidPose,
     center_mm: NDArray[np.float64],
     n_each: int,
-    turn_deg: float,
-    shift_mm: float,
+    rotation_deg: float,
+    translation_mm: float,
     rng: np.random.Generator,
 ) -> RigidPose:
     """Motions [J (1 + n_each)]: those given, and random ones around each.
@@ -67,15 +67,15 @@ def perturbed(
         motion: J motions.
         center_mm: [3] point (before the motion) about which the random turns go.
         n_each: random motions for each.
-        turn_deg: standard deviation per axis of their turns.
-        shift_mm: and of their shifts.
+        rotation_deg: standard deviation per axis of their turns.
+        translation_mm: and of their shifts.
         rng: source of randomness.
     """
     n = len(motion) * n_each
-    turn = rotation_matrix(np.deg2rad(rng.normal(0, turn_deg, (n, 3))))
+    turn = rotation_matrix(np.deg2rad(rng.normal(0, rotation_deg, (n, 3))))
     rotation = turn @ np.repeat(motion.rotation, n_each, axis=0)
     moved_center = np.repeat(motion.rotation @ center_mm + motion.translation_mm, n_each, axis=0)
-    around = turns_about(rotation, center_mm, moved_center + rng.normal(0, shift_mm, (n, 3)))
+    around = turns_about(rotation, center_mm, moved_center + rng.normal(0, translation_mm, (n, 3)))
     return RigidPose(
         np.concatenate([motion.rotation, around.rotation]),
         np.concatenate([motion.translation_mm, around.translation_mm]),
@@ -135,9 +135,7 @@ class SearchPixels:
     def __len__(self) -> int:
         return len(self.start) - 1
 
-    def moments(
-        self, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose
-    ) -> NDArray[np.float64]:
+    def moments(self, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose) -> NDArray[np.float64]:
         """Sums n, y, m, yy, mm, ym [J, K, 6] of slices k in a volume under world motions j.
 
         y is the slice's pixel, m the volume there (trilinear, 0 outside); a volume as blurred as the slices
@@ -178,9 +176,7 @@ def _moments(volume, point, value, start, linear, shift, out):
                     v00 = volume[i, h, q] + fz * (volume[i, h, q + 1] - volume[i, h, q])
                     v01 = volume[i, h + 1, q] + fz * (volume[i, h + 1, q + 1] - volume[i, h + 1, q])
                     v10 = volume[i + 1, h, q] + fz * (volume[i + 1, h, q + 1] - volume[i + 1, h, q])
-                    v11 = volume[i + 1, h + 1, q] + fz * (
-                        volume[i + 1, h + 1, q + 1] - volume[i + 1, h + 1, q]
-                    )
+                    v11 = volume[i + 1, h + 1, q] + fz * (volume[i + 1, h + 1, q + 1] - volume[i + 1, h + 1, q])
                     v0, v1 = v00 + fy * (v01 - v00), v10 + fy * (v11 - v10)
                     m = v0 + fx * (v1 - v0)
                 s_y += value[p]

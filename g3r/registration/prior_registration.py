@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 N_STEPS = 4
 """Few on purpose, and once: repeated, still stacks drift by 0.1 mm a time."""
 
-LEAST_GAIN = 0.22
+MIN_GAIN = 0.22
 """Share of the robust loss that registration must remove to be believed: 0.10 to 0.18 for stacks that lay
 still (gains and noise), 0.26 to 0.32 for mild motion (docs/motion.md)."""
 
@@ -47,4 +47,4 @@ def register_to_prior(
     size = before.moments[:, 0]
     removed = 1 - float(size @ after.loss) / max(float(size @ before.loss), 1e-30)
     logger.info("slices against the prior: %.0f %% of the loss removed", 100 * removed)
-    return (moved, new_gain, True) if removed > LEAST_GAIN else (slices, gain, False)
+    return (moved, new_gain, True) if removed > MIN_GAIN else (slices, gain, False)

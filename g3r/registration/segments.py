@@ -24,9 +24,9 @@ INTERLEAVES = (1, 2, 3)
 HEAD_RADIUS_MM = 30.0
 """Half of a typical head's diameter, by which turns are compared with shifts."""
 
-CHANGE_PRICE = 6.0
+CHANGE_PENALTY = 6.0
 """Cost (a logarithm of odds) of any change of motion from one slice in time to the next."""
-DISTANCE_PRICE = 8.0
+DISTANCE_PENALTY = 8.0
 """Further cost of a change by d mm: this times log(1 + (d / STEADY_MM)^2); heavy-tailed, as jerks are."""
 STEADY_MM = 4.0
 """Below about this, movement between slices is ordinary."""
@@ -40,20 +40,20 @@ BEST_PER_WINDOW = 6
 
 
 @dataclass(frozen=True)
-class Runs:
+class Segments:
     """The chosen candidate of each slice.
 
     Args:
         choice: [K] candidate of each slice, in the order of the slices given.
         interleave: the acquisition order under which that was cheapest.
         cost: of the whole sequence.
-        n_runs: constant pieces of it.
+        n_segments: constant pieces of it.
     """
 
     choice: NDArray[np.int64]
     interleave: int
     cost: float
-    n_runs: int = 1
+    n_segments: int = 1
 
 
 def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
@@ -82,13 +82,13 @@ def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64])
     return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
-def best_runs(
+def best_segments(
     cost: NDArray[np.float64],
     motion: RigidPose,
     slice_index: NDArray[np.int64],
     center_mm: NDArray[np.float64],
     keep: NDArray[np.int64] | None = None,
-) -> Runs:
+) -> Segments:
     """The cheapest sequence of candidate motions for one stack.
 
     Args:
@@ -103,21 +103,21 @@ def best_runs(
     if keep is not None:
         chosen = np.union1d(chosen, keep)
     motion, cost = motion.take(chosen), cost[:, chosen]
-    price = _price(head_distance_mm(motion, motion, center_mm))
-    np.fill_diagonal(price, 0.0)
-    best: Runs | None = None
+    penalty = _penalty(head_distance_mm(motion, motion, center_mm))
+    np.fill_diagonal(penalty, 0.0)
+    best: Segments | None = None
     for interleave, order in orders.items():
-        path, total = cheapest_path(cost[order], price)
+        path, total = cheapest_path(cost[order], penalty)
         if best is None or total < best.cost:
             choice = np.empty(len(cost), np.int64)
             choice[order] = chosen[path]
-            best = Runs(choice, interleave, total, 1 + int((np.diff(path) != 0).sum()))
+            best = Segments(choice, interleave, total, 1 + int((np.diff(path) != 0).sum()))
     assert best is not None
     return best
 
 
-def _price(distance_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    return CHANGE_PRICE + DISTANCE_PRICE * np.log1p((distance_mm / STEADY_MM) ** 2)
+def _penalty(distance_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    return CHANGE_PENALTY + DISTANCE_PENALTY * np.log1p((distance_mm / STEADY_MM) ** 2)
 
 
 def changes_in_time(
@@ -131,9 +131,9 @@ def changes_in_time(
     return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
-def price_of_changes(distance_mm: NDArray[np.float64]) -> float:
+def transition_penalty(distance_mm: NDArray[np.float64]) -> float:
     """Price of all movements [K - 1] (mm) of a stack; none costs nothing."""
-    return float(_price(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
+    return float(_penalty(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
 
 
 def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:
@@ -150,13 +150,13 @@ def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -
     return np.unique(np.concatenate(found))
 
 
-def cheapest_path(cost: NDArray[np.float64], price: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+def cheapest_path(cost: NDArray[np.float64], penalty: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
     """The path [T] with the least sum of costs [T, J] and prices [J, J] of changes, and that sum."""
     n, n_states = cost.shape
     total = cost[0].astype(np.float64)
     came_from = np.zeros((n, n_states), np.int64)
     for t in range(1, n):
-        through = total[:, None] + price
+        through = total[:, None] + penalty
         came_from[t] = through.argmin(0)
         total = through[came_from[t], np.arange(n_states)] + cost[t]
     path = np.empty(n, np.int64)

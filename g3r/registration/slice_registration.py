@@ -13,7 +13,7 @@ from g3r.geometry import RigidPose
 from g3r.geometry.rigid import orthonormal, rotation_matrix
 from g3r.registration.normal_equations import NormalEquations, SliceModel
 
-LARGEST_TURN_RAD, LARGEST_SHIFT_MM = 0.06, 2.0
+MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.06, 2.0
 """Trust region of one step of a slice."""
 
 GAIN_PRIOR_SIGMA = 0.3
@@ -31,12 +31,7 @@ of an interleaved stack, neighbours lie elsewhere for good reason."""
 
 
 def register_slices(
-    model: SliceModel,
-    slices: Slices,
-    gain: NDArray[np.float64],
-    *,
-    n_steps: int,
-    width: float,
+    model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, n_steps: int, width: float
 ) -> tuple[Slices, NDArray[np.float64], NormalEquations]:
     """Levenberg-Marquardt steps for every slice at once, each with a damping of its own.
 
@@ -71,9 +66,7 @@ def register_slices(
     return slices.with_pose(pose), np.exp(log_gain - log_gain.mean()), current
 
 
-def try_neighbours(
-    model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, width: float
-) -> tuple[Slices, int]:
+def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, width: float) -> tuple[Slices, int]:
     """Offer every slice the motions of its neighbours in the stack, and keep what fits clearly better.
 
     A slice that locked on wrongly sees no gradient towards its place; its neighbours mostly lie there.
@@ -131,9 +124,7 @@ class NeighbourTie:
             valid &= slices.stack_id[source] == slices.stack_id
             candidate = motion.take(source) @ slices.header_pose
             turn = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
-            away_mm = np.hypot(
-                np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1), radius_mm * turn
-            )
+            away_mm = np.hypot(np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1), radius_mm * turn)
             weight = np.where(valid, information[source] / (1 + (away_mm / TIE_REACH_MM) ** 2), 0.0)
             rotation += weight[:, None, None] * candidate.rotation
             translation += weight[:, None] * candidate.translation_mm
@@ -186,8 +177,8 @@ def _solve(
     )
     hessian += np.eye(7) * (damping[:, None] * diagonal + floor * 1e-2 + 1e-20)[:, None, :]
     step = np.asarray(np.linalg.solve(hessian, gradient[..., None])[..., 0], dtype=np.float64)
-    step[:, :3] *= _limit(step[:, :3], LARGEST_TURN_RAD)
-    step[:, 3:6] *= _limit(step[:, 3:6], LARGEST_SHIFT_MM)
+    step[:, :3] *= _limit(step[:, :3], MAX_ROTATION_RAD)
+    step[:, 3:6] *= _limit(step[:, 3:6], MAX_TRANSLATION_MM)
     step[:, 6] = np.clip(step[:, 6], -0.3, 0.3)
     return step
 

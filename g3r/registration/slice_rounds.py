@@ -16,7 +16,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
-from g3r.run.deadline import Deadline, paced
+from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
 
@@ -29,16 +29,16 @@ class SliceRounds:
         n_rounds: alternations of volume and slices.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
-        pixels_at_most: masked pixels in use; larger subjects are thinned on coarse levels.
+        max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
     """
 
     n_rounds: int
     steps_per_round: int
     finest_voxel_mm: float
-    pixels_at_most: int
+    max_pixels: int
 
 
-LEAST_ROUNDS = 3
+MIN_ROUNDS = 3
 """One round for each voxel size, however little time there is."""
 
 
@@ -72,7 +72,7 @@ def refine_slices(
     volume: NDArray[np.float32] | None = None
     grid: VolumeGrid | None = None
     history: list[dict[str, float]] = []
-    for number, done in paced(rounds.n_rounds, deadline, least=LEAST_ROUNDS):
+    for number, done in timed_steps(rounds.n_rounds, deadline, least=MIN_ROUNDS):
         progress(number, rounds.n_rounds)
         # the last round has 1; rounded, so that the steps below do not hang on the last digit
         fraction = round(min(1.0, done * rounds.n_rounds / max(1, rounds.n_rounds - 1)), 9)
@@ -81,7 +81,7 @@ def refine_slices(
         smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
         if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
             grid, volume = grid_around(slices, voxel), None
-        n_wanted = rounds.pixels_at_most / (voxel / rounds.finest_voxel_mm)
+        n_wanted = rounds.max_pixels / (voxel / rounds.finest_voxel_mm)
         stride = max(1, round(len(slices.pixel_index) / n_wanted))
         volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
         model = SliceModel(slices, volume, grid, stride=stride)
@@ -93,18 +93,21 @@ def refine_slices(
         slices, gain, fit = register_slices(model, slices, gain, n_steps=rounds.steps_per_round, width=width)
         weight = slice_weights(fit.loss)
         history.append(
-            {"round": number, "voxel_mm": voxel, "residual": width / 2,
-             "median_ncc": float(np.median(fit.ncc)), "moved": moved}
-        )  # fmt: skip
-        logger.info(
-            "slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved
+            {
+                "round": number,
+                "voxel_mm": voxel,
+                "residual": width / 2,
+                "median_ncc": float(np.median(fit.ncc)),
+                "moved": moved,
+            }
         )
+        logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
     progress(rounds.n_rounds, rounds.n_rounds)
     ncc = correlation_with_all(slices, gain, weight, rounds.finest_voxel_mm)
     return FittedSlices(slices, gain, weight, ncc, history)
 
 
-LARGEST_DROPPED_SHARE = 0.2
+MAX_DROPPED_SHARE = 0.2
 """At most so many slices may weigh less than `DROPPED_WEIGHT`; where more do not fit, poses are at fault."""
 DROPPED_WEIGHT = 0.1
 
@@ -113,13 +116,13 @@ def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
     """Trust in each slice [K], going down smoothly where its mean robust loss stands out.
 
     1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
-    `DROPPED_WEIGHT` for at most `LARGEST_DROPPED_SHARE` of the slices.
+    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices.
     """
     median = np.median(loss)
     spread = 1.4826 * np.median(np.abs(loss - median)) + 0.05 * median + 1e-12
     excess = np.maximum(0.0, (loss - median) / spread - 2.0)
     weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
-    n_dropped = int(LARGEST_DROPPED_SHARE * len(weight))
+    n_dropped = int(MAX_DROPPED_SHARE * len(weight))
     by_weight = np.argsort(weight, kind="stable")
     kept = by_weight[n_dropped:]
     weight[kept] = np.maximum(weight[kept], DROPPED_WEIGHT)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import correlation
-from g3r.registration.placement import Placement, StackPixels, slice_costs
+from g3r.registration.placement import Placement, StackSamples, slice_costs
 from g3r.registration.pose_samples import angle_deg, rotations_within, turns_about, uniform_rotations
-from g3r.registration.segments import best_runs
+from g3r.registration.segments import best_segments
 
 N_ORIENTATIONS = 4000
 """Orientations that are tried; the nearest to any is about 10 degrees off."""
@@ -24,8 +24,8 @@ STACK_PEAK_DISTANCE_DEG = 35.0
 """Orientations that are followed further: at most so many, at least so far apart, and no worse than the best
 by more than this in correlation. One stack alone is more ambiguous than the whole head."""
 
-RUN_REACH_DEG = 70.0
-RUN_SHIFT_MM = 7.0
+SEGMENT_REACH_DEG = 70.0
+SEGMENT_TRANSLATION_MM = 7.0
 """How far a run of slices may lie from its stack's orientation, and the lattice of shifts tried."""
 
 
@@ -46,17 +46,17 @@ def peaks(
 
 
 def stack_orientations(
-    part: StackPixels, target_mm: NDArray[np.float64], volume: NDArray[np.float32], grid: VolumeGrid
+    sample: StackSamples, target_mm: NDArray[np.float64], volume: NDArray[np.float32], grid: VolumeGrid
 ) -> list[NDArray[np.float64]]:
     """Orientations [3, 3] of a whole stack worth following, its centre taken to a target [3] (mm)."""
     rotation = uniform_rotations(N_ORIENTATIONS)
-    motion = turns_about(rotation, part.pixels.center_mm, target_mm)
-    agreement = correlation(part.pixels.moments(volume, grid, motion).sum(1))
+    motion = turns_about(rotation, sample.pixels.center_mm, target_mm)
+    agreement = correlation(sample.pixels.moments(volume, grid, motion).sum(1))
     return peaks(rotation, agreement, N_STACK_PEAKS, STACK_PEAK_DISTANCE_DEG)
 
 
 def place_around(
-    part: StackPixels,
+    sample: StackSamples,
     base: NDArray[np.float64],
     target_mm: NDArray[np.float64],
     volume: NDArray[np.float32],
@@ -65,19 +65,19 @@ def place_around(
     """Runs of a stack on a lattice of motions around one orientation.
 
     Args:
-        part: the stack.
+        sample: the stack.
         base: [3, 3] orientation of the lattice's middle.
         target_mm: [3] where the stack's centre is taken to, give or take a shift.
         volume: [I, J, K].
         grid: its grid.
     """
-    rotation = rotations_within(N_ORIENTATIONS, RUN_REACH_DEG) @ base
-    lattice = np.array(list(itertools.product((-RUN_SHIFT_MM, 0.0, RUN_SHIFT_MM), repeat=3)))
+    rotation = rotations_within(N_ORIENTATIONS, SEGMENT_REACH_DEG) @ base
+    lattice = np.array(list(itertools.product((-SEGMENT_TRANSLATION_MM, 0.0, SEGMENT_TRANSLATION_MM), repeat=3)))
     candidate = turns_about(
         np.repeat(rotation, len(lattice), axis=0),
-        part.pixels.center_mm,
+        sample.pixels.center_mm,
         target_mm + np.tile(lattice, (len(rotation), 1)),
     )
-    cost = slice_costs(part.pixels, volume, grid, candidate)
-    runs = best_runs(cost, candidate, part.slice_index, part.pixels.center_mm)
-    return Placement(candidate.take(runs.choice), runs)
+    cost = slice_costs(sample.pixels, volume, grid, candidate)
+    segments = best_segments(cost, candidate, sample.slice_index, sample.pixels.center_mm)
+    return Placement(candidate.take(segments.choice), segments)

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 SEARCH_ANGLES_DEG = (-24.0, 0.0, 24.0)
 SEARCH_VOXEL_MM = 3.2
 N_REFINED = 4
-LARGEST_TURN_RAD, LARGEST_SHIFT_MM = 0.12, 4.0
+MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.12, 4.0
 """Trust region of one Gauss-Newton step of a stack."""
 
 
@@ -143,8 +143,8 @@ def refine_stack(model: SliceModel, slices: Slices, pose: RigidPose, n_steps: in
         if not scale.min() > 0:
             break
         twist = np.linalg.solve(hessian + np.diag(damping * scale), gradient)
-        twist[:3] = _shortened(twist[:3], LARGEST_TURN_RAD)
-        twist[3:] = _shortened(twist[3:], LARGEST_SHIFT_MM)
+        twist[:3] = _shortened(twist[:3], MAX_ROTATION_RAD)
+        twist[3:] = _shortened(twist[3:], MAX_TRANSLATION_MM)
         turn = rotation_matrix(twist[:3])
         trial_pose = RigidPose(turn[None], (center - turn @ center + twist[3:])[None]) @ pose
         trial = model.evaluate(slices.planes.with_pose(trial_pose), gain, width)

@@ -19,7 +19,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import correlation
-from g3r.registration.placement import Placement, StackPixels, own_moments, place_again, predict
+from g3r.registration.placement import Placement, StackSamples, own_moments, predict, refine_placement
 from g3r.registration.pose_samples import angle_deg, turns_about, uniform_rotations
 from g3r.registration.so3_search import N_ORIENTATIONS, peaks, place_around, stack_orientations
 
@@ -40,12 +40,12 @@ SAME_DEG = 30.0
 N_OPTIONS = 4
 """Placements of each stack that are followed."""
 
-HEADER_PRICE, HEADER_DEG = 8.0, 25.0
+HEADER_PENALTY, HEADER_DEG = 8.0, 25.0
 """Price of two stacks at an angle to what their headers say: the first times log(1 + (angle / second)^2)."""
 
 
 @dataclass(frozen=True)
-class FittedHead:
+class FittedTemplate:
     """A mean head of about the subject's age, scaled to its size.
 
     Args:
@@ -75,20 +75,20 @@ class TemplatePlacement:
     """
 
     placement: list[Placement]
-    head: FittedHead
-    heads: list[FittedHead]
+    head: FittedTemplate
+    heads: list[FittedTemplate]
     correlation: float
 
-    def motion(self, n_slices: int, parts: list[StackPixels]) -> RigidPose:
+    def motion(self, n_slices: int, samples: list[StackSamples]) -> RigidPose:
         """Motions [K] of all slices (world from header)."""
         rotation, translation = np.empty((n_slices, 3, 3)), np.empty((n_slices, 3))
-        for part, one in zip(parts, self.placement, strict=True):
-            rotation[part.rows], translation[part.rows] = one.motion.rotation, one.motion.translation_mm
+        for sample, one in zip(samples, self.placement, strict=True):
+            rotation[sample.rows], translation[sample.rows] = one.motion.rotation, one.motion.translation_mm
         return RigidPose(rotation, translation)
 
 
 def place_in_template(
-    slices: Slices, parts: list[StackPixels], template: AtlasTemplate, rng: np.random.Generator
+    slices: Slices, samples: list[StackSamples], template: AtlasTemplate, rng: np.random.Generator
 ) -> TemplatePlacement:
     """Motions of all slices into the atlas frame.
 
@@ -97,23 +97,23 @@ def place_in_template(
 
     Args:
         slices: of all stacks.
-        parts: the same, as a search sees them.
+        samples: the same, as a search sees them.
         template: mean heads.
         rng: source of randomness.
     """
-    heads = near_heads(slices, template)
+    heads = nearest_templates(slices, template)
     few = uniform_rotations(N_ORIENTATIONS // 4)
-    head = max(heads, key=lambda one: float(_whole_correlation(parts, one, few).max()))
-    whole = head_orientations(parts, head)
+    head = max(heads, key=lambda one: float(_whole_correlation(samples, one, few).max()))
+    whole = template_orientations(samples, head)
     # several orientations fit about as well: the headers do not hold the stacks together
     by_stack = len(whole) > 1
-    options = [_options(part, head, whole, by_stack, rng) for part in parts]
-    placement = _consistent(parts, options)
-    for turn_deg, shift_mm in REFINEMENT[2:]:
-        placement = _refined(parts, placement, head, turn_deg, shift_mm, rng)
+    options = [_options(sample, head, whole, by_stack, rng) for sample in samples]
+    placement = _consistent(samples, options)
+    for rotation_deg, translation_mm in REFINEMENT[2:]:
+        placement = _refined(samples, placement, head, rotation_deg, translation_mm, rng)
     moments = [
-        own_moments(part.pixels, head.volume, head.grid, one.motion)
-        for part, one in zip(parts, placement, strict=True)
+        own_moments(sample.pixels, head.volume, head.grid, one.motion)
+        for sample, one in zip(samples, placement, strict=True)
     ]
     return TemplatePlacement(placement, head, heads, float(correlation(np.concatenate(moments).sum(0))))
 
@@ -121,17 +121,17 @@ def place_in_template(
 def template_fits(slices: Slices, template: AtlasTemplate) -> bool:
     """Whether some mean head has about the size of what is masked; without brain masks none has."""
     volume_mm3 = head_volume_mm3(slices)
-    scale = [fitted_head(template, n, volume_mm3).scale for n in range(len(template))]
+    scale = [fitted_template(template, n, volume_mm3).scale for n in range(len(template))]
     fits = any(SCALE_RANGE[0] <= s <= SCALE_RANGE[1] for s in scale)
     if not fits:
         logger.info("masked volume of %.0f ml: no mean head of that size", volume_mm3 / 1000)
     return fits
 
 
-def near_heads(slices: Slices, template: AtlasTemplate) -> list[FittedHead]:
+def nearest_templates(slices: Slices, template: AtlasTemplate) -> list[FittedTemplate]:
     """The three mean heads of about the subject's size, scaled to it."""
     volume_mm3 = head_volume_mm3(slices)
-    candidates = [fitted_head(template, n, volume_mm3) for n in range(len(template))]
+    candidates = [fitted_template(template, n, volume_mm3) for n in range(len(template))]
     return sorted(candidates, key=lambda head: abs(np.log(head.scale)))[:3]
 
 
@@ -154,7 +154,7 @@ def _slice_spacing_mm(stack: Slices) -> float:
     return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
 
 
-def fitted_head(template: AtlasTemplate, number: int, volume_mm3: float) -> FittedHead:
+def fitted_template(template: AtlasTemplate, number: int, volume_mm3: float) -> FittedTemplate:
     """A mean head scaled about its centre to a volume."""
     volume, grid = template.volume[number], template.grid
     inside = np.argwhere(volume > 0)
@@ -164,35 +164,38 @@ def fitted_head(template: AtlasTemplate, number: int, volume_mm3: float) -> Fitt
     affine[:3, :3] *= scale
     affine[:3, 3] = center + scale * (grid.affine[:3, 3] - center)
     blurred = gaussian_filter(volume, TEMPLATE_BLUR_VOXELS)
-    return FittedHead(blurred, VolumeGrid(grid.shape, affine), center, float(template.weeks[number]), scale)
+    return FittedTemplate(blurred, VolumeGrid(grid.shape, affine), center, float(template.weeks[number]), scale)
 
 
-def head_orientations(parts: list[StackPixels], head: FittedHead) -> list[NDArray[np.float64]]:
+def template_orientations(samples: list[StackSamples], head: FittedTemplate) -> list[NDArray[np.float64]]:
     """Orientations [3, 3] of the whole head worth following, best first."""
     rotation = uniform_rotations(N_ORIENTATIONS)
-    agreement = _whole_correlation(parts, head, rotation)
+    agreement = _whole_correlation(samples, head, rotation)
     chosen = peaks(rotation, agreement)
     logger.info(
         "mean head of %.0f weeks, scaled by %.2f: correlation %.2f, %d orientations to follow",
-        head.weeks, head.scale, agreement.max(), len(chosen),
-    )  # fmt: skip
+        head.weeks,
+        head.scale,
+        agreement.max(),
+        len(chosen),
+    )
     return chosen
 
 
 def _whole_correlation(
-    parts: list[StackPixels], head: FittedHead, rotation: NDArray[np.float64]
+    samples: list[StackSamples], head: FittedTemplate, rotation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Correlation [J] of all stacks with a head, each stack turned about its own centre."""
     total = np.zeros((len(rotation), 6))
-    for part in parts:
-        motion = turns_about(rotation, part.pixels.center_mm, head.center_mm)
-        total += part.pixels.moments(head.volume, head.grid, motion).sum(1)
+    for sample in samples:
+        motion = turns_about(rotation, sample.pixels.center_mm, head.center_mm)
+        total += sample.pixels.moments(head.volume, head.grid, motion).sum(1)
     return correlation(total)
 
 
 def _options(
-    part: StackPixels,
-    head: FittedHead,
+    sample: StackSamples,
+    head: FittedTemplate,
     whole: list[NDArray[np.float64]],
     by_stack: bool,
     rng: np.random.Generator,
@@ -200,36 +203,36 @@ def _options(
     """Placements of one stack around several orientations, with their costs, cheapest first."""
     bases = list(whole)
     if by_stack:
-        own = stack_orientations(part, head.center_mm, head.volume, head.grid)
+        own = stack_orientations(sample, head.center_mm, head.volume, head.grid)
         bases += [base for base in own if min(angle_deg(base, other) for other in whole) > SAME_DEG]
     found = []
     for base in bases:
-        one = place_around(part, base, head.center_mm, head.volume, head.grid)
-        found.append((_cost(part, one, head), one))
+        one = place_around(sample, base, head.center_mm, head.volume, head.grid)
+        found.append((_cost(sample, one, head), one))
     found.sort(key=lambda option: option[0])
     refined = []
     for _, one in found[:N_OPTIONS]:
-        for turn_deg, shift_mm in REFINEMENT[:2]:
-            one = _refined([part], [one], head, turn_deg, shift_mm, rng)[0]
-        refined.append((_cost(part, one, head), one))
+        for rotation_deg, translation_mm in REFINEMENT[:2]:
+            one = _refined([sample], [one], head, rotation_deg, translation_mm, rng)[0]
+        refined.append((_cost(sample, one, head), one))
     return sorted(refined, key=lambda option: option[0])
 
 
-def _consistent(parts: list[StackPixels], options: list[list[tuple[float, Placement]]]) -> list[Placement]:
+def _consistent(samples: list[StackSamples], options: list[list[tuple[float, Placement]]]) -> list[Placement]:
     """One option for each stack: the least sum of their costs and of a price for headers that disagree."""
     mean = [[Rotation.from_matrix(one.motion.rotation).mean().as_matrix() for _, one in o] for o in options]
     best: tuple[float, list[int]] | None = None
     for first, stack in [(n, k) for k, o in enumerate(options) for n in range(len(o))]:
-        choice = [0] * len(parts)
+        choice = [0] * len(samples)
         choice[stack] = first
         for _ in range(3):  # coordinate descent
-            for k in range(len(parts)):
+            for k in range(len(samples)):
                 if k != stack:
-                    choice[k] = int(np.argmin([
-                        o[0] + _disagreement(mean, choice, k, n) for n, o in enumerate(options[k])
-                    ]))  # fmt: skip
+                    choice[k] = int(
+                        np.argmin([o[0] + _disagreement(mean, choice, k, n) for n, o in enumerate(options[k])])
+                    )
         total = sum(options[k][n][0] for k, n in enumerate(choice))
-        total += sum(_disagreement(mean, choice, k, choice[k]) for k in range(len(parts))) / 2
+        total += sum(_disagreement(mean, choice, k, choice[k]) for k in range(len(samples))) / 2
         if best is None or total < best[0]:
             best = (total, choice)
     assert best is not None
@@ -240,25 +243,31 @@ def _consistent(parts: list[StackPixels], options: list[list[tuple[float, Placem
 
 def _disagreement(mean: list[list[NDArray[np.float64]]], choice: list[int], stack: int, option: int) -> float:
     """Price of one stack's option lying at an angle to those of the other stacks, by the headers."""
-    angles = np.array(
-        [float(angle_deg(mean[stack][option], mean[k][n])) for k, n in enumerate(choice) if k != stack]
-    )
-    return float(HEADER_PRICE * np.log1p((angles / HEADER_DEG) ** 2).sum())
+    angles = np.array([float(angle_deg(mean[stack][option], mean[k][n])) for k, n in enumerate(choice) if k != stack])
+    return float(HEADER_PENALTY * np.log1p((angles / HEADER_DEG) ** 2).sum())
 
 
-def _cost(part: StackPixels, one: Placement, head: FittedHead) -> float:
-    return predict(part, one.motion, head.volume, head.grid, one.runs.interleave).cost
+def _cost(sample: StackSamples, one: Placement, head: FittedTemplate) -> float:
+    return predict(sample, one.motion, head.volume, head.grid, one.segments.interleave).cost
 
 
 def _refined(
-    parts: list[StackPixels],
+    samples: list[StackSamples],
     placement: list[Placement],
-    head: FittedHead,
-    turn_deg: float,
-    shift_mm: float,
+    head: FittedTemplate,
+    rotation_deg: float,
+    translation_mm: float,
     rng: np.random.Generator,
 ) -> list[Placement]:
     return [
-        place_again(part, one.motion, head.volume, head.grid, turn_deg=turn_deg, shift_mm=shift_mm, rng=rng)
-        for part, one in zip(parts, placement, strict=True)
+        refine_placement(
+            sample,
+            one.motion,
+            head.volume,
+            head.grid,
+            rotation_deg=rotation_deg,
+            translation_mm=translation_mm,
+            rng=rng,
+        )
+        for sample, one in zip(samples, placement, strict=True)
     ]

@@ -11,14 +11,14 @@ M_MMAP_THRESHOLD = -3
 LARGE_BLOCK_BYTES = 1_000_000
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Give what was freed back to the system, where it can be asked to (glibc): some 0.05 s."""
     trim = _libc_function("malloc_trim")
     if trim is not None:
         trim(ctypes.c_size_t(0))
 
 
-def give_back_at_once() -> bool:
+def release_memory_eagerly() -> bool:
     """Have large blocks given back whenever they are freed, from now on; whether this system can.
 
     glibc keeps freed blocks of up to 32 MB, and where small ones lie between them they stay. Setting the
@@ -29,8 +29,8 @@ def give_back_at_once() -> bool:
     return set_option is not None and bool(set_option(M_MMAP_THRESHOLD, LARGE_BLOCK_BYTES))
 
 
-def can_give_back_at_once() -> bool:
-    """Whether `give_back_at_once` would have an effect."""
+def can_release_memory_eagerly() -> bool:
+    """Whether `release_memory_eagerly` would have an effect."""
     return _libc_function("mallopt") is not None
 
 

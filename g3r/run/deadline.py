@@ -13,11 +13,11 @@ def _nobody() -> bool:
 
 
 @dataclass
-class Pace:
+class LoopRecord:
     """What the clock decided in the loops of a run, in their order, so that a later run can do the same.
 
     Attributes:
-        loops: for each loop the fractions of its steps (see `paced`).
+        loops: for each loop the fractions of its steps (see `timed_steps`).
         repeating: whether the loops are followed, and no longer written.
     """
 
@@ -41,14 +41,14 @@ class Deadline:
     Args:
         end_s: on the clock; infinity for none.
         clock: seconds that only go forwards.
-        is_cut: whether the end is asked for at once, whatever the clock says.
-        pace: remembers what the clock decided; None for nobody.
+        is_stopped: whether the end is asked for at once, whatever the clock says.
+        loop_record: remembers what the clock decided; None for nobody.
     """
 
     end_s: float = math.inf
     clock: Callable[[], float] = field(default=time.monotonic, repr=False)
-    is_cut: Callable[[], bool] = field(default=_nobody, repr=False)
-    pace: Pace | None = field(default=None, repr=False)
+    is_stopped: Callable[[], bool] = field(default=_nobody, repr=False)
+    loop_record: LoopRecord | None = field(default=None, repr=False)
 
     @classmethod
     def after(cls, seconds: float, clock: Callable[[], float] = time.monotonic) -> Deadline:
@@ -66,15 +66,15 @@ class Deadline:
 
     def has_passed(self) -> bool:
         """Whether no time is left, as the clock says now or said then."""
-        if self.pace is None:
+        if self.loop_record is None:
             return self.remaining_s <= 0
-        known = self.pace.begin()
-        if not self.pace.repeating:
+        known = self.loop_record.begin()
+        if not self.loop_record.repeating:
             known.append(float(self.remaining_s <= 0))
         return bool(known and known[0])
 
 
-def paced(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Iterator[tuple[int, float]]:
+def timed_steps(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Iterator[tuple[int, float]]:
     """Numbers of steps, and the fraction of the whole that is done before each, from 0 to below 1.
 
     With a deadline the whole is what fits into the time left, as the steps so far suggest, so that a schedule
@@ -89,14 +89,14 @@ def paced(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Ite
         for step in range(n_steps):
             yield step, step / n_steps
         return
-    written = deadline.pace.begin() if deadline.pace else []
+    written = deadline.loop_record.begin() if deadline.loop_record else []
     steps = _by_the_clock(n_steps, deadline, least)
-    if deadline.pace and deadline.pace.repeating:
+    if deadline.loop_record and deadline.loop_record.repeating:
         steps = enumerate(written)
     for step, fraction in steps:
-        if deadline.is_cut():
+        if deadline.is_stopped():
             return
-        if deadline.pace and not deadline.pace.repeating:
+        if deadline.loop_record and not deadline.loop_record.repeating:
             written.append(fraction)
         yield step, fraction
 

@@ -21,7 +21,7 @@ from g3r.errors import InputError, cannot_be_written
 SUFFIX = ".unfinished"
 
 
-class UnfinishedRun:
+class OutputFolder:
     """The folder of one run; use it as a context, which holds the lock.
 
     At the end the folder goes, unless `stages` holds something to go on from.
@@ -45,7 +45,7 @@ class UnfinishedRun:
         self._lock: int | None = None
         self._made: list[Path] = []
 
-    def __enter__(self) -> UnfinishedRun:
+    def __enter__(self) -> OutputFolder:
         parents = [self.folder.parent, *self.folder.parent.parents]
         self._made = [path for path in parents if not path.exists()]
         try:

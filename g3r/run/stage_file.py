@@ -56,16 +56,7 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
         UnreadableStage: see there.
     """
     known = {record.__name__: record for record in records}
-    damaged = (
-        OSError,
-        EOFError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    )
+    damaged = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}

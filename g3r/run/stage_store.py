@@ -20,7 +20,7 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.record import Clock
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 from g3r.registration.atlas_frame import Orientation
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 
@@ -45,7 +45,7 @@ class PriorVolume:
     prior: NDArray[np.float32]
     gain: NDArray[np.float64]
     scale: float
-    believed: bool | None
+    accepted: bool | None
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,18 @@ class PriorCloud:
 
 
 RECORDS = (
-    MotionEstimate, PriorVolume, PriorCloud, SliceFit, FitStart, Slices, Planes, RigidPose, Orientation,
-    VolumeGrid, GaussianCloud,
-)  # fmt: skip
+    Registration,
+    PriorVolume,
+    PriorCloud,
+    SliceFit,
+    FitStart,
+    Slices,
+    Planes,
+    RigidPose,
+    Orientation,
+    VolumeGrid,
+    GaussianCloud,
+)
 """What files of stages may hold."""
 
 
@@ -75,7 +84,7 @@ class Stages:
     Args:
         clock: of the run; seconds of a stage that is read are those that it took to make.
         folder: for the files; None keeps nothing.
-        made_of: everything that decides the results, by name; None keeps nothing.
+        provenance: everything that decides the results, by name; None keeps nothing.
         resume: whether to take the stages that are there already, rather than to begin anew.
 
     Raises:
@@ -86,7 +95,7 @@ class Stages:
         self,
         clock: Clock | None = None,
         folder: Path | None = None,
-        made_of: Mapping[str, str] | None = None,
+        provenance: Mapping[str, str] | None = None,
         *,
         resume: bool = False,
     ) -> None:
@@ -97,13 +106,11 @@ class Stages:
             return
         told = folder / "made_of.json"
         if resume and told.exists():
-            _refuse_other(folder, told, made_of or {})
+            _refuse_other(folder, told, provenance or {})
         self.reads = resume
-        self._begin(told, made_of or {})
+        self._begin(told, provenance or {})
 
-    def once(
-        self, name: str, make: Callable[[], Result], unless: Callable[[], bool] = lambda: False
-    ) -> Result:
+    def once(self, name: str, make: Callable[[], Result], unless: Callable[[], bool] = lambda: False) -> Result:
         """What a stage gives: read if it was finished, else made, and kept if it can be.
 
         Args:
@@ -127,13 +134,11 @@ class Stages:
         value = as_stored(make(), RECORDS)
         if path is not None and not unless():
             new = [key for key in self.clock.seconds if key not in before]
-            took = tuple(
-                {key: told[key] for key in new} for told in (self.clock.seconds, self.clock.cpu_seconds)
-            )
+            took = tuple({key: told[key] for key in new} for told in (self.clock.seconds, self.clock.cpu_seconds))
             self._keep(path, (*took, value))
         return value
 
-    def _begin(self, told: Path, made_of: Mapping[str, str]) -> None:
+    def _begin(self, told: Path, provenance: Mapping[str, str]) -> None:
         assert self.folder is not None
         try:
             if not self.reads and self.folder.exists():
@@ -141,7 +146,7 @@ class Stages:
                     path.unlink()
             self.folder.mkdir(parents=True, exist_ok=True)
             beside = told.with_name(f".{told.name}")
-            beside.write_text(json.dumps(dict(made_of), indent=2) + "\n", encoding="utf-8")
+            beside.write_text(json.dumps(dict(provenance), indent=2) + "\n", encoding="utf-8")
             os.replace(beside, told)
         except OSError as error:
             self._give_up(error)
@@ -154,16 +159,14 @@ class Stages:
 
     def _give_up(self, error: OSError) -> None:
         """Go on without files: the result matters more than a way back to it."""
-        logger.warning(
-            "%s: stages cannot be kept (%s); --resume will not find them", self.folder, error.strerror
-        )
+        logger.warning("%s: stages cannot be kept (%s); --resume will not find them", self.folder, error.strerror)
         self.folder = None
 
 
-def _refuse_other(folder: Path, told: Path, made_of: Mapping[str, str]) -> None:
+def _refuse_other(folder: Path, told: Path, provenance: Mapping[str, str]) -> None:
     try:
         then = json.loads(told.read_text(encoding="utf-8"))
-        differing = sorted(key for key in {*then, *made_of} if then.get(key) != made_of.get(key))
+        differing = sorted(key for key in {*then, *provenance} if then.get(key) != provenance.get(key))
     except (OSError, ValueError, AttributeError, TypeError):
         differing = ["a file that cannot be read"]
     if differing:

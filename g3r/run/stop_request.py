@@ -11,11 +11,11 @@ from g3r.run.deadline import Deadline
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Interruption:
+class StopRequest:
     """Listens to both signals while it is entered.
 
     The first one raises `KeyboardInterrupt` wherever the program is, until `postpone` is called; from then on
-    it only sets `asked`, for loops to look at. A second one always raises.
+    it only sets `is_requested`, for loops to look at. A second one always raises.
 
     Kernels are never cut: Python handles signals between two of its own instructions.
     """
@@ -25,7 +25,7 @@ class Interruption:
         self._postponed = False
         self._before: dict[int, object] = {}
 
-    def __enter__(self) -> Interruption:
+    def __enter__(self) -> StopRequest:
         for number in SIGNALS:
             try:
                 self._before[number] = signal.signal(number, self._heard)
@@ -39,7 +39,7 @@ class Interruption:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
 
-    def asked(self) -> bool:
+    def is_requested(self) -> bool:
         """Whether the end was asked for."""
         return self.signal is not None
 
@@ -49,7 +49,7 @@ class Interruption:
 
     def cut(self, deadline: Deadline | None) -> Deadline:
         """A deadline that also comes when the end is asked for."""
-        return replace(deadline or Deadline(), is_cut=self.asked)
+        return replace(deadline or Deadline(), is_stopped=self.is_requested)
 
     @property
     def exit_code(self) -> int:

@@ -81,10 +81,7 @@ class AnnealedModule(LightningModule):
         # Without normalisation layers one batch can have a far larger gradient than those before; with the
         # usual 0.999 the second moment is then too small and a single step throws the network far off.
         optimizer = torch.optim.AdamW(
-            self.parameters(),
-            lr=self.learning_rate,
-            betas=(0.9, 0.95),
-            weight_decay=self.weight_decay,
+            self.parameters(), lr=self.learning_rate, betas=(0.9, 0.95), weight_decay=self.weight_decay
         )
         total = self.trainer.estimated_stepping_batches
         self._total_steps = float(total) if total > 0 else math.inf

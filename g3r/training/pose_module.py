@@ -30,8 +30,8 @@ SECOND_REFINEMENT_SHARE = 0.2
 """Share of training batches that refine twice, so that a refinement also knows good poses."""
 DISTURBED_SHARE = 0.6
 """Share of heads whose poses are disturbed before a refinement, by at most these deviations per axis."""
-STACK_TURN_RAD, STACK_SHIFT_MM = 0.3, 6.0
-SLICE_TURN_RAD, SLICE_SHIFT_MM = 0.1, 2.5
+STACK_ROTATION_RAD, STACK_TRANSLATION_MM = 0.3, 6.0
+SLICE_ROTATION_RAD, SLICE_TRANSLATION_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
 """Weight of the votes' squared error (0 to 3, no unit) beside the distances."""
 N_PANEL_SLICES = 12
@@ -210,9 +210,7 @@ def point_loss(step: PoseStep, batch: Batch) -> Tensor:
     return (weight[:, None] * distance).mean() / weight.mean()
 
 
-def disturbed(
-    rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor
-) -> tuple[Tensor, Tensor]:
+def disturbed(rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor) -> tuple[Tensor, Tensor]:
     """Poses with errors of a random size for each head: common to a stack, and of each slice."""
     n_stacks, n_sets, n = len(set_of_stack), int(set_of_stack.max()) + 1, len(stack)
 
@@ -222,11 +220,11 @@ def disturbed(
     chosen = torch.rand(2, n_sets, 1, dtype=rotation.dtype, device=rotation.device)
     size = chosen[0] * (chosen[1] < DISTURBED_SHARE)
     of_stack, of_slice = size[set_of_stack], size[set_of_stack[stack]]
-    turn = rotation_from_vector(normal(n_stacks) * of_stack * STACK_TURN_RAD)[stack]
-    shift = (normal(n_stacks) * of_stack * STACK_SHIFT_MM)[stack]
+    turn = rotation_from_vector(normal(n_stacks) * of_stack * STACK_ROTATION_RAD)[stack]
+    shift = (normal(n_stacks) * of_stack * STACK_TRANSLATION_MM)[stack]
     moved = (turn @ translation_mm[..., None])[..., 0] + shift
-    own = rotation_from_vector(normal(n) * of_slice * SLICE_TURN_RAD)
-    return turn @ rotation @ own, moved + normal(n) * of_slice * SLICE_SHIFT_MM
+    own = rotation_from_vector(normal(n) * of_slice * SLICE_ROTATION_RAD)
+    return turn @ rotation @ own, moved + normal(n) * of_slice * SLICE_TRANSLATION_MM
 
 
 def vote_loss(step: PoseStep, batch: Batch) -> Tensor:

@@ -7,10 +7,7 @@ from typing import Any
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
-from torchmetrics.functional.image import (
-    peak_signal_noise_ratio,
-    structural_similarity_index_measure,
-)
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from g3r.errors import InputError
 from g3r.prior.checkpoint import VOXEL_MM_TOLERANCE, load_prior
@@ -27,7 +24,7 @@ entries are left as they are."""
 VALIDATED = ("prior", "sharp", "coarse")
 """Volumes that are scored: the network's, and what it starts from."""
 METRICS = ("l1", "psnr", "ssim")
-MOST_STACKS = 12
+MAX_STACKS = 12
 """More count as so many."""
 PANEL_TAG = "coarse, sharp, confidence, gate, prior, truth, 4 x error"
 
@@ -131,7 +128,7 @@ class PriorModule(AnnealedModule):
     def on_validation_epoch_start(self) -> None:
         """Forget the last epoch's scores and images."""
         # sum and number of each score, for each number of stacks; row 0 is everything
-        shape = (MOST_STACKS + 1, len(VALIDATED), len(METRICS), 2)
+        shape = (MAX_STACKS + 1, len(VALIDATED), len(METRICS), 2)
         self._sums = torch.zeros(shape, dtype=torch.float64)
         self._panels = {}
 
@@ -169,9 +166,11 @@ class PriorModule(AnnealedModule):
             if isinstance(logger, TensorBoardLogger):
                 for n, image in sorted(self._panels.items()):
                     logger.experiment.add_image(
-                        f"val/{stacks_suffix(n).removeprefix('_') or 'volume'}: {PANEL_TAG}", image,
-                        global_step=self.global_step, dataformats="HW",
-                    )  # fmt: skip
+                        f"val/{stacks_suffix(n).removeprefix('_') or 'volume'}: {PANEL_TAG}",
+                        image,
+                        global_step=self.global_step,
+                        dataformats="HW",
+                    )
 
     # ---- what an export needs -------------------------------------------------------------------------
 
@@ -187,9 +186,7 @@ class PriorModule(AnnealedModule):
         spacing_mm = settings.get("spacing_mm", getattr(data, "spacing_mm", None))
         if self.voxel_mm is None:
             if spacing_mm is None:
-                raise InputError(
-                    "model.voxel_mm: not given, and the data module has no spacing_mm; pass either"
-                )
+                raise InputError("model.voxel_mm: not given, and the data module has no spacing_mm; pass either")
             self.voxel_mm = float(spacing_mm)
         elif spacing_mm is not None and abs(self.voxel_mm - float(spacing_mm)) > VOXEL_MM_TOLERANCE:
             raise InputError(
@@ -299,10 +296,10 @@ def scores_in_mask(volume: Tensor, truth: Tensor, mask: Tensor) -> dict[str, lis
 
 
 def stack_numbers(batch: Batch) -> list[int]:
-    """How many stacks each sample was made of, at most `MOST_STACKS`; 0 where the batch does not say."""
+    """How many stacks each sample was made of, at most `MAX_STACKS`; 0 where the batch does not say."""
     if "n_stacks" not in batch:
         return [0] * len(batch["truth"])
-    return [min(int(n), MOST_STACKS) for n in batch["n_stacks"]]
+    return [min(int(n), MAX_STACKS) for n in batch["n_stacks"]]
 
 
 def stacks_suffix(n_stacks: int) -> str:
@@ -314,7 +311,7 @@ def validation_scores(sums: Tensor) -> dict[str, float]:
     """Means by name: `psnr_prior`, `psnr_prior_1stack`, `psnr_gain` (prior less V_coarse) and so on.
 
     Args:
-        sums: [`MOST_STACKS` + 1, volumes, metrics, 2], sums of the scores and their numbers.
+        sums: [`MAX_STACKS` + 1, volumes, metrics, 2], sums of the scores and their numbers.
     """
     result: dict[str, float] = {}
     for n, of_volume in enumerate(sums.double().cpu()):

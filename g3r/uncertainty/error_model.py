@@ -31,12 +31,12 @@ LEAST = {"log residual": 0.3}
 calibration, and a model that learnt from the others to overlook misfit would not see a bad registration."""
 
 
-def terms(evidence: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+def terms(predictors: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """What the logarithm of the answer is linear in, by name: each [n], larger where more is in doubt."""
-    found = {f"log {name}": np.log(evidence[name] + floor) for name, floor in FLOORS.items()}
-    found["rim"] = np.exp(-evidence["depth_mm"] / DEPTH_MM)
-    if "prior_share" in evidence:
-        found["prior_share"] = evidence["prior_share"]
+    found = {f"log {name}": np.log(predictors[name] + floor) for name, floor in FLOORS.items()}
+    found["rim"] = np.exp(-predictors["depth_mm"] / DEPTH_MM)
+    if "prior_share" in predictors:
+        found["prior_share"] = predictors["prior_share"]
     return found
 
 
@@ -52,13 +52,13 @@ class ErrorModel:
     intercept: float
     coefficients: dict[str, float]
 
-    def expected(self, evidence: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    def expected(self, predictors: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
         """Expected absolute error u [n], in normalised intensities.
 
         Raises:
             ValueError: evidence that the model was fitted with is missing.
         """
-        found = terms(evidence)
+        found = terms(predictors)
         missing = sorted(set(self.coefficients) - set(found))
         if missing:
             raise ValueError(f"no evidence for {', '.join(missing)}")
@@ -67,9 +67,7 @@ class ErrorModel:
 
 
 def fit_model(
-    samples: Mapping[str, NDArray[np.float64]],
-    error: NDArray[np.float64],
-    weight: NDArray[np.float64] | None = None,
+    samples: Mapping[str, NDArray[np.float64]], error: NDArray[np.float64], weight: NDArray[np.float64] | None = None
 ) -> ErrorModel:
     """The model under which the errors are most likely, with an exponential distribution of mean u.
 
@@ -106,9 +104,7 @@ def fit_model(
     bounds = [(None, None), *[(float(bound), None) for bound in least]]
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     slopes = found[1:] / spread
-    return ErrorModel(
-        float(found[0] - slopes @ middle), {n: float(b) for n, b in zip(names, slopes, strict=True)}
-    )
+    return ErrorModel(float(found[0] - slopes @ middle), {n: float(b) for n, b in zip(names, slopes, strict=True)})
 
 
 def save_calibration(path: Path, models: Mapping[str, ErrorModel], fitted_on: Mapping[str, Any]) -> None:

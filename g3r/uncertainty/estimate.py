@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty.error_model import ErrorModel, load_calibration
-from g3r.uncertainty.predictors import gather_evidence, mean_residual
+from g3r.uncertainty.predictors import gather_predictors, mean_residual
 from g3r.uncertainty.prior_share import on_grid
 
 CALIBRATION = Path(__file__).parent / "calibration.json"
@@ -26,9 +26,7 @@ MEANING = "expected absolute error of volume.nii.gz, in its intensity units"
 MOSTLY_PRIOR = 0.5
 """A voxel whose prior share is larger shows more of the prior than of the slices."""
 
-DOUBTED_NOTE = (
-    "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
-)
+UNRELIABLE_NOTE = "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
 UNCHECKED_NOTE = "a single stack: nothing but the prior checks where its slices lie"
 
 
@@ -57,7 +55,7 @@ def estimate_uncertainty(
     prior_share: NDArray[np.float32] | None = None,
     with_prior: bool = True,
     intensity: float = 1.0,
-    trusted: bool | None = True,
+    reliable: bool | None = True,
 ) -> Uncertainty:
     """The expected absolute error of every voxel of the mask.
 
@@ -76,11 +74,11 @@ def estimate_uncertainty(
         prior_share: [I, J, K] on `grid`; None where no network was used.
         with_prior: whether one was used: there is a calibration for each.
         intensity: what 1 stands for; the map is multiplied by it.
-        trusted: whether the registration is; None where nothing checks it.
+        reliable: whether the registration is; None where nothing checks it.
     """
-    evidence = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
+    predictors = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
     name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
-    found = uncertainty_of(evidence, calibration()[name], name, mask, intensity, trusted)
+    found = uncertainty_of(predictors, calibration()[name], name, mask, intensity, reliable)
     if prior_share is not None:
         found.record["prior_share"] = prior_share_summary(prior_share[mask])
     return found
@@ -97,25 +95,27 @@ def collect(
     prior_share: NDArray[np.float32] | None,
 ) -> dict[str, NDArray[np.float64]]:
     """The evidence on the voxels of the mask; see `estimate_uncertainty` for the arguments."""
-    return gather_evidence(
-        volume, mask, grid,
-        residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.shading, grid),
+    return gather_predictors(
+        volume,
+        mask,
+        grid,
+        residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.bias_field, grid),
         density=on_grid(density, prior_grid, grid, outside=0.0),
         prior=on_grid(prior, prior_grid, grid, outside=0.0),
         prior_share=prior_share,
-    )  # fmt: skip
+    )
 
 
 def uncertainty_of(
-    evidence: dict[str, NDArray[np.float64]],
+    predictors: dict[str, NDArray[np.float64]],
     model: ErrorModel,
     name: str,
     mask: NDArray[np.bool_],
     intensity: float,
-    trusted: bool | None,
+    reliable: bool | None,
 ) -> Uncertainty:
     """The map of one model, and its record."""
-    error = model.expected(evidence)
+    error = model.expected(predictors)
     expected = np.zeros(mask.shape, np.float32)
     expected[mask] = error * intensity
     record: dict[str, Any] = {
@@ -124,10 +124,10 @@ def uncertainty_of(
         "p90_in_mask": float(np.percentile(error, 90)) * intensity,
         "median_over_brightest": float(np.median(error)),
         "calibration": name,
-        "registration_trusted": trusted,
+        "registration_reliable": reliable,
     }
-    if trusted is not True:
-        record["note"] = UNCHECKED_NOTE if trusted is None else DOUBTED_NOTE
+    if reliable is not True:
+        record["note"] = UNCHECKED_NOTE if reliable is None else UNRELIABLE_NOTE
     return Uncertainty(expected, record)
 
 

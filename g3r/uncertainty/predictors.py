@@ -9,16 +9,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import (
-    distance_transform_edt,
-    gaussian_filter,
-    gaussian_gradient_magnitude,
-)
+from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_gradient_magnitude
 
 from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
-from g3r.fitting.bias_field import StackShading
+from g3r.fitting.bias_field import StackBiasField
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty.prior_share import on_grid
@@ -40,7 +36,7 @@ def mean_residual(
     slices: Slices,
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
-    shading: list[list[float]],
+    bias_field: list[list[float]],
     grid: VolumeGrid,
 ) -> NDArray[np.float32]:
     """Mean absolute difference [I, J, K] of pixels and rendered slices around each voxel.
@@ -53,13 +49,13 @@ def mean_residual(
         slices: K slices in their last poses, intensities as the cloud's.
         gain: [K] intensity factor of each slice.
         weight: [K] trust in each slice.
-        shading: coefficients of the stacks' fields; empty where there are none.
+        bias_field: coefficients of the stacks' fields; empty where there are none.
         grid: of the result.
     """
     log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
     rendered = render(cloud, slices.planes, log_gain=log_gain).numpy()
-    if shading:
-        rendered = rendered * np.exp(StackShading(slices).log_field(np.array(shading)))
+    if bias_field:
+        rendered = rendered * np.exp(StackBiasField(slices).log_field(np.array(bias_field)))
     size = np.abs(slices.value - rendered)[slices.pixel_index] / gain[slices.pixel_plane]
     low, high = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
     coarse = VolumeGrid.isotropic(np.minimum(low, high), np.maximum(low, high), RESIDUAL_VOXEL_MM)
@@ -74,7 +70,7 @@ def mean_residual(
     return on_grid(local, coarse, grid, outside=float(typical))
 
 
-def gather_evidence(
+def gather_predictors(
     volume: NDArray[np.float32],
     mask: NDArray[np.bool_],
     grid: VolumeGrid,
@@ -105,21 +101,21 @@ def gather_evidence(
     inside = mask[box]
     # what lies outside of the head is zero: its edge is no edge of the brain, so continue the head outwards
     image = _continued(np.asarray(volume[box], np.float32), inside)
-    evidence: dict[str, NDArray[np.float64]] = {}
+    predictors: dict[str, NDArray[np.float64]] = {}
 
     def keep(name: str, values: NDArray[np.floating]) -> None:
         # one after the other: fine voxels make every whole map a large one
-        evidence[name] = values[inside].astype(np.float64)
+        predictors[name] = values[inside].astype(np.float64)
 
     keep("unmeasured", 1 - confidence(density[box]))
     keep("from_prior", np.abs(volume[box] - prior[box]))
     keep("edge", gaussian_gradient_magnitude(image, EDGE_SIGMA_MM / spacing) / spacing.mean())
     keep("texture", _local_deviation(image, TEXTURE_SIGMA_MM / spacing))
     keep("residual", residual[box])
-    evidence["depth_mm"] = _depth_mm(inside, spacing)
+    predictors["depth_mm"] = _depth_mm(inside, spacing)
     if prior_share is not None:
         keep("prior_share", prior_share[box])
-    return evidence
+    return predictors
 
 
 def _local_deviation(image: NDArray[np.float32], sigma: NDArray[np.float64]) -> NDArray[np.float32]:

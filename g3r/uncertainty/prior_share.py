@@ -1,8 +1,8 @@
 """How far each voxel of a result rests on the prior: the fit's answer to a change of the prior.
 
 If the prior had been wrong by some amount, how much of that would still be in the volume after the slices
-have had their say? Rendered pixels are linear in the peaks, so this can be asked of the finished fit: the
-peaks are changed at random, as another prior would have changed them, the slices stay as they are, and
+have had their say? Rendered pixels are linear in the amplitudes, so this can be asked of the finished fit: the
+amplitudes are changed at random, as another prior would have changed them, the slices stay as they are, and
 conjugate gradients take back what the slices contradict. What is left, as a share of what was put in, is the
 prior's share.
 """
@@ -17,8 +17,8 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.fitting.slice_stage import SliceFit
-from g3r.gaussians import GaussianCloud, render, solve_peaks
-from g3r.gaussians.amplitudes import RECORD_BYTES_AT_MOST
+from g3r.gaussians import GaussianCloud, render, solve_amplitudes
+from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.geometry import VolumeGrid
 
 N_PROBES = 2
@@ -28,7 +28,7 @@ SMOOTHING_MM = 3.2
 
 ANSWER_ITERATIONS = 20
 ANSWER_DAMPING = 0.01
-"""Conjugate-gradient steps and pull towards the changed peaks that answer as the whole fit does: checked by
+"""Conjugate-gradient steps and pull towards the changed amplitudes that answer as the whole fit does: checked by
 changing the prior volume itself and fitting again (tests/fitting/test_prior_share.py)."""
 
 
@@ -40,7 +40,7 @@ def estimate_prior_share(
     grid: VolumeGrid,
     rng: np.random.Generator,
     n_probes: int = N_PROBES,
-    record_bytes: int = RECORD_BYTES_AT_MOST,
+    projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
     """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
 
@@ -57,13 +57,13 @@ def estimate_prior_share(
         grid: of the answer.
         rng: draws the changes.
         n_probes: number of random changes; their answers are averaged.
-        record_bytes: see `solve_peaks`.
+        projection_bytes: see `solve_amplitudes`.
 
     Returns:
         [I, J, K] float32 in [0, 1].
     """
     unseen = 1 - on_grid(confidence(density), density_grid, grid, outside=0.0)
-    left = on_grid(remaining_share(fit, grid, rng, n_probes, record_bytes), _coarse(grid), grid, outside=1.0)
+    left = on_grid(remaining_share(fit, grid, rng, n_probes, projection_bytes), _coarse(grid), grid, outside=1.0)
     share = np.maximum(np.clip(left, 0, 1), np.clip(unseen, 0, 1) ** 2)
     return np.where(mask, share, 1.0).astype(np.float32)
 
@@ -73,16 +73,16 @@ def remaining_share(
     grid: VolumeGrid,
     rng: np.random.Generator,
     n_probes: int = N_PROBES,
-    record_bytes: int = RECORD_BYTES_AT_MOST,
+    projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
-    """r: how much of a random change of the peaks the slices leave standing, on a coarse grid over `grid`.
+    """r: how much of a random change of the amplitudes the slices leave standing, on a coarse grid over `grid`.
 
     The local regression of what is left on what was put in, <left, put in> / <put in, put in>, with means
     over a Gaussian neighbourhood and all probes; 1 where no Gaussian reaches.
     """
     slices, coarse = fit.slices, _coarse(grid)
     planes, sampling = slices.planes, volume_planes(coarse)
-    trust = slices.mask * fit.weight[planes.plane_id()]
+    slice_weight = slices.mask * fit.weight[planes.plane_id()]
     nothing = np.zeros(planes.n_pixels, np.float32)
     sigma = SMOOTHING_MM / coarse.spacing_mm
     together, square = np.zeros(coarse.shape), np.zeros(coarse.shape)
@@ -92,11 +92,17 @@ def remaining_share(
 
     for _ in range(n_probes):
         change = torch.from_numpy(rng.standard_normal(len(fit.cloud)).astype(np.float32))
-        probe = fit.cloud.with_peak(change)
-        answer = solve_peaks(
-            probe, planes, nothing, trust.astype(np.float32), gain=fit.gain,
-            n_iterations=ANSWER_ITERATIONS, damping=ANSWER_DAMPING, record_bytes=record_bytes,
-        )  # fmt: skip
+        probe = fit.cloud.with_amplitude(change)
+        answer = solve_amplitudes(
+            probe,
+            planes,
+            nothing,
+            slice_weight.astype(np.float32),
+            gain=fit.gain,
+            n_iterations=ANSWER_ITERATIONS,
+            damping=ANSWER_DAMPING,
+            projection_bytes=projection_bytes,
+        )
         put_in, left = volume(probe), volume(answer)
         together += gaussian_filter(left * put_in, sigma)
         square += gaussian_filter(put_in**2, sigma)
@@ -105,17 +111,14 @@ def remaining_share(
     return np.where(reached, together / np.where(reached, square, 1), 1).astype(np.float32)
 
 
-def on_grid(
-    data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float
-) -> NDArray[np.float32]:
+def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float) -> NDArray[np.float32]:
     """A map [I, J, K] read on another grid by trilinear interpolation."""
     if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
         return data.astype(np.float32)
     index = source.index_from_world @ target.affine
     return affine_transform(
-        data.astype(np.float32), index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant",
-        cval=outside,
-    )  # fmt: skip
+        data.astype(np.float32), index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant", cval=outside
+    )
 
 
 def _coarse(grid: VolumeGrid) -> VolumeGrid:

@@ -51,13 +51,9 @@ def draw_lesions_kept(runs: Sequence[LesionRun], variants: Sequence[str], path: 
             for row, (name, volume, kept) in enumerate(rows):
                 panel = panels[row, block * len(KINDS) + column]
                 shown = _section(volume, run.subject.grid, lesion.center_mm, HALF_WIDTH_MM[kind])
-                panel.imshow(
-                    shown.T, cmap="gray", vmin=0, vmax=high, origin="lower", interpolation="bilinear"
-                )
+                panel.imshow(shown.T, cmap="gray", vmin=0, vmax=high, origin="lower", interpolation="bilinear")
                 _quiet(panel)
-                panel.text(
-                    0.03, 0.03, kept, transform=panel.transAxes, color="#e8b04a", fontsize=10, va="bottom"
-                )
+                panel.text(0.03, 0.03, kept, transform=panel.transAxes, color="#e8b04a", fontsize=10, va="bottom")
                 if row == 0:
                     stacks = f"{run.n_stacks} stack{'s' * (run.n_stacks > 1)}"
                     panel.set_title(f"{kind}, {stacks}", color="#c8c8c8", fontsize=10)

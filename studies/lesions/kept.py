@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
 """Weeks that no training and no choice has seen."""
 
-DEVELOPMENT_VOLUMES = (
-    "spina-bifida/sb26-operated", "spina-bifida/sb30-operated", "spina-bifida/sb33-operated",
-)  # fmt: skip
+DEVELOPMENT_VOLUMES = ("spina-bifida/sb26-operated", "spina-bifida/sb30-operated", "spina-bifida/sb33-operated")
 
 FIRST_SEED, DEVELOPMENT_SEED = 52_300, 51_300
 
@@ -49,9 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--subjects", type=int, default=3, metavar="N", help="heads, week after week")
     parser.add_argument("--stacks", nargs="+", type=int, choices=STACK_NUMBERS, default=list(STACK_NUMBERS))
-    parser.add_argument(
-        "--development", action="store_true", help="another atlas, seeds that may be looked at"
-    )
+    parser.add_argument("--development", action="store_true", help="another atlas, seeds that may be looked at")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw sections of the first head")
     return parser
 
@@ -80,9 +76,10 @@ def _run(options: argparse.Namespace) -> int:
     settings = preset_settings(options.preset)
     # at the true poses no slice may move, or the two reconstructions of a pair would differ by that too
     settings = replace(
-        settings, motion=replace(settings.motion, runs=False),
+        settings,
+        registration=replace(settings.registration, segments=False),
         slice_stage=replace(settings.slice_stage, optimise_poses=False),
-    )  # fmt: skip
+    )
     reconstructors = {
         WITHOUT_PRIOR: GaussianReconstructor(None, replace(settings, use_prior=False)),
         WITH_PRIOR: GaussianReconstructor(options.ckpt, settings),
@@ -91,9 +88,11 @@ def _run(options: argparse.Namespace) -> int:
     first_seed = DEVELOPMENT_SEED if options.development else FIRST_SEED
     start = time.perf_counter()
     record: dict[str, Any] = {
-        "preset": options.preset, "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
-        "machine": machine(), "rows": [],
-    }  # fmt: skip
+        "preset": options.preset,
+        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "machine": machine(),
+        "rows": [],
+    }
     shown: list[LesionRun] = []
     for n in range(options.subjects):
         subject = lesion_subject(volumes[n % len(volumes)], first_seed + n, atlas)
@@ -132,28 +131,24 @@ def lesion_text(record: dict[str, Any]) -> str:
             ratios = [row["kept"][WITH_PRIOR] / row["kept"][WITHOUT_PRIOR] for row in of_kind]
             shares = [_spread([row["kept"][variant] for row in of_kind]) for variant in VARIANTS]
             summary.append(
-                [
-                    _NAMES[kind],
-                    n,
-                    len(of_kind),
-                    *shares,
-                    _spread(ratios),
-                    f"{min(ratios):.2f}",
-                    f"{WANTED_SHARE:.2f}",
-                ]
+                [_NAMES[kind], n, len(of_kind), *shares, _spread(ratios), f"{min(ratios):.2f}", f"{WANTED_SHARE:.2f}"]
             )
     each = [
-        [row["subject"], row["n_stacks"], row["kind"], *(f"{row['kept'][v]:.2f}" for v in VARIANTS)]
-        for row in rows
+        [row["subject"], row["n_stacks"], row["kind"], *(f"{row['kept'][v]:.2f}" for v in VARIANTS)] for row in rows
     ]
     lines = [
         f"Preset `{record['preset']}`, weights {record['weights']}. Share of the true contrast that is kept "
         "(1: all, 0: the lesion is not there), mean ± standard deviation over lesions; then the ratio that "
         f"is wanted to be at least {WANTED_SHARE:.2f}.",
-        "", markdown_table(head, summary), "",
-        "<details><summary>Every lesion</summary>", "",
-        markdown_table(["subject", "stacks", "lesion", *VARIANTS], each), "", "</details>",
-    ]  # fmt: skip
+        "",
+        markdown_table(head, summary),
+        "",
+        "<details><summary>Every lesion</summary>",
+        "",
+        markdown_table(["subject", "stacks", "lesion", *VARIANTS], each),
+        "",
+        "</details>",
+    ]
     return "\n".join(lines)
 
 

@@ -20,9 +20,9 @@ from g3r.geometry import VolumeGrid
 from g3r.geometry.rigid import RigidPose
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 from studies.lesions.volumes import Lesion, draw_lesions, kept, load_labels, with_lesions
-from studies.subjects import BRIGHT, SubjectRecipe, _stretched
+from studies.subjects import BRIGHT, SubjectSpec, _stretched
 
 MARGIN_VOXELS = 4
 MOTION = "mild"
@@ -69,11 +69,13 @@ class LesionRun:
         """A row for each lesion."""
         return [
             {
-                "subject": self.subject.name, "n_stacks": self.n_stacks, "kind": lesion.kind,
+                "subject": self.subject.name,
+                "n_stacks": self.n_stacks,
+                "kind": lesion.kind,
                 "kept": {variant: shares[k] for variant, shares in self.kept.items()},
             }
             for k, lesion in enumerate(self.subject.lesions)
-        ]  # fmt: skip
+        ]
 
     def line(self) -> str:
         """Shares kept, for the terminal."""
@@ -92,26 +94,27 @@ def lesion_subject(volume: str, seed: int, atlas: Path) -> LesionSubject:
     """
     name = f"{MOTION}-{seed}-{volume.rsplit('/', 1)[-1]}"
     chosen = find_subjects(atlas, include=[volume])[0]
-    recipe = SubjectRecipe(name, volume, MOTION, seed)
+    spec = SubjectSpec(name, volume, MOTION, seed)
     head = cropped(load_subject(chosen, spacing_mm=None), MARGIN_VOXELS)
-    healthy = _stretched(head, recipe, np.random.default_rng(seed))
+    healthy = _stretched(head, spec, np.random.default_rng(seed))
     labels = load_labels(chosen.image, chosen.mask, MARGIN_VOXELS).data
     lesions = draw_lesions(healthy, labels, BRIGHT, np.random.default_rng([seed, 1]))
     stacks = {
         which: simulate_stacks(
-            head.data, head.mask, head.affine, orthogonal_settings(3, MOTION),
-            np.random.default_rng([seed, 2]), fine=True,
+            head.data,
+            head.mask,
+            head.affine,
+            orthogonal_settings(3, MOTION),
+            np.random.default_rng([seed, 2]),
+            fine=True,
         )
         for which, head in (("healthy", healthy), ("lesions", with_lesions(healthy, lesions)))
-    }  # fmt: skip
+    }
     return LesionSubject(name, healthy, tuple(lesions), stacks)
 
 
 def lesion_run(
-    subject: LesionSubject,
-    n_stacks: int,
-    reconstructors: Mapping[str, GaussianReconstructor],
-    prior_alone: str,
+    subject: LesionSubject, n_stacks: int, reconstructors: Mapping[str, GaussianReconstructor], prior_alone: str
 ) -> LesionRun:
     """Reconstruct a head twice by each variant and compare the difference with the lesions.
 
@@ -147,7 +150,7 @@ def lesion_run(
     return LesionRun(subject, n_stacks, volumes, changes, shares, seconds)
 
 
-def true_motion(stacks: list[SimulatedStack]) -> MotionEstimate:
+def true_motion(stacks: list[SimulatedStack]) -> Registration:
     """What a registration without error would give for simulated stacks."""
     slices = slices_from_stacks([one.stack for one in stacks])
     rotation = np.concatenate([one.true_pose.rotation for one in stacks])
@@ -158,11 +161,18 @@ def true_motion(stacks: list[SimulatedStack]) -> MotionEstimate:
     is_void = np.concatenate([one.is_void for one in stacks])[row]
     pose = RigidPose(rotation[row], shift[row])
     n = len(stacks)
-    return MotionEstimate(
-        slices.with_pose(pose @ slices.header_pose), gain / np.exp(np.log(gain).mean()),
-        np.where(is_void, VOID_WEIGHT, 1.0), np.ones(len(slices)), [1.0] * n if n > 1 else None, "true poses",
-        {}, [None] * n, [1] * n, None,
-    )  # fmt: skip
+    return Registration(
+        slices.with_pose(pose @ slices.header_pose),
+        gain / np.exp(np.log(gain).mean()),
+        np.where(is_void, VOID_WEIGHT, 1.0),
+        np.ones(len(slices)),
+        [1.0] * n if n > 1 else None,
+        "true poses",
+        {},
+        [None] * n,
+        [1] * n,
+        None,
+    )
 
 
 def _on_truth(data: NDArray[np.float32], grid: VolumeGrid, subject: LesionSubject) -> NDArray[np.float32]:

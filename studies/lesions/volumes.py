@@ -20,10 +20,10 @@ DIAMETER_MM = 6.0
 BRIGHT_LEVEL, DARK_LEVEL = 1.0, 0.15
 """Intensity of the spheres; 1 is the 99.5th percentile in the mask, about that of fluid."""
 
-LEAST_CONTRAST = 0.35
+MIN_CONTRAST = 0.35
 """Between a sphere and the tissue that it replaces (mean of it), in the same unit."""
 
-LEAST_DEPTH_MM = 7.0
+MIN_DEPTH_MM = 7.0
 """Of a sphere's middle below the rim of the mask: all of it and some tissue around it are brain."""
 
 APART_MM = 16.0
@@ -91,11 +91,7 @@ def load_labels(volume_file: Path, mask_file: Path, margin_voxels: int) -> Truth
 
 
 def draw_lesions(
-    truth: TruthVolume,
-    labels: NDArray[np.floating],
-    bright: float,
-    rng: np.random.Generator,
-    n_of_each: int = 2,
+    truth: TruthVolume, labels: NDArray[np.floating], bright: float, rng: np.random.Generator, n_of_each: int = 2
 ) -> list[Lesion]:
     """An enlarged ventricle, and spheres at random places of a head.
 
@@ -113,7 +109,7 @@ def draw_lesions(
     lesions = [_ventricle(truth, labels, grid, rng)]
     spacing = grid.spacing_mm
     depth = distance_transform_edt(np.pad(truth.mask, 1), sampling=spacing)[1:-1, 1:-1, 1:-1]
-    free = (depth > LEAST_DEPTH_MM) & ~(labels == VENTRICLE_LABEL)
+    free = (depth > MIN_DEPTH_MM) & ~(labels == VENTRICLE_LABEL)
     free &= distance_transform_edt(lesions[0].change == 0, sampling=spacing) > APART_MM / 2
     width = np.maximum(np.round(DIAMETER_MM / spacing).astype(int), 1)
     mean = uniform_filter(truth.data / np.float32(bright), width.tolist())
@@ -121,11 +117,9 @@ def draw_lesions(
     for kind, level in (("bright", BRIGHT_LEVEL), ("dark", DARK_LEVEL)):
         for _ in range(n_of_each):
             contrast = (level - mean) if kind == "bright" else (mean - level)
-            places = np.argwhere(free & (contrast > LEAST_CONTRAST))
+            places = np.argwhere(free & (contrast > MIN_CONTRAST))
             if len(places) == 0:
-                raise InputError(
-                    f"{truth.name}: no room for a {kind} sphere of {DIAMETER_MM:g} mm; use fewer lesions"
-                )
+                raise InputError(f"{truth.name}: no room for a {kind} sphere of {DIAMETER_MM:g} mm; use fewer lesions")
             center = grid.world(places[rng.integers(len(places))])
             one = _sphere(truth, grid, center, kind, level * bright)
             lesions.append(one)
@@ -139,9 +133,7 @@ def with_lesions(truth: TruthVolume, lesions: Sequence[Lesion]) -> TruthVolume:
     return replace(truth, data=truth.data + sum((one.change for one in lesions), np.zeros((), np.float32)))
 
 
-def _sphere(
-    truth: TruthVolume, grid: VolumeGrid, center_mm: NDArray[np.float64], kind: str, level: float
-) -> Lesion:
+def _sphere(truth: TruthVolume, grid: VolumeGrid, center_mm: NDArray[np.float64], kind: str, level: float) -> Lesion:
     """A ball of one intensity, its surface softened over a voxel (partial volume)."""
     distance = np.linalg.norm(_positions(grid) - center_mm, axis=-1)
     covered = np.clip((DIAMETER_MM / 2 - distance) / grid.spacing_mm.mean() + 0.5, 0, 1)
@@ -149,9 +141,7 @@ def _sphere(
     return Lesion(kind, change, (distance < DIAMETER_MM / 2 + AROUND_MM) & truth.mask, center_mm)
 
 
-def _ventricle(
-    truth: TruthVolume, labels: NDArray[np.floating], grid: VolumeGrid, rng: np.random.Generator
-) -> Lesion:
+def _ventricle(truth: TruthVolume, labels: NDArray[np.floating], grid: VolumeGrid, rng: np.random.Generator) -> Lesion:
     """One lateral ventricle with its wall moved outwards, filled with its own fluid."""
     both = labels == VENTRICLE_LABEL
     if not both.any():
@@ -163,7 +153,7 @@ def _ventricle(
     grown = np.clip((VENTRICLE_GROWTH_MM - beyond) / grid.spacing_mm.mean() + 0.5, 0, 1)
     # fluid does not reach the rim of the head, nor across the middle
     inner = distance_transform_edt(truth.mask, sampling=grid.spacing_mm)
-    grown = np.where(inner > LEAST_DEPTH_MM / 2, grown, 0)
+    grown = np.where(inner > MIN_DEPTH_MM / 2, grown, 0)
     core = fluid & (distance_transform_edt(fluid, sampling=grid.spacing_mm) > grid.spacing_mm.mean())
     level = float(np.percentile(truth.data[core if core.any() else fluid], 75))
     smooth = gaussian_filter(np.maximum(grown, fluid).astype(np.float32), 0.6)

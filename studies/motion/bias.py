@@ -12,7 +12,7 @@ from g3r.bench.record import markdown_table, put_between_markers, write_json, wr
 from studies.command import parser_of, run_command
 
 if TYPE_CHECKING:
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
 BIASES = (0.05, 0.15)
 VOLUMES = ("crl-sta/sta30", "spina-bifida/sb32-operated")
@@ -22,28 +22,29 @@ SEED = 33_000
 """Seeds from here on belong to this benchmark; a volume has the same at every strength of shading, so that
 motion, noise and the shape of the shading agree."""
 
-VARIANTS: dict[str, Mapping[str, Any]] = {
-    "estimated": {},
-    "not estimated": {"slice_stage.optimise_shading": False},
-}
+VARIANTS: dict[str, Mapping[str, Any]] = {"estimated": {}, "not estimated": {"slice_stage.optimise_bias_field": False}}
 """What is compared; options as `g3r.planning.presets.changed` reads them."""
 
 DEFAULT_FOLDER = Path("runs") / "bench" / "motion-bias"
 
 
-def recipes(n_repeats: int = 1) -> list[SubjectRecipe]:
+def specs(n_repeats: int = 1) -> list[SubjectSpec]:
     """The subjects: each volume with moderate motion, `n_repeats` times, at each strength of shading."""
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
     return [
-        SubjectRecipe(
-            name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}-{number}", volume=volume, motion="moderate",
-            seed=SEED + n + len(VOLUMES) * number, bias=bias, stretch=0.0,
+        SubjectSpec(
+            name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}-{number}",
+            volume=volume,
+            motion="moderate",
+            seed=SEED + n + len(VOLUMES) * number,
+            bias=bias,
+            stretch=0.0,
         )
         for n, volume in enumerate(VOLUMES)
         for number in range(n_repeats)
         for bias in BIASES
-    ]  # fmt: skip
+    ]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -78,18 +79,16 @@ def _run(options: argparse.Namespace) -> int:
     use_threads(threads)
     rows: list[dict[str, Any]] = []
     record = {"preset": options.preset, "threads": threads, "machine": machine(), "runs": rows}
-    for recipe in recipes(options.repeats):
-        case = load_case(simulated_subject(recipe, atlas, options.cache))
+    for spec in specs(options.repeats):
+        case = load_case(simulated_subject(spec, atlas, options.cache))
         for variant, changes in VARIANTS.items():
             chosen = changed(settings, changes)
-            if options.motion_only and chosen != settings and chosen.motion == settings.motion:
+            if options.motion_only and chosen != settings and chosen.registration == settings.registration:
                 continue  # registration would do the same again
-            run = (
-                registered(case, chosen) if options.motion_only else reconstructed(case, chosen, options.ckpt)
-            )
+            run = registered(case, chosen) if options.motion_only else reconstructed(case, chosen, options.ckpt)
             # without the fit, settings left as they are say nothing about the shading
             label = "-" if options.motion_only and not changes else variant
-            row = {"volume": recipe.volume, "seed": recipe.seed, "bias": recipe.bias, "shading": label}
+            row = {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "shading": label}
             rows.append({**row, **run.record()})
             print(table(record).splitlines()[-1], flush=True)
             write_json(options.output / "bias.json", record)
@@ -107,12 +106,19 @@ def table(record: Mapping[str, Any]) -> str:
     head += ["wall s"]
     rows = [
         [
-            row["volume"], row["seed"], f"{row['bias']:.2f}", row["shading"], f"{row['median_mm']:.2f}",
-            f"{row['p90_mm']:.2f}", _figure(row, "psnr_db", 2), _figure(row, "ssim", 3),
-            "yes" if row["warned"] else "-", f"{row['seconds']:.0f}",
+            row["volume"],
+            row["seed"],
+            f"{row['bias']:.2f}",
+            row["shading"],
+            f"{row['median_mm']:.2f}",
+            f"{row['p90_mm']:.2f}",
+            _figure(row, "psnr_db", 2),
+            _figure(row, "ssim", 3),
+            "yes" if row["warned"] else "-",
+            f"{row['seconds']:.0f}",
         ]
         for row in record["runs"]
-    ]  # fmt: skip
+    ]
     return f"Preset `{record['preset']}`, {record['threads']} threads.\n\n{markdown_table(head, rows)}"
 
 

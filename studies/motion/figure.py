@@ -20,16 +20,22 @@ JERK_RATIO = 3.0
 """A step between neighbours in time is a jerk if it moves the slices by so much, and by so many times the
 median step: the walks of all levels stay under, jerks of 6 degrees (4 mm at the rim of a head) do not."""
 
-LEAST_SHOWN_MM = 0.01
+MIN_SHOWN_MM = 0.01
 """Smaller errors are drawn here: a logarithm has no zero."""
 
 GAP_SLICES = 4
 """Empty places between two stacks."""
 
 COLOURS = {
-    "headers": "#b8b8b8", "template": "#009e73", "network": "#e69f00", "stacks": "#56b4e9",
-    "best start": "#f0e442", "runs": "#cc79a7", "slices": "#0072b2", "joint": "#d55e00",
-}  # fmt: skip
+    "headers": "#b8b8b8",
+    "template": "#009e73",
+    "network": "#e69f00",
+    "stacks": "#56b4e9",
+    "best start": "#f0e442",
+    "runs": "#cc79a7",
+    "slices": "#0072b2",
+    "joint": "#d55e00",
+}
 SHOWN = ("headers", "best start", "runs", "slices", "joint")
 """Those that the figure draws; more dots than these hide each other."""
 
@@ -78,16 +84,14 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
         for n, (first, n_slices) in enumerate(zip(start, width, strict=True)):
             if n % 2 == 0:
                 half_gap = GAP_SLICES / 2
-                axis.axvspan(
-                    first - half_gap, first + n_slices - 1 + half_gap, color="#f4f4f4", zorder=-1, lw=0
-                )
+                axis.axvspan(first - half_gap, first + n_slices - 1 + half_gap, color="#f4f4f4", zorder=-1, lw=0)
         for number, (layer, figures) in enumerate(case["layers"].items()):
             if layer in COLOURS and layer not in SHOWN:
                 continue
             x, y = _dots(figures["per_slice_mm"], start, width, interleave)
             colour = COLOURS.get(layer, OTHER_COLOURS[number % len(OTHER_COLOURS)])
             legend[layer] = axis.scatter(
-                x, np.maximum(y, LEAST_SHOWN_MM), s=9, color=colour, linewidths=0, label=layer, zorder=2
+                x, np.maximum(y, MIN_SHOWN_MM), s=9, color=colour, linewidths=0, label=layer, zorder=2
             )
         axis.axhline(1.0, color="black", lw=0.9, zorder=1)
         axis.set_yscale("log")
@@ -105,9 +109,8 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
     axes[0, 0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     figure.supxlabel("slices in the order they were taken; dotted: sudden movements; line: 1 mm", fontsize=10)
     figure.legend(
-        legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False,
-        markerscale=2,
-    )  # fmt: skip
+        legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False, markerscale=2
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 

@@ -23,9 +23,12 @@ Options = Mapping[str, Any]
 
 
 _ONE_START = {
-    "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
-    "motion.n_rounds": 0,
-}  # fmt: skip
+    "registration.template": False,
+    "registration.network": False,
+    "registration.stacks": False,
+    "registration.segments": False,
+    "registration.n_rounds": 0,
+}
 
 
 @dataclass(frozen=True)
@@ -44,25 +47,25 @@ class Layer:
 
 
 LAYERS = (
-    Layer("template", {**_ONE_START, "motion.template": True}),
-    Layer("network", {**_ONE_START, "motion.network": True}),
-    Layer("stacks", {**_ONE_START, "motion.stacks": True}),
-    Layer("best start", {"motion.runs": False, "motion.n_rounds": 0}),
-    Layer("runs", {"motion.n_rounds": 0}),
+    Layer("template", {**_ONE_START, "registration.template": True}),
+    Layer("network", {**_ONE_START, "registration.network": True}),
+    Layer("stacks", {**_ONE_START, "registration.stacks": True}),
+    Layer("best start", {"registration.segments": False, "registration.n_rounds": 0}),
+    Layer("runs", {"registration.n_rounds": 0}),
     Layer("slices"),
     Layer("joint", full=True),
 )
 """In the order in which they follow on the headers; the first three each compete with the headers alone."""
 
 WITHOUT: dict[str, Options] = {
-    "template": {"motion.template": False},
-    "network": {"motion.network": False},
-    "stacks": {"motion.stacks": False},
-    "runs": {"motion.runs": False},
-    "slices": {"motion.n_rounds": 0},
+    "template": {"registration.template": False},
+    "network": {"registration.network": False},
+    "stacks": {"registration.stacks": False},
+    "runs": {"registration.segments": False},
+    "slices": {"registration.n_rounds": 0},
     "joint": {"slice_stage.optimise_poses": False},
-    "slices and joint": {"motion.n_rounds": 0, "slice_stage.optimise_poses": False},
-    "shading": {"slice_stage.optimise_shading": False},
+    "slices and joint": {"registration.n_rounds": 0, "slice_stage.optimise_poses": False},
+    "shading": {"slice_stage.optimise_bias_field": False},
 }
 """What is switched off, one at a time, in a whole reconstruction."""
 
@@ -210,13 +213,18 @@ def layer_tables(record: Mapping[str, Any]) -> str:
         [
             f"Preset `{record['preset']}`, {record['threads']} threads. "
             "TRE after each layer, median / 90th percentile over slices in mm:",
-            "", markdown_table(["case", *names], errors), "",
+            "",
+            markdown_table(["case", *names], errors),
+            "",
             "Wall seconds from the stacks to the end of that layer (of the last: to the volume):",
-            "", markdown_table(["case", *names[1:]], seconds), "",
+            "",
+            markdown_table(["case", *names[1:]], seconds),
+            "",
             "PSNR of the volume in dB (and median TRE in mm) with everything, and with one thing left out:",
-            "", markdown_table(["case", *titles], volumes),
+            "",
+            markdown_table(["case", *titles], volumes),
         ]
-    )  # fmt: skip
+    )
 
 
 def _cell(figures: Mapping[str, Any] | None, form: str) -> str:

@@ -18,7 +18,7 @@ from g3r.errors import G3RError, InputError
 from studies.command import parser_of, run_command
 
 if TYPE_CHECKING:
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
 logger = logging.getLogger(__name__)
 
@@ -44,11 +44,11 @@ DEVELOPMENT_SEED = 31_000
 DEFAULT_FOLDER = Path("runs") / "bench" / "motion-sweep"
 
 
-def recipes(
+def specs(
     levels: Sequence[str], n_subjects: int, *, turned: bool = False, development: bool = False
-) -> list[SubjectRecipe]:
+) -> list[SubjectSpec]:
     """The sweep's subjects, level by level; subject n of a level is always the same."""
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
     first = TURNED_SEED if turned else FIRST_SEED
     if development:
@@ -58,7 +58,7 @@ def recipes(
         for n in range(n_subjects):
             seed, volume = first + 100 * LEVELS.index(level) + n, VOLUMES[n % len(VOLUMES)]
             name = f"{level}-{seed}-{volume.rsplit('/', 1)[-1]}{'-turned' * turned}"
-            chosen.append(SubjectRecipe(name, volume, level, seed, turned=turned))
+            chosen.append(SubjectSpec(name, volume, level, seed, turned=turned))
     return chosen
 
 
@@ -101,22 +101,26 @@ def _run(options: argparse.Namespace) -> int:
     threads = options.threads or max(1, available_cores() // options.jobs)
     if options.docs and options.development:
         raise InputError("--docs: the published table needs seeds not looked at; leave out --development")
-    chosen = recipes(options.levels, options.subjects, turned=options.turned, development=options.development)
+    chosen = specs(options.levels, options.subjects, turned=options.turned, development=options.development)
     task = (atlas, options.cache, options.preset, options.full, options.ckpt, threads)
     rows: dict[str, dict[str, Any]] = {}
     record = {
-        "preset": options.preset, "full": options.full, "jobs": options.jobs, "threads": threads,
-        "machine": machine(), "subjects": rows,
-    }  # fmt: skip
+        "preset": options.preset,
+        "full": options.full,
+        "jobs": options.jobs,
+        "threads": threads,
+        "machine": machine(),
+        "subjects": rows,
+    }
     # a fresh interpreter for each worker: thread pools do not survive a fork
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        waiting = {pool.submit(_one, recipe, *task): recipe for recipe in chosen}
+        waiting = {pool.submit(_one, spec, *task): spec for spec in chosen}
         for done in as_completed(waiting):
-            recipe = waiting[done]
-            rows[recipe.name] = {"level": recipe.motion, "seed": recipe.seed, **done.result()}
-            print(_line(recipe.name, rows[recipe.name]), flush=True)
+            spec = waiting[done]
+            rows[spec.name] = {"level": spec.motion, "seed": spec.seed, **done.result()}
+            print(_line(spec.name, rows[spec.name]), flush=True)
             write_json(options.output / "sweep.json", record)
-    record["subjects"] = {recipe.name: rows[recipe.name] for recipe in chosen}
+    record["subjects"] = {spec.name: rows[spec.name] for spec in chosen}
     write_json(options.output / "sweep.json", record)
     text = sweep_tables(record)
     write_text(options.output / "sweep.md", text)
@@ -127,7 +131,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _one(
-    recipe: SubjectRecipe, atlas: Path, cache: Path, preset: str, full: bool, ckpt: str | None, threads: int
+    spec: SubjectSpec, atlas: Path, cache: Path, preset: str, full: bool, ckpt: str | None, threads: int
 ) -> dict[str, Any]:
     """One subject in a worker process."""
     from g3r.bench.record import use_threads
@@ -136,7 +140,7 @@ def _one(
     from studies.subjects import simulated_subject
 
     use_threads(threads)
-    case = load_case(simulated_subject(recipe, atlas, cache))
+    case = load_case(simulated_subject(spec, atlas, cache))
     settings = preset_settings(preset)
     header = case.header_error()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -172,34 +176,52 @@ def sweep_tables(record: dict[str, Any]) -> str:
     each_head += ["PSNR dB"] * full
     each = [
         [
-            name, f"{row['header_mm']:.1f}", f"{row['median_mm']:.2f}", f"{row['p90_mm']:.2f}",
-            f"{row['worst_mm']:.1f}", "yes" if row["warned"] else "-", _degrees(row), f"{row['seconds']:.0f}",
-            f"{row['cpu_seconds']:.0f}", *([_psnr([row], 2)] if full else []),
+            name,
+            f"{row['header_mm']:.1f}",
+            f"{row['median_mm']:.2f}",
+            f"{row['p90_mm']:.2f}",
+            f"{row['worst_mm']:.1f}",
+            "yes" if row["warned"] else "-",
+            _degrees(row),
+            f"{row['seconds']:.0f}",
+            f"{row['cpu_seconds']:.0f}",
+            *([_psnr([row], 2)] if full else []),
         ]
         for name, row in rows.items()
-    ]  # fmt: skip
+    ]
     what = "whole reconstructions" if full else "registration alone"
     lines = [
         f"Preset `{record['preset']}`, {what}; {record['jobs']} at a time, {record['threads']} threads each. "
         "TRE in mm; seconds, headers and PSNR are medians over subjects; bad: median TRE not under 1 mm; "
         f"upright: the result stands within {UPRIGHT_DEG:g} degrees of the atlas.",
-        "", markdown_table(head, summary), "",
-        "<details><summary>Every subject</summary>", "", markdown_table(each_head, each), "", "</details>",
-    ]  # fmt: skip
+        "",
+        markdown_table(head, summary),
+        "",
+        "<details><summary>Every subject</summary>",
+        "",
+        markdown_table(each_head, each),
+        "",
+        "</details>",
+    ]
     return "\n".join(lines)
 
 
 def _summary(level: str, group: list[dict[str, Any]]) -> list[str]:
     n_good = sum(not row["bad"] for row in group)
     return [
-        f"{len(group)}", f"{_middle(group, 'header_mm'):.1f}", f"{n_good / len(group):.0%}",
-        f"{WANTED_SHARE[level]:.0%}", f"{_middle(group, 'median_mm'):.2f}", f"{_middle(group, 'p90_mm'):.2f}",
+        f"{len(group)}",
+        f"{_middle(group, 'header_mm'):.1f}",
+        f"{n_good / len(group):.0%}",
+        f"{WANTED_SHARE[level]:.0%}",
+        f"{_middle(group, 'median_mm'):.2f}",
+        f"{_middle(group, 'p90_mm'):.2f}",
         f"{sum(row['warned'] and row['bad'] for row in group)}",
         f"{sum(row['warned'] and not row['bad'] for row in group)}",
         f"{sum(not row['warned'] and row['bad'] for row in group)}",
         f"{sum(_is_upright(row) for row in group) / len(group):.0%}",
-        f"{_middle(group, 'seconds'):.0f}", f"{_middle(group, 'cpu_seconds'):.0f}",
-    ]  # fmt: skip
+        f"{_middle(group, 'seconds'):.0f}",
+        f"{_middle(group, 'cpu_seconds'):.0f}",
+    ]
 
 
 def _psnr(group: list[dict[str, Any]], digits: int = 1) -> str:

@@ -27,7 +27,7 @@ SIGMAS_PER_PIXEL = (0.02, 0.1, 0.2, 0.3, 0.5, 0.8, 1.5)
 DISTANCES_M = (0.0, 1.0, 10.0, 100.0)
 
 FULL_CUTOFF = 6.0
-"""Where the errors below are those of arithmetic: what is cut off is 1.5e-8 of a peak."""
+"""Where the errors below are those of arithmetic: what is cut off is 1.5e-8 of a amplitude."""
 
 Row = dict[str, float]
 
@@ -74,9 +74,7 @@ def value_errors(scene: Scene) -> Row:
     exact = render(cloud, planes, backend="reference").numpy()
     if planes.psf_var_mm2.min() > 0:
         few = replace(planes, shape=np.full_like(planes.shape, 2))
-        float64 = relative_error(
-            render(cloud, few, backend="reference").numpy(), integrated_pixels(cloud, few)
-        )
+        float64 = relative_error(render(cloud, few, backend="reference").numpy(), integrated_pixels(cloud, few))
     else:
         float64 = relative_error(exact, volume_at(cloud, planes.pixel_world_mm()))
     rough = single(cloud)
@@ -110,20 +108,27 @@ def gradients(
     leaves = [p.detach().to(dtype).requires_grad_() for p in cloud.parameters]
     further = [torch.zeros(len(planes), n, dtype=dtype, requires_grad=True) for n in (6, 1)]
     pixels = render(
-        GaussianCloud.of(leaves, cloud.origin_mm), planes, twist=further[0], log_gain=further[1][:, 0],
+        GaussianCloud.of(leaves, cloud.origin_mm),
+        planes,
+        twist=further[0],
+        log_gain=further[1][:, 0],
         **options,  # type: ignore[arg-type]
-    )  # fmt: skip
+    )
     (pixels * weight.to(dtype)).sum().backward()
     nothing = [torch.zeros_like(leaf) for leaf in (*leaves, *further)]
     grads = [
         (zero if leaf.grad is None else leaf.grad).double()
         for leaf, zero in zip((*leaves, *further), nothing, strict=True)
     ]
-    mean, log_scale, quaternion, peak, twist, gain = grads
+    mean, log_scale, quaternion, amplitude, twist, gain = grads
     return pixels.detach().double(), {
-        "centre": mean, "shape": torch.cat([log_scale, quaternion], 1), "peak": peak, "turn": twist[:, :3],
-        "shift": twist[:, 3:], "gain": gain,
-    }  # fmt: skip
+        "centre": mean,
+        "shape": torch.cat([log_scale, quaternion], 1),
+        "amplitude": amplitude,
+        "turn": twist[:, :3],
+        "shift": twist[:, 3:],
+        "gain": gain,
+    }
 
 
 def gradient_rows(ratios: tuple[float, ...] = RATIOS) -> list[Row]:
@@ -190,9 +195,12 @@ def sized_scenes(sigma_mm: float, thickness_mm: float, n: int = 6, seed: int = 1
     for _ in range(n):
         base = slender_scenes(1.0, sigma_mm, False, 1, int(rng.integers(1 << 30)))[0]
         cloud = cloud_of(
-            base.cloud.mean_mm.numpy(), sigma_mm * rng.uniform(0.7, 1.0, (1, 3)), rng.normal(size=(1, 4)),
-            np.ones(1), base.cloud.origin_mm,
-        )  # fmt: skip
+            base.cloud.mean_mm.numpy(),
+            sigma_mm * rng.uniform(0.7, 1.0, (1, 3)),
+            rng.normal(size=(1, 4)),
+            np.ones(1),
+            base.cloud.origin_mm,
+        )
         planes = base.planes
         if thickness_mm:
             spacing = np.maximum(planes.spacing_mm, 0.1)
@@ -238,21 +246,18 @@ def pixel_rows(sigmas: tuple[float, ...] = SIGMAS_PER_PIXEL, n_places: int = 40)
             places = np.concatenate([[[0.0, 0, 0], [0.5, 0.5, 0.5]], rng.uniform(-0.5, 0.5, (n_places, 3))])
             for place in places:
                 cloud = cloud_of(
-                    (place * steps)[None],
-                    np.full((1, 3), sigma),
-                    np.array([[1.0, 0, 0, 0]]),
-                    np.ones(1),
-                    np.zeros(3),
+                    (place * steps)[None], np.full((1, 3), sigma), np.array([[1.0, 0, 0, 0]]), np.ones(1), np.zeros(3)
                 )
                 pixels = render(single(cloud), planes, cutoff_sigma=FULL_CUTOFF).double()
                 mass = float(cloud.log_scale.sum().exp() * (2 * math.pi) ** 1.5)
                 seen.append(float(pixels.sum()) * float(steps.prod()) / mass)
             total = np.sqrt(sigma**2 + variance) / steps
             row |= {
-                f"{name} least": min(seen), f"{name} most": max(seen),
+                f"{name} least": min(seen),
+                f"{name} most": max(seen),
                 f"{name} lower bound": math.prod(comb(s, 0.5) for s in total),
                 f"{name} upper bound": math.prod(comb(s, 0.0) for s in total),
-            }  # fmt: skip
+            }
         rows.append(row)
     return rows
 

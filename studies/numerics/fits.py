@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
-from g3r.fitting import divergence_guard as safeguard
+from g3r.fitting import divergence_guard as divergence_guard
 from g3r.fitting.parameters import LearningRates
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import render
@@ -20,7 +20,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration.settings import MotionSettings
+from g3r.registration.settings import RegistrationSettings
 from studies.numerics.scenes import ORIGIN_MM, head_scene, single, stacks_of_planes
 
 HEAD_RADIUS_MM = 10.0
@@ -30,8 +30,8 @@ SCANNER_UNITS = 700.0
 SETTINGS = replace(
     PRESETS["draft"],
     gaussian_spacing_pixels=2.0,
-    motion=MotionSettings(
-        template=False, network=False, stacks=False, runs=False, n_rounds=2, standard_orientation=False
+    registration=RegistrationSettings(
+        template=False, network=False, stacks=False, segments=False, n_rounds=2, standard_orientation=False
     ),
 )
 """The shortest preset, with slices registered from where the header has them: no search, no mean head."""
@@ -67,9 +67,7 @@ def _stack(planes: Planes, pixels: NDArray[np.float32], inside: NDArray[np.bool_
     def volume(array: NDArray) -> NDArray:
         return array[begin:end].reshape(n, *shape).transpose(1, 2, 0)
 
-    return Stack(
-        volume(pixels), volume(inside), affine, float(np.linalg.norm(step)), name=f"stack-{number}.nii.gz"
-    )
+    return Stack(volume(pixels), volume(inside), affine, float(np.linalg.norm(step)), name=f"stack-{number}.nii.gz")
 
 
 def reconstruction(factor: float = 1.0, motion: RigidPose | None = None) -> ReconstructionResult:
@@ -105,9 +103,8 @@ def volume_changes() -> list[dict[str, float | str]]:
         value = _values(reconstruction(factor, motion), points, motion) / factor
         change, error = np.abs(value - first) / scale, np.abs(value - truth) / scale
         rows.append(
-            {"change": name, "mean": float(change.mean()), "largest": float(change.max()),
-             "error": float(error.mean())}
-        )  # fmt: skip
+            {"change": name, "mean": float(change.mean()), "largest": float(change.max()), "error": float(error.mean())}
+        )
     return rows
 
 
@@ -116,9 +113,7 @@ def _points(result: ReconstructionResult) -> Planes:
     world = result.grid.world(np.argwhere(result.mask))
     world = world[np.linalg.norm(world - ORIGIN_MM, axis=1) < HEAD_RADIUS_MM - 2][::7]
     n = len(world)
-    return Planes(
-        np.tile(np.eye(3), (n, 1, 1)), world, np.ones((n, 2)), np.ones((n, 2), np.int64), np.zeros((n, 3))
-    )
+    return Planes(np.tile(np.eye(3), (n, 1, 1)), world, np.ones((n, 2)), np.ones((n, 2), np.int64), np.zeros((n, 3)))
 
 
 def _values(result: ReconstructionResult, points: Planes, motion: RigidPose | None) -> NDArray[np.float64]:
@@ -132,9 +127,7 @@ def times(factor: float) -> LearningRates:
     return LearningRates(**{field.name: factor * getattr(rates, field.name) for field in fields(rates)})
 
 
-def slices_of_small_head(
-    noise: float = NOISE,
-) -> tuple[Slices, VolumeGrid, NDArray[np.float32], NDArray[np.bool_]]:
+def slices_of_small_head(noise: float = NOISE) -> tuple[Slices, VolumeGrid, NDArray[np.float32], NDArray[np.bool_]]:
     """Slices of the small head about the origin, and a blurred guess of it with mask on a grid."""
     scene = head_scene(np.zeros(3))
     planes = stacks_of_planes(np.zeros(3))
@@ -143,9 +136,14 @@ def slices_of_small_head(
     value = value + rng.normal(0, noise, len(value)).astype(np.float32)
     n = len(planes) // 3
     slices = Slices(
-        planes, value, np.linalg.norm(planes.pixel_world_mm(), axis=1) < HEAD_RADIUS_MM,
-        np.repeat(np.arange(3), n), np.tile(np.arange(n), 3), np.full(3 * n, 2.2), planes.pose,
-    )  # fmt: skip
+        planes,
+        value,
+        np.linalg.norm(planes.pixel_world_mm(), axis=1) < HEAD_RADIUS_MM,
+        np.repeat(np.arange(3), n),
+        np.tile(np.arange(n), 3),
+        np.full(3 * n, 2.2),
+        planes.pose,
+    )
     grid = VolumeGrid.isotropic([-HEAD_RADIUS_MM] * 3, [HEAD_RADIUS_MM] * 3, 1.0)
     index = np.stack(np.meshgrid(*[np.arange(m) for m in grid.shape], indexing="ij"), -1)
     mask = np.linalg.norm(grid.world(index), axis=-1) < HEAD_RADIUS_MM
@@ -158,15 +156,15 @@ def fit_at(factor: float, guarded: bool = True, n_steps: int = 60) -> SliceFit:
     slices, grid, guess, mask = slices_of_small_head()
     ones = np.ones(len(slices))
     settings = SliceStageSettings(n_steps=n_steps, rates=times(factor))
-    before = safeguard.RISE
+    before = divergence_guard.RISE
     try:
         if not guarded:
-            safeguard.RISE = math.inf
+            divergence_guard.RISE = math.inf
         return fit_slices(
             seed_cloud(guess, mask, grid, 2.5), slices, ones, ones, None, settings, np.random.default_rng(0)
         )
     finally:
-        safeguard.RISE = before
+        divergence_guard.RISE = before
 
 
 def step_size_rows() -> list[dict[str, float]]:
@@ -184,6 +182,6 @@ def step_size_rows() -> list[dict[str, float]]:
                 image = [entry["image"] for entry in fit.history]
                 residual = np.abs(render(fit.cloud, fit.slices.planes).numpy() - slices.value)[slices.mask]
                 row |= {"first": image[0], "most": max(image), "residual": float(residual.mean())}
-                row["back"] = sum("step_back" in entry for entry in fit.history)
+                row["back"] = sum("rollback" in entry for entry in fit.history)
             rows.append(row)
     return rows

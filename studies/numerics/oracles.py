@@ -20,12 +20,12 @@ STEP = 0.5
 
 def volume_at(cloud: GaussianCloud, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """V(x) of Eq. 3 at world points [P, 3]: turned into a Gaussian's axes, divided by sigma, no inverse."""
-    mean, log_scale, quaternion, peak = (p.detach().double() for p in cloud.parameters)
+    mean, log_scale, quaternion, amplitude = (p.detach().double() for p in cloud.parameters)
     axes = rotation_from_quaternion(quaternion).numpy()
     total = np.zeros(len(points_mm))
     for j in range(len(cloud)):
         white = (points_mm - cloud.origin_mm - mean[j].numpy()) @ axes[j] / np.exp(log_scale[j].numpy())
-        total += float(peak[j]) * np.exp(-0.5 * (white**2).sum(1))
+        total += float(amplitude[j]) * np.exp(-0.5 * (white**2).sum(1))
     return total
 
 
@@ -42,7 +42,7 @@ def integrated_pixels(cloud: GaussianCloud, planes: Planes) -> NDArray[np.float6
     """
     if len(planes) and not planes.psf_var_mm2.min() > 0:
         raise ValueError("a plane without PSF samples V(x); use volume_at")
-    mean, log_scale, quaternion, peak = (p.detach().double() for p in cloud.parameters)
+    mean, log_scale, quaternion, amplitude = (p.detach().double() for p in cloud.parameters)
     axes, sigma = rotation_from_quaternion(quaternion).numpy(), log_scale.exp().numpy()
     world, plane_of = planes.pixel_world_mm(), planes.plane_id()
     pixels = np.zeros(planes.n_pixels)
@@ -68,7 +68,7 @@ def integrated_pixels(cloud: GaussianCloud, planes: Planes) -> NDArray[np.float6
             away = np.stack(np.meshgrid(*nodes, indexing="ij"), -1).reshape(-1, 3) - at
             psf = np.exp(-0.5 * ((away @ frame) ** 2 / variance).sum(1)) * density
             product = np.einsum("i,j,k->ijk", *value).ravel()
-            pixels[p] += float(peak[j]) * step * float(product @ psf)
+            pixels[p] += float(amplitude[j]) * step * float(product @ psf)
     return pixels
 
 
@@ -77,7 +77,7 @@ def naive_render(cloud: GaussianCloud, planes: Planes, dtype: torch.dtype, epsil
 
     With an epsilon (mm^6) added to the determinant, as some codes have it. Kept to show where it fails.
     """
-    mean, log_scale, quaternion, peak = (p.detach().to(dtype) for p in cloud.parameters)
+    mean, log_scale, quaternion, amplitude = (p.detach().to(dtype) for p in cloud.parameters)
     root = rotation_from_quaternion(quaternion) * log_scale.exp()[:, None]
     sigma = root @ root.mT
     pixels = []
@@ -92,7 +92,7 @@ def naive_render(cloud: GaussianCloud, planes: Planes, dtype: torch.dtype, epsil
         u = torch.as_tensor(np.pad(uv, ((0, 0), (0, 1))), dtype=dtype)
         d = u[None] - ((mean - center) @ frame)[:, None]
         e = torch.einsum("npa,nab,npb->np", d, inverse, d)
-        pixels.append((peak * factor) @ torch.exp(-0.5 * e))
+        pixels.append((amplitude * factor) @ torch.exp(-0.5 * e))
     return torch.cat(pixels) if pixels else mean.new_zeros(0)
 
 
@@ -103,10 +103,10 @@ def absolute(cloud: GaussianCloud, dtype: torch.dtype) -> GaussianCloud:
     return GaussianCloud(mean, rest[0], rest[1], rest[2], np.zeros(3))
 
 
-def naive_peaks(
+def naive_amplitudes(
     matrix: NDArray[np.float32], pixels: NDArray[np.float32], epsilon: float = 1e-8
 ) -> NDArray[np.float32]:
-    """Peaks as weighted means of pixels, A^T y / (A^T 1 + epsilon): with an absolute epsilon."""
+    """Amplitudes as weighted means of pixels, A^T y / (A^T 1 + epsilon): with an absolute epsilon."""
     return (matrix.T @ pixels) / (matrix.T @ np.ones_like(pixels) + np.float32(epsilon))
 
 
@@ -118,8 +118,14 @@ def _determinant(s: Tensor) -> Tensor:
 def _adjugate(s: Tensor) -> Tensor:
     a, b, c, d, e, f = s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]
     rows = [
-        d * f - e * e, c * e - b * f, b * e - c * d,
-        c * e - b * f, a * f - c * c, b * c - a * e,
-        b * e - c * d, b * c - a * e, a * d - b * b,
-    ]  # fmt: skip
+        d * f - e * e,
+        c * e - b * f,
+        b * e - c * d,
+        c * e - b * f,
+        a * f - c * c,
+        b * c - a * e,
+        b * e - c * d,
+        b * c - a * e,
+        a * d - b * b,
+    ]
     return torch.stack(rows, 1).reshape(-1, 3, 3)

@@ -34,14 +34,12 @@ def cloud_of(
     mean_mm: NDArray[np.float64],
     sigma_mm: NDArray[np.float64],
     quaternion_wxyz: NDArray[np.float64],
-    peak: NDArray[np.float64],
+    amplitude: NDArray[np.float64],
     origin_mm: NDArray[np.float64] = ORIGIN_MM,
 ) -> GaussianCloud:
     """A float64 cloud of parameters that float32 holds exactly: errors are the arithmetic's alone."""
-    arrays = (mean_mm, np.log(sigma_mm), quaternion_wxyz, peak)
-    return GaussianCloud.of(
-        [torch.tensor(array, dtype=torch.float32).double() for array in arrays], origin_mm
-    )
+    arrays = (mean_mm, np.log(sigma_mm), quaternion_wxyz, amplitude)
+    return GaussianCloud.of([torch.tensor(array, dtype=torch.float32).double() for array in arrays], origin_mm)
 
 
 def slender_scenes(ratio: float, widest_mm: float, psf: bool, n: int = 12, seed: int = 0) -> list[Scene]:
@@ -74,8 +72,10 @@ def slender_scenes(ratio: float, widest_mm: float, psf: bool, n: int = 12, seed:
         planes = Planes(
             np.concatenate([tilted.as_matrix(), at_random.as_matrix()[None]]),
             np.concatenate([middle + shift, middle[None] + rng.normal(0, 0.3 * sigma.min(), (1, 3))]),
-            spacing, np.array([[40, 24]] * 3), np.tile(variance, (3, 1)),
-        )  # fmt: skip
+            spacing,
+            np.array([[40, 24]] * 3),
+            np.tile(variance, (3, 1)),
+        )
         scenes.append(Scene(cloud, planes))
     return scenes
 
@@ -101,6 +101,9 @@ def stacks_of_planes(
     n = len(rotation)
     spacing = np.full((n, 2), PIXEL_MM)
     return Planes(
-        rotation, origin_mm + rotation[:, :, 2] * offset[:, None], spacing, np.full((n, 2), n_pixels),
+        rotation,
+        origin_mm + rotation[:, :, 2] * offset[:, None],
+        spacing,
+        np.full((n, 2), n_pixels),
         psf_variance_mm2(spacing, np.full(n, thickness_mm)),
-    )  # fmt: skip
+    )

@@ -28,9 +28,10 @@ Rows = Sequence[Mapping[str, Any]]
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.numerics.tables", description="Errors at the extremes, swept and tabulated.",
+        prog="python -m studies.numerics.tables",
+        description="Errors at the extremes, swept and tabulated.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
     parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "numerics")
     parser.add_argument("--only", choices=TABLES, nargs="+", help="some of the tables (None: all)")
@@ -64,24 +65,36 @@ def shown(value: float) -> str:
 
 def shape_table(rows: Rows) -> str:
     """Errors of values by axis ratio."""
-    names = (
-        "float64", "reference float32", "numba", "naive float32", "naive float32, epsilon", "naive float64"
-    )  # fmt: skip
+    names = ("float64", "reference float32", "numba", "naive float32", "naive float32, epsilon", "naive float64")
     return markdown_table(
         ["", "axis ratio", *names, "bound for float32"],
-        [[_place(row), f"{row['ratio']:g}", *(shown(row[name]) for name in names),
-          shown(shape_tolerance(row["ratio"]))] for row in rows],
-    )  # fmt: skip
+        [
+            [
+                _place(row),
+                f"{row['ratio']:g}",
+                *(shown(row[name]) for name in names),
+                shown(shape_tolerance(row["ratio"])),
+            ]
+            for row in rows
+        ],
+    )
 
 
 def gradient_table(rows: Rows) -> str:
     """Errors of gradients by axis ratio."""
-    names = ("centre", "shape", "peak", "turn", "shift", "gain")
+    names = ("centre", "shape", "amplitude", "turn", "shift", "gain")
     return markdown_table(
         ["", "axis ratio", *names, "bound"],
-        [[_place(row), f"{row['ratio']:g}", *(shown(row[name]) for name in names),
-          shown(gradient_tolerance(row["ratio"]))] for row in rows],
-    )  # fmt: skip
+        [
+            [
+                _place(row),
+                f"{row['ratio']:g}",
+                *(shown(row[name]) for name in names),
+                shown(gradient_tolerance(row["ratio"])),
+            ]
+            for row in rows
+        ],
+    )
 
 
 def size_table(rows: Rows) -> str:
@@ -101,18 +114,25 @@ def pixel_table(rows: Rows) -> str:
 
     return markdown_table(
         ["sigma over pixel", "volume", "by the formula", "slices", "by the formula"],
-        [[f"{row['ratio']:g}",
-          *(pair(row, name, low, high) for name in ("volume", "slices")
-            for low, high in (("least", "most"), ("lower bound", "upper bound")))] for row in rows],
-    )  # fmt: skip
+        [
+            [
+                f"{row['ratio']:g}",
+                *(
+                    pair(row, name, low, high)
+                    for name in ("volume", "slices")
+                    for low, high in (("least", "most"), ("lower bound", "upper bound"))
+                ),
+            ]
+            for row in rows
+        ],
+    )
 
 
 def distance_table(rows: Rows) -> str:
     """Errors of values by distance from the world's origin."""
     names = ("reference float64", "reference float32", "numba", "naive float32")
     return markdown_table(
-        ["distance, m", *names],
-        [[f"{row['distance_m']:g}", *(shown(row[name]) for name in names)] for row in rows],
+        ["distance, m", *names], [[f"{row['distance_m']:g}", *(shown(row[name]) for name in names)] for row in rows]
     )
 
 
@@ -127,9 +147,8 @@ def change_table(rows: Rows) -> str:
     """What whole reconstructions make of changes that ought to change nothing."""
     return markdown_table(
         ["change of the input", "mean change", "largest change", "mean error against the truth"],
-        [[row["change"], *(shown(row[name]) for name in ("mean", "largest")), f"{row['error']:.4f}"]
-         for row in rows],
-    )  # fmt: skip
+        [[row["change"], *(shown(row[name]) for name in ("mean", "largest")), f"{row['error']:.4f}"] for row in rows],
+    )
 
 
 def step_rows() -> Rows:
@@ -147,9 +166,16 @@ def step_table(rows: Rows) -> str:
 
     return markdown_table(
         ["step sizes", "safeguard", "steps back", "loss at the start", "largest loss", "residual at the end"],
-        [[f"x {row['factor']:g}", "on" if row["guarded"] else "off", row["back"],
-          *(number(row[name]) for name in ("first", "most", "residual"))] for row in rows],
-    )  # fmt: skip
+        [
+            [
+                f"x {row['factor']:g}",
+                "on" if row["guarded"] else "off",
+                row["back"],
+                *(number(row[name]) for name in ("first", "most", "residual")),
+            ]
+            for row in rows
+        ],
+    )
 
 
 def _place(row: Mapping[str, Any]) -> str:

@@ -21,13 +21,18 @@ from studies.command import parser_of, run_command
 if TYPE_CHECKING:
     from g3r.evaluation.case import SimulatedCase
     from g3r.planning.presets import ReconstructionSettings
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
 VOLUMES = (
-    "crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34",
-    "spina-bifida/sb25-operated", "spina-bifida/sb27-operated", "spina-bifida/sb29-operated",
-    "spina-bifida/sb31-operated", "spina-bifida/sb33-operated",
-)  # fmt: skip
+    "crl-sta/sta24",
+    "crl-sta/sta30",
+    "crl-sta/sta34",
+    "spina-bifida/sb25-operated",
+    "spina-bifida/sb27-operated",
+    "spina-bifida/sb29-operated",
+    "spina-bifida/sb31-operated",
+    "spina-bifida/sb33-operated",
+)
 """None was trained on. Weeks 24, 30 and 34 were used for nothing at all, but their neighbours were trained
 on; the operated volumes are another atlas, whose volumes before operation were trained on, and checkpoints
 were chosen by operated ones."""
@@ -55,13 +60,13 @@ VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS)
 DEFAULT_FOLDER = Path("runs") / "bench" / "prior-ablation"
 
 
-def recipes(*, development: bool = False) -> list[SubjectRecipe]:
+def specs(*, development: bool = False) -> list[SubjectSpec]:
     """The subjects; always the same."""
-    from studies.subjects import SubjectRecipe
+    from studies.subjects import SubjectSpec
 
     first = DEVELOPMENT_SEED if development else FIRST_SEED
     return [
-        SubjectRecipe(f"{MOTION}-{first + n}-{volume.rsplit('/', 1)[-1]}", volume, MOTION, first + n)
+        SubjectSpec(f"{MOTION}-{first + n}-{volume.rsplit('/', 1)[-1]}", volume, MOTION, first + n)
         for n, volume in enumerate(VOLUMES)
     ]
 
@@ -105,33 +110,36 @@ def _run(options: argparse.Namespace) -> int:
         raise InputError("--docs: the published table needs seeds not looked at; leave out --development")
     atlas = test_data_folder() / "atlas"
     settings = preset_settings(options.preset)
-    every = recipes(development=options.development)
+    every = specs(development=options.development)
     chosen = [r for r in every if any(word in r.name for word in options.subjects)]
     threads = options.threads or max(1, available_cores() // options.jobs)
     path = options.output / "ablation.json"
     record: dict[str, Any] = {
-        "preset": options.preset, "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
-        "jobs": options.jobs, "threads": threads, "machine": machine(), "subjects": {},
-    }  # fmt: skip
+        "preset": options.preset,
+        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "jobs": options.jobs,
+        "threads": threads,
+        "machine": machine(),
+        "subjects": {},
+    }
     rows = record["subjects"] if options.fresh else _kept(path, record)
     todo = [
-        (recipe, n)
+        (spec, n)
         for n in sorted(options.stacks, reverse=True)  # the longest first, so that workers end together
-        for recipe in chosen
-        if str(n) not in rows.get(recipe.name, {})
+        for spec in chosen
+        if str(n) not in rows.get(spec.name, {})
     ]
     start = time.perf_counter()
     if todo:
         # a fresh interpreter for each worker: thread pools do not survive a fork
         with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
             waiting = {
-                pool.submit(_one, *task, atlas, options.cache, settings, options.ckpt, threads): task
-                for task in todo
+                pool.submit(_one, *task, atlas, options.cache, settings, options.ckpt, threads): task for task in todo
             }
             for done in as_completed(waiting):
-                recipe, n_stacks = waiting[done]
-                rows.setdefault(recipe.name, {})[str(n_stacks)] = done.result()
-                print(_line(recipe.name, n_stacks, done.result()), flush=True)
+                spec, n_stacks = waiting[done]
+                rows.setdefault(spec.name, {})[str(n_stacks)] = done.result()
+                print(_line(spec.name, n_stacks, done.result()), flush=True)
                 write_json(path, record)
     print(f"{len(todo)} of {len(chosen) * len(options.stacks)} made, {time.perf_counter() - start:.0f} s")
     text = ablation_tables(record)
@@ -159,7 +167,7 @@ def _kept(path: Path, record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _one(
-    recipe: SubjectRecipe,
+    spec: SubjectSpec,
     n_stacks: int,
     atlas: Path,
     cache: Path,
@@ -173,9 +181,9 @@ def _one(
     from studies.subjects import simulated_subject
 
     use_threads(threads)
-    case = load_case(simulated_subject(recipe, atlas, cache))
+    case = load_case(simulated_subject(spec, atlas, cache))
     case = replace(case, stacks=case.stacks[:n_stacks])
-    return {"volume": recipe.volume, **measure(case, settings, ckpt)}
+    return {"volume": spec.volume, **measure(case, settings, ckpt)}
 
 
 def measure(case: SimulatedCase, settings: ReconstructionSettings, ckpt: str | None) -> dict[str, Any]:
@@ -227,21 +235,36 @@ def ablation_tables(record: Mapping[str, Any]) -> str:
         if _of_group(rows, group)
     ]
     each = [
-        [name, n, *(f"{of[str(n)]['scores'][v]['psnr_db']:.2f}" for v in VARIANTS),
-         f"{of[str(n)]['median_mm'][VARIANTS[-1]]:.2f}"]
-        for name, of in sorted(rows.items()) for n in numbers if str(n) in of
-    ]  # fmt: skip
+        [
+            name,
+            n,
+            *(f"{of[str(n)]['scores'][v]['psnr_db']:.2f}" for v in VARIANTS),
+            f"{of[str(n)]['median_mm'][VARIANTS[-1]]:.2f}",
+        ]
+        for name, of in sorted(rows.items())
+        for n in numbers
+        if str(n) in of
+    ]
     counts = ", ".join(f"{len(_of_group(rows, group))} {group}" for group in GROUPS)
     lines = [
         f"{len(rows)} subjects ({counts}), {MOTION} motion, preset `{record['preset']}`, weights "
         f"{record['weights']}. Mean and standard deviation over subjects; the last column of each number of "
         "stacks is the paired difference.",
-        "", markdown_table(head, summary), "",
-        "By atlas:", "", markdown_table(head, by_group), "",
-        _worst(rows, numbers), "",
-        "<details><summary>Every subject: dB, and median TRE in mm of the last variant</summary>", "",
-        markdown_table(["subject", "stacks", *VARIANTS, "TRE"], each), "", "</details>",
-    ]  # fmt: skip
+        "",
+        markdown_table(head, summary),
+        "",
+        "By atlas:",
+        "",
+        markdown_table(head, by_group),
+        "",
+        _worst(rows, numbers),
+        "",
+        "<details><summary>Every subject: dB, and median TRE in mm of the last variant</summary>",
+        "",
+        markdown_table(["subject", "stacks", *VARIANTS, "TRE"], each),
+        "",
+        "</details>",
+    ]
     return "\n".join(lines)
 
 
@@ -283,10 +306,7 @@ def _worst(rows: Mapping[str, Any], numbers: Sequence[int]) -> str:
 
 def _of_group(rows: Mapping[str, Any], group: str) -> dict[str, Any]:
     prefix = GROUPS[group]
-    return {
-        name: of for name, of in rows.items()
-        if any(one["volume"].startswith(prefix) for one in of.values())
-    }  # fmt: skip
+    return {name: of for name, of in rows.items() if any(one["volume"].startswith(prefix) for one in of.values())}
 
 
 def _stacks(n: int) -> str:

@@ -72,9 +72,13 @@ def _run(options: argparse.Namespace) -> int:
     use_threads(threads)
     rows: list[dict[str, Any]] = []
     record = {
-        "weights": file_digest(checkpoint), "threads": threads, "machine": machine(),
-        "n_views": n_views, "rows": rows, "speed": None,
-    }  # fmt: skip
+        "weights": file_digest(checkpoint),
+        "threads": threads,
+        "machine": machine(),
+        "n_views": n_views,
+        "rows": rows,
+        "speed": None,
+    }
     for folder in case_folders(root / "cases", options.cases):
         case = load_case(folder, THICKNESS_MM.get(folder.name))
         for n_stacks in sorted({1, len(case.stacks)}):
@@ -113,10 +117,10 @@ def measure_speed(
     """Wall seconds on a 36-week brain (the least of a few runs), and what tiles change."""
     from g3r.evaluation.case import load_case
     from studies.prior.volumes import prior_volumes, slices_at_true_poses, tiling_difference
-    from studies.subjects import SubjectRecipe, simulated_subject
+    from studies.subjects import SubjectSpec, simulated_subject
 
-    recipe = SubjectRecipe("speed-sta36", SPEED_VOLUME, "mild", SPEED_SEED, stretch=0.0)
-    case = load_case(simulated_subject(recipe, atlas, cache))
+    spec = SubjectSpec("speed-sta36", SPEED_VOLUME, "mild", SPEED_SEED, stretch=0.0)
+    case = load_case(simulated_subject(spec, atlas, cache))
     slices = slices_at_true_poses(case, len(case.stacks))
     runs = [prior_volumes(network, slices, voxel_mm) for _ in range(REPEATS)]
     return {
@@ -148,10 +152,14 @@ def alone_tables(record: Mapping[str, Any]) -> str:
         cells = [f"{row['scores'][n]['psnr_db']:.2f} / {row['scores'][n]['ssim']:.3f}" for n in VOLUMES]
         body.append(
             [
-                row["case"], n_stacks, *cells, f"{gain_db(row):+.2f}{_verdict(gain_db(row), wanted_db)}",
-                f"{ssim:.3f}{_verdict(ssim, wanted_ssim)}", f"{row['seconds']:.1f}",
+                row["case"],
+                n_stacks,
+                *cells,
+                f"{gain_db(row):+.2f}{_verdict(gain_db(row), wanted_db)}",
+                f"{ssim:.3f}{_verdict(ssim, wanted_ssim)}",
+                f"{row['seconds']:.1f}",
             ]
-        )  # fmt: skip
+        )
     head = ["case", "stacks", *VOLUMES, "prior - coarse, dB", "SSIM of the prior", "seconds"]
     wanted = " and ".join(
         f"{gain:g} dB and SSIM {WANTED_SSIM[n]:g} from {_stacks(n)}" for n, gain in WANTED_GAIN_DB.items()
@@ -160,8 +168,11 @@ def alone_tables(record: Mapping[str, Any]) -> str:
         f"PSNR in dB / SSIM at true poses; weights {record['weights']}, mean over {record['n_views']} views "
         f"as in the product, {record['threads']} threads, wall seconds of the network. Asked: at least "
         f"{wanted}; what falls short is marked (!).",
-        "", markdown_table(head, body), "", _mean_line(record["rows"]),
-    ]  # fmt: skip
+        "",
+        markdown_table(head, body),
+        "",
+        _mean_line(record["rows"]),
+    ]
     if record["speed"]:
         lines += ["", _speed_line(record["speed"], record["threads"], record["n_views"])]
     return "\n".join(lines)

@@ -13,16 +13,17 @@ from studies.command import parser_of, run_command
 from studies.motion.layers import THICKNESS_MM
 from studies.prior.ablation import BASELINE, VARIANTS, measure
 
-MOST_LOSS_DB = 0.1
+MAX_LOSS_DB = 0.1
 """From several stacks the prior may not cost more than this."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = parser_of(
-        "prior_cases", "Every variant of studies.prior.ablation on the cases, with all their stacks.",
+        "prior_cases",
+        "Every variant of studies.prior.ablation on the cases, with all their stacks.",
         Path("runs") / "bench" / "prior-cases",
-    )  # fmt: skip
+    )
     parser.add_argument("--cases", nargs="+", metavar="WORD", default=[""], help="names that contain one")
     return parser
 
@@ -45,9 +46,12 @@ def _run(options: argparse.Namespace) -> int:
     settings = preset_settings(options.preset)
     rows: dict[str, Any] = {}
     record = {
-        "preset": options.preset, "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
-        "threads": threads, "machine": machine(), "cases": rows,
-    }  # fmt: skip
+        "preset": options.preset,
+        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "threads": threads,
+        "machine": machine(),
+        "cases": rows,
+    }
     for folder in sorted((test_data_folder() / "cases").iterdir()):
         if not any(word in folder.name for word in options.cases):
             continue
@@ -69,15 +73,21 @@ def cases_table(record: Mapping[str, Any]) -> str:
     for name, row in record["cases"].items():
         psnr = {variant: row["scores"][variant]["psnr_db"] for variant in VARIANTS}
         gain = psnr[VARIANTS[-1]] - psnr[BASELINE]
-        mark = " (!)" if gain < -MOST_LOSS_DB else ""
+        mark = " (!)" if gain < -MAX_LOSS_DB else ""
         rows.append(
-            [name, row["n_stacks"], *(f"{psnr[variant]:.2f}" for variant in VARIANTS), f"{gain:+.2f}{mark}",
-             f"{row['scores'][VARIANTS[-1]]['ssim']:.3f}", f"{row['median_mm'][VARIANTS[-1]]:.2f}"]
-        )  # fmt: skip
+            [
+                name,
+                row["n_stacks"],
+                *(f"{psnr[variant]:.2f}" for variant in VARIANTS),
+                f"{gain:+.2f}{mark}",
+                f"{row['scores'][VARIANTS[-1]]['ssim']:.3f}",
+                f"{row['median_mm'][VARIANTS[-1]]:.2f}",
+            ]
+        )
     head = ["case", "stacks", *VARIANTS, "prior brings", "SSIM", "TRE, mm"]
     return (
         f"dB; preset `{record['preset']}`, weights {record['weights']}. (!) marks a loss of more than "
-        f"{MOST_LOSS_DB:g} dB.\n\n{markdown_table(head, rows)}"
+        f"{MAX_LOSS_DB:g} dB.\n\n{markdown_table(head, rows)}"
     )
 
 

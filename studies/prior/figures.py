@@ -40,16 +40,26 @@ def draw_ablation(rows: Mapping[str, Any], variants: Sequence[str], baseline: st
             if panel is panels[2] and variant == baseline:
                 continue
             panel.errorbar(
-                np.array(numbers) + shift, [np.mean(v) for v in values], [_deviation(v) for v in values],
-                color=COLOURS[place % len(COLOURS)], marker="o", markersize=4, capsize=2.5, linewidth=1.4,
+                np.array(numbers) + shift,
+                [np.mean(v) for v in values],
+                [_deviation(v) for v in values],
+                color=COLOURS[place % len(COLOURS)],
+                marker="o",
+                markersize=4,
+                capsize=2.5,
+                linewidth=1.4,
                 label=variant,
-            )  # fmt: skip
+            )
             if panel is panels[2]:
                 for n, found in zip(numbers, values, strict=True):
                     panel.plot(
-                        [n + shift] * len(found), found, ".", markersize=3, alpha=0.5,
+                        [n + shift] * len(found),
+                        found,
+                        ".",
+                        markersize=3,
+                        alpha=0.5,
                         color=COLOURS[place % len(COLOURS)],
-                    )  # fmt: skip
+                    )
     titles = ("PSNR (dB)", "SSIM", f"difference to the {baseline} (dB)")
     for panel, title in zip(panels, titles, strict=True):
         panel.set_title(title, fontsize=10)
@@ -83,17 +93,13 @@ def draw_networks(record: Mapping[str, Any], path: Path) -> None:
     for place, n in enumerate(numbers):
         gain = [of[n]["psnr_db"] - coarse[n]["psnr_db"] if n in of else 0.0 for of in scores.values()]
         label = f"{n} stack{'s' * (n != '1')}"
-        left.barh(
-            rows + thick * place - 0.4, gain, thick, align="edge", color=COLOURS[4 - place], label=label
-        )
+        left.barh(rows + thick * place - 0.4, gain, thick, align="edge", color=COLOURS[4 - place], label=label)
     left.set_yticks(rows, list(scores), fontsize=9)
     left.invert_yaxis()
     left.set_title("PSNR gained over V_coarse (dB)", fontsize=10)
     left.legend(fontsize=8)
     left.grid(alpha=0.25, axis="x")
-    sizes = sorted(
-        (one["seconds"], one["scores"]["all"]["l1"], n) for n, one in variants.items() if one["is_size"]
-    )
+    sizes = sorted((one["seconds"], one["scores"]["all"]["l1"], n) for n, one in variants.items() if one["is_size"])
     right.plot([s for s, _, _ in sizes], [error for _, error, _ in sizes], "o-", color=COLOURS[5])
     for seconds, error, name in sizes:
         right.annotate(name, (seconds, error), textcoords="offset points", xytext=(6, 6), fontsize=8)

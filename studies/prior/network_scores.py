@@ -33,9 +33,13 @@ def validation_volumes(
     from data_synth.prior_data import StackSynthesisDataModule
 
     settings = {
-        **config["data"]["init_args"], "source": str(source), "cache": str(cache),
-        "val_subjects": val_subjects, "exclude": list(LEFT_OUT), "val_include": list(VALIDATED_ON),
-    }  # fmt: skip
+        **config["data"]["init_args"],
+        "source": str(source),
+        "cache": str(cache),
+        "val_subjects": val_subjects,
+        "exclude": list(LEFT_OUT),
+        "val_include": list(VALIDATED_ON),
+    }
     return list(StackSynthesisDataModule(**settings).val_dataloader())
 
 
@@ -89,9 +93,7 @@ def baseline_scores(volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
     }
 
 
-def scores_by_stacks(
-    made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]
-) -> dict[str, dict[str, float]]:
+def scores_by_stacks(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, dict[str, float]]:
     """Mean L1, PSNR (dB) and SSIM in the mask, for each number of stacks and over all ("all")."""
     from g3r.training.prior_module import scores_in_mask
 

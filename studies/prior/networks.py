@@ -75,9 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
         "the atlas in the folder that G3R_TEST_DATA names, or --source.",
         DEFAULT_FOLDER,
     )
-    parser.add_argument(
-        "--steps", type=int, default=384, metavar="N", help="of the optimiser, to whole epochs"
-    )
+    parser.add_argument("--steps", type=int, default=384, metavar="N", help="of the optimiser, to whole epochs")
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help=", ".join(names(VARIANTS)))
     parser.add_argument("--source", type=Path, help="atlas folder (None: the one of the test data)")
     parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="synthetic subjects")
@@ -86,10 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--retime", action="store_true", help="measure all seconds again, on a quiet machine")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw errors and seconds")
     parser.add_argument(
-        "train_args",
-        nargs="*",
-        metavar="-- ARG",
-        help="more arguments of g3r-pretrain, such as --data.batch_size=2",
+        "train_args", nargs="*", metavar="-- ARG", help="more arguments of g3r-pretrain, such as --data.batch_size=2"
     )
     return parser
 
@@ -145,9 +140,13 @@ def _run(options: argparse.Namespace) -> int:
             volumes = volumes or validation_volumes(source, options.cache, options.val_subjects, config)
             record["baselines"] = record["baselines"] or baseline_scores(volumes)
             record["variants"][variant.name] = {
-                "what": variant.what, "options": dict(variant.options), "is_size": variant.is_size,
-                "epochs": n_epochs, "train_seconds": round(seconds), **evaluate(checkpoint, run, volumes),
-            }  # fmt: skip
+                "what": variant.what,
+                "options": dict(variant.options),
+                "is_size": variant.is_size,
+                "epochs": n_epochs,
+                "train_seconds": round(seconds),
+                **evaluate(checkpoint, run, volumes),
+            }
             write_json(path, record)
     if not record["variants"]:
         raise InputError(f"{path}: holds no trained variant; leave out --no-train")
@@ -199,9 +198,11 @@ def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
     """What all variants are told about their data."""
     listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
     return [
-        f"--data.source={source}", f"--data.cache={cache}", f"--data.val_subjects={val_subjects}",
+        f"--data.source={source}",
+        f"--data.cache={cache}",
+        f"--data.val_subjects={val_subjects}",
         *(f"--data.{name}={json.dumps(patterns)}" for name, patterns in listed.items()),
-    ]  # fmt: skip
+    ]
 
 
 def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
@@ -213,12 +214,21 @@ def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) 
     run.mkdir(parents=True, exist_ok=True)
     last = newest_checkpoint(run)
     command = [
-        sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(CONFIG), *arguments,
+        sys.executable,
+        "-m",
+        "g3r.cli.pretrain",
+        "fit",
+        "--config",
+        str(CONFIG),
+        *arguments,
         *(f"--model.{name}={json.dumps(value)}" for name, value in variant.options.items()),
-        f"--trainer.max_epochs={n_epochs}", "--trainer.max_time=null", "--trainer.enable_progress_bar=false",
-        f"--trainer.logger.init_args.save_dir={run}", "--trainer.logger.init_args.name=logs",
+        f"--trainer.max_epochs={n_epochs}",
+        "--trainer.max_time=null",
+        "--trainer.enable_progress_bar=false",
+        f"--trainer.logger.init_args.save_dir={run}",
+        "--trainer.logger.init_args.name=logs",
         *([f"--ckpt_path={last}"] if last else []),
-    ]  # fmt: skip
+    ]
     print(f"{variant.name}: {'going on' if last else 'training'}, {n_epochs} epochs", flush=True)
     start = time.perf_counter()
     with (run / "train.log").open("ab") as log:
@@ -240,25 +250,30 @@ def network_tables(record: Mapping[str, Any]) -> str:
     numbers = sorted(n for n in variants[ordered[0]]["scores"] if n != "all")
     head = ["", "differs by", "L1", *(f"{n} stack{'s' * (n != '1')}, dB" for n in numbers), "all, dB", "SSIM"]
     head += ["weights", "s per brain", "steps", "trained, min"]
-    rows = [
-        [name, "", *_score_cells(scores, numbers), "", "", "", ""]
-        for name, scores in record["baselines"].items()
-    ]
+    rows = [[name, "", *_score_cells(scores, numbers), "", "", "", ""] for name, scores in record["baselines"].items()]
     for name in ordered:
         one = variants[name]
         rows.append(
-            [name, one["what"], *_score_cells(one["scores"], numbers), f"{one['parameters'] / 1e6:.2f} M",
-             f"{one['seconds']:.1f}", one["steps"], f"{one['train_seconds'] / 60:.0f}"]
-        )  # fmt: skip
+            [
+                name,
+                one["what"],
+                *_score_cells(one["scores"], numbers),
+                f"{one['parameters'] / 1e6:.2f} M",
+                f"{one['seconds']:.1f}",
+                one["steps"],
+                f"{one['train_seconds'] / 60:.0f}",
+            ]
+        )
     size = " x ".join(map(str, SPEED_SHAPE))
     return "\n".join(
         [
             "Mean over the validation volumes, in the mask, in normalised intensities (PSNR: range 1); "
             f"seconds for one view of {size} voxels on {record['threads']} threads. Trained with "
             f"`{' '.join(record.get('arguments', [])) or 'the configuration as it is'}`.",
-            "", markdown_table(head, rows),
+            "",
+            markdown_table(head, rows),
         ]
-    )  # fmt: skip
+    )
 
 
 def _score_cells(scores: Mapping[str, Any], numbers: Sequence[str]) -> list[str]:

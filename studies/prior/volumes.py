@@ -66,9 +66,7 @@ def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
     return slices.with_pose(case.true.pose.take(rows) @ slices.header_pose)
 
 
-def prior_volumes(
-    network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: float, n_views: int = 1
-) -> PriorVolumes:
+def prior_volumes(network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: float, n_views: int = 1) -> PriorVolumes:
     """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have.
 
     Args:
@@ -135,11 +133,7 @@ def _moved(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def refined_pose(
-    data: NDArray[np.float32],
-    grid: VolumeGrid,
-    truth: Volume,
-    mask: NDArray[np.bool_],
-    truth_from_volume: RigidPose,
+    data: NDArray[np.float32], grid: VolumeGrid, truth: Volume, mask: NDArray[np.bool_], truth_from_volume: RigidPose
 ) -> RigidPose:
     """Least squares over six parameters, gain and offset, by Gauss-Newton from a near start."""
     inside = np.argwhere(mask)
@@ -162,9 +156,7 @@ def refined_pose(
         jacobian = np.concatenate([np.cross(lever, slope), slope], 1)
         gain, offset = np.polyfit(value, wanted, 1)
         system = np.concatenate([gain * jacobian, value[:, None], np.ones((len(value), 1))], 1)
-        step = np.linalg.lstsq(system.T @ system, system.T @ (wanted - gain * value - offset), rcond=None)[0][
-            :6
-        ]
+        step = np.linalg.lstsq(system.T @ system, system.T @ (wanted - gain * value - offset), rcond=None)[0][:6]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         pose = RigidPose(turn[None], (step[3:] + middle_mm - turn @ middle_mm)[None]) @ pose
         if np.abs(step).max() < SMALL_STEP:

@@ -23,12 +23,12 @@ STEPS = (10, 20, 40, 80, 160, 320)
 NEAR_DB = 0.1
 
 _LATTICE = {"adaptive": None}
-_NO_PEAKS = {"prior_stage.peak_iterations": 0, "slice_stage.peak_iterations": 0}
+_NO_AMPLITUDES = {"prior_stage.amplitude_iterations": 0, "slice_stage.amplitude_iterations": 0}
 _UNFITTED = {"use_prior": False, "prior_stage.n_steps": 0}
 
 WAYS: dict[str, Mapping[str, Any]] = {
-    "Adam from the seeds": {**_LATTICE, **_NO_PEAKS, **_UNFITTED},
-    "peaks by least squares first": {**_LATTICE, **_UNFITTED},
+    "Adam from the seeds": {**_LATTICE, **_NO_AMPLITUDES, **_UNFITTED},
+    "amplitudes by least squares first": {**_LATTICE, **_UNFITTED},
     "started at the prior": _LATTICE,
     "few Gaussians first (as shipped)": {},
 }
@@ -87,9 +87,13 @@ def _run(options: argparse.Namespace) -> int:
                 found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
                 seconds = result.record["cpu_seconds"]
                 rows[name].append(
-                    {"steps": n_steps, "n_gaussians": len(result.cloud), **found.record(),
-                     "cpu_s": seconds["fit to prior"] + seconds["fit to slices"]}
-                )  # fmt: skip
+                    {
+                        "steps": n_steps,
+                        "n_gaussians": len(result.cloud),
+                        **found.record(),
+                        "cpu_s": seconds["fit to prior"] + seconds["fit to slices"],
+                    }
+                )
                 print(case.name, name, rows[name][-1], flush=True)
                 write_json(options.output / "convergence.json", record)
     text = convergence_table(record)
@@ -113,13 +117,25 @@ def convergence_table(record: Mapping[str, Any]) -> str:
             if common is not None:
                 seconds = float(np.interp(np.log(common), np.log(steps), [e["cpu_s"] for e in entries]))
             rows.append(
-                [case, name, entries[-1]["n_gaussians"], *(f"{value:.2f}" for value in psnr), f"{own:.0f}",
-                 "never" if common is None else f"{common:.0f}", "" if seconds is None else f"{seconds:.1f}"]
-            )  # fmt: skip
+                [
+                    case,
+                    name,
+                    entries[-1]["n_gaussians"],
+                    *(f"{value:.2f}" for value in psnr),
+                    f"{own:.0f}",
+                    "never" if common is None else f"{common:.0f}",
+                    "" if seconds is None else f"{seconds:.1f}",
+                ]
+            )
     head = [
-        "case", "fit", "Gaussians", *(f"{n} steps, dB" for n in STEPS), "steps to its own best",
-        "to the best of all", "CPU s of both stages for it",
-    ]  # fmt: skip
+        "case",
+        "fit",
+        "Gaussians",
+        *(f"{n} steps, dB" for n in STEPS),
+        "steps to its own best",
+        "to the best of all",
+        "CPU s of both stages for it",
+    ]
     return (
         f"Preset `{record['preset']}`; steps of the slice stage to within {NEAR_DB:g} dB, interpolated on "
         f"their logarithm.\n\n{markdown_table(head, rows)}"

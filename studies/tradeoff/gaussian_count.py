@@ -19,7 +19,7 @@ from data_synth.phantom import fetal_brain_phantom
 from g3r.bench.record import machine, markdown_table, put_between_markers, write_json
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
-from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior, solve_peaks_on
+from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior, solve_amplitudes_on
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
@@ -86,15 +86,15 @@ def psnr_db(cloud: GaussianCloud, target: VolumeTarget) -> float:
 
 
 def lattice_cloud(
-    subject: Subject, spacing_mm: float, n_steps: int, peak_iterations: int, seed: int
+    subject: Subject, spacing_mm: float, n_steps: int, amplitude_iterations: int, seed: int
 ) -> GaussianCloud:
     """A uniform lattice with as many optimiser and conjugate-gradient steps as the adaptive cloud had."""
     volume, mask, grid = subject
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
-    stage = replace(STAGE, n_steps=n_steps, peak_iterations=peak_iterations)
+    stage = replace(STAGE, n_steps=n_steps, amplitude_iterations=amplitude_iterations)
     cloud = seed_cloud(volume, mask, grid, spacing_mm)
     cloud, _ = fit_prior(cloud, target, stage, np.random.default_rng(seed))
-    return solve_peaks_on(cloud, target, ADAPTIVE.peak_iterations)
+    return solve_amplitudes_on(cloud, target, ADAPTIVE.amplitude_iterations)
 
 
 STAGE = PriorStageSettings(scale_weight=0.0)
@@ -111,7 +111,7 @@ def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[
     adaptive = replace(ADAPTIVE, start=4.0) if name == "ball" else ADAPTIVE
     adaptive = replace(adaptive, last_steps=adaptive.round_steps)
     rows: dict[str, Any] = {"adaptive": [], "uniform": []}
-    most_steps = 0
+    max_steps = 0
     for bound in BOUNDS.get(name, USUAL_BOUNDS):
         start = time.process_time()
         settings = replace(adaptive, bound=bound)
@@ -119,17 +119,17 @@ def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[
         seconds = round(time.process_time() - start, 2)
         row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **done.record()}
         rows["adaptive"].append(row)
-        most_steps = max(most_steps, done.steps)
+        max_steps = max(max_steps, done.steps)
         _say(name, "adaptive", row)
-    iterations = ADAPTIVE.peak_iterations * (most_steps // adaptive.round_steps)
+    iterations = ADAPTIVE.amplitude_iterations * (max_steps // adaptive.round_steps)
     for spacing_mm in LATTICE_MM.get(name, USUAL_LATTICE):
         start = time.process_time()
-        cloud = lattice_cloud(subject, spacing_mm, most_steps, iterations, seed)
+        cloud = lattice_cloud(subject, spacing_mm, max_steps, iterations, seed)
         seconds = round(time.process_time() - start, 2)
         row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds}
         rows["uniform"].append(row | {"spacing_mm": spacing_mm})
         _say(name, "uniform", row)
-    return rows | {"steps": most_steps, "n_voxels": int(mask.sum())}
+    return rows | {"steps": max_steps, "n_voxels": int(mask.sum())}
 
 
 def uniform_number(rows: Sequence[dict[str, Any]], psnr: float) -> float | None:
@@ -149,16 +149,24 @@ def table(record: dict[str, Any]) -> str:
             needed = uniform_number(case["uniform"], row["psnr_db"])
             lines.append(
                 [
-                    name, f"{row['bound']:g}", f"{row['psnr_db']:.1f}", row["n"],
+                    name,
+                    f"{row['bound']:g}",
+                    f"{row['psnr_db']:.1f}",
+                    row["n"],
                     "outside the curve" if needed is None else f"{needed:.0f}",
                     "-" if needed is None else f"{100 * row['n'] / needed:.0f} %",
                     f"{row['n_seeded']} + {row['n_added']} - {row['n_dropped']} - {row['n_merged']}",
                 ]
-            )  # fmt: skip
+            )
     head = [
-        "volume", "bound", "PSNR, dB", "Gaussians", "uniform, equal PSNR", "ratio",
+        "volume",
+        "bound",
+        "PSNR, dB",
+        "Gaussians",
+        "uniform, equal PSNR",
+        "ratio",
         "seeded + added - dropped - merged",
-    ]  # fmt: skip
+    ]
     text = markdown_table(head, lines)
     for name, reason in record["skipped"].items():
         text += f"\n\n{name}: left out, {reason}"
@@ -177,9 +185,7 @@ def draw(record: dict[str, Any], path: Path) -> None:
     for axis, (name, case) in zip(axes, cases.items(), strict=True):
         for kind, colour, mark in (("adaptive", "#0072b2", "o"), ("uniform", "#d55e00", "s")):
             rows = sorted(case[kind], key=lambda row: row["n"])
-            axis.plot(
-                [r["n"] for r in rows], [r["psnr_db"] for r in rows], marker=mark, color=colour, label=kind
-            )
+            axis.plot([r["n"] for r in rows], [r["psnr_db"] for r in rows], marker=mark, color=colour, label=kind)
         axis.set_xscale("log")
         axis.set_title(name, fontsize=10)
         axis.set_xlabel("Gaussians")
@@ -194,8 +200,9 @@ def draw(record: dict[str, Any], path: Path) -> None:
 def _say(name: str, kind: str, row: dict[str, Any]) -> None:
     print(
         f"{name}: {kind}, {row['n']} Gaussians, {row['psnr_db']:.2f} dB, {row['cpu_seconds']} s",
-        file=sys.stderr, flush=True,
-    )  # fmt: skip
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -244,9 +251,10 @@ def _finished(path: Path, voxel_mm: float) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `python -m studies.tradeoff.gaussian_count`."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.gaussian_count", description=__doc__,
+        prog="python -m studies.tradeoff.gaussian_count",
+        description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--subjects", nargs="*", default=[], metavar="NAME", help="(none: all)")
     parser.add_argument("--voxel", type=float, default=1.0, help="of phantoms, ball and atlas, mm")
     parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "bench", help="for the JSON")

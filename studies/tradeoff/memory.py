@@ -47,10 +47,7 @@ CONFIGURATIONS = (
 )
 """Small and large heads, few and many stacks, coarse and fine voxels; draft where nothing else is asked."""
 
-LIMITED = (
-    Configuration(30, 3, "draft", 0.8),
-    Configuration(30, 1, "draft", 0.5),
-)
+LIMITED = (Configuration(30, 3, "draft", 0.8), Configuration(30, 1, "draft", 0.5))
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
 
 
@@ -68,9 +65,13 @@ def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
 def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
     """Of g3r-infer."""
     return [
-        *infer_arguments(case, one.preset, output), "--threads", str(one.threads),
-        "--resolution", f"{one.voxel_mm:g}", *one.more,
-    ]  # fmt: skip
+        *infer_arguments(case, one.preset, output),
+        "--threads",
+        str(one.threads),
+        "--resolution",
+        f"{one.voxel_mm:g}",
+        *one.more,
+    ]
 
 
 def measured(one: Configuration, folder: Path) -> dict[str, Any]:
@@ -79,10 +80,16 @@ def measured(one: Configuration, folder: Path) -> dict[str, Any]:
     run = run_infer(arguments_for(one, case, folder / "out"), folder / "out")
     said = run.record["memory"]
     return {
-        "weeks": one.weeks, "stacks": one.n_stacks, "preset": one.preset, "voxel_mm": one.voxel_mm,
-        "threads": one.threads, "more": " ".join(one.more), "stated_bytes": said["stated_bytes"],
-        "stage": said["stage"], "measured_bytes": run.peak_bytes,
-    }  # fmt: skip
+        "weeks": one.weeks,
+        "stacks": one.n_stacks,
+        "preset": one.preset,
+        "voxel_mm": one.voxel_mm,
+        "threads": one.threads,
+        "more": " ".join(one.more),
+        "stated_bytes": said["stated_bytes"],
+        "stage": said["stage"],
+        "measured_bytes": run.peak_bytes,
+    }
 
 
 def table(record: dict[str, Any]) -> str:
@@ -90,12 +97,18 @@ def table(record: dict[str, Any]) -> str:
     head = ("phantom", "stacks", "preset", "voxel", "threads", "stated", "most of it in", "measured", "ratio")
     rows = [
         (
-            f"{row['weeks']} weeks", row["stacks"], f"{row['preset']} {row['more']}".strip(),
-            f"{row['voxel_mm']:g} mm", row["threads"], f"{row['stated_bytes'] / 1e9:.2f} GB", row["stage"],
-            f"{row['measured_bytes'] / 1e9:.2f} GB", f"{row['stated_bytes'] / row['measured_bytes']:.2f}",
+            f"{row['weeks']} weeks",
+            row["stacks"],
+            f"{row['preset']} {row['more']}".strip(),
+            f"{row['voxel_mm']:g} mm",
+            row["threads"],
+            f"{row['stated_bytes'] / 1e9:.2f} GB",
+            row["stage"],
+            f"{row['measured_bytes'] / 1e9:.2f} GB",
+            f"{row['stated_bytes'] / row['measured_bytes']:.2f}",
         )
         for row in record["rows"]
-    ]  # fmt: skip
+    ]
     return f"{markdown_table(head, rows)}\n\n{machine_line(record['machine'])}"
 
 
@@ -131,9 +144,10 @@ def run(options: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `python -m studies.tradeoff.memory`."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.memory", description=__doc__,
+        prog="python -m studies.tradeoff.memory",
+        description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "memory", help="for the record")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
     parser.add_argument("--part", choices=("all", "statement", "limits"), default="all", help="of the tables")

@@ -35,9 +35,7 @@ def limited_rows(
     return [first, *[_row(case, name, arguments, output, limit) for limit in limits]]
 
 
-def _row(
-    case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, limit: int | None
-) -> dict[str, Any]:
+def _row(case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, limit: int | None) -> dict[str, Any]:
     row: dict[str, Any] = {"name": name, "limit_bytes": limit}
     try:
         run = run_infer([*arguments, *([] if limit is None else ["--max-memory", str(limit)])], output)
@@ -45,10 +43,13 @@ def _row(
         return row | {"refused": str(error)}
     said = run.record["memory"]
     return row | {
-        "stated_bytes": said["stated_bytes"], "measured_bytes": run.peak_bytes, "changes": said["changes"],
-        "seconds": round(run.seconds, 1), "cpu_seconds": round(run.cpu_seconds, 1),
+        "stated_bytes": said["stated_bytes"],
+        "measured_bytes": run.peak_bytes,
+        "changes": said["changes"],
+        "seconds": round(run.seconds, 1),
+        "cpu_seconds": round(run.cpu_seconds, 1),
         "psnr_db": quality_of_folder(case, output).psnr_db,
-    }  # fmt: skip
+    }
 
 
 def is_kept(row: dict[str, Any]) -> bool:
@@ -67,8 +68,15 @@ def limits_table(rows: Sequence[dict[str, Any]]) -> str:
             cells.append((row["name"], limit, "refused", "", "", "", row["refused"].split(";")[0]))
             continue
         changes = "; ".join(change.removeprefix("memory limit: ") for change in row["changes"])
-        cells.append((
-            row["name"], limit, f"{row['stated_bytes'] / GB:.2f} GB", f"{row['measured_bytes'] / GB:.2f} GB",
-            f"{row['cpu_seconds']:.0f}", f"{row['psnr_db']:.2f}", changes or "nothing",
-        ))  # fmt: skip
+        cells.append(
+            (
+                row["name"],
+                limit,
+                f"{row['stated_bytes'] / GB:.2f} GB",
+                f"{row['measured_bytes'] / GB:.2f} GB",
+                f"{row['cpu_seconds']:.0f}",
+                f"{row['psnr_db']:.2f}",
+                changes or "nothing",
+            )
+        )
     return markdown_table(head, cells)

@@ -34,9 +34,10 @@ LENGTH_MM = 42.0
 def build_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.peer_phantom", description=__doc__.splitlines()[0],
+        prog="python -m studies.tradeoff.peer_phantom",
+        description=__doc__.splitlines()[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "peer-phantom")
     parser.add_argument("--seed", type=int, default=61000)
     parser.add_argument("--force", action="store_true", help="replace an earlier case in --output")
@@ -73,9 +74,7 @@ def small_head(seed: int) -> TruthVolume:
     affine = np.diag([VOXEL_MM, VOXEL_MM, VOXEL_MM, 1.0])
     affine[:3, 3] = -VOXEL_MM * (VOXELS - 1) / 2
     shape = (VOXELS, VOXELS, VOXELS)
-    return TruthVolume(
-        "phantom", _window(made.t2 * bright, low, shape), _window(made.mask, low, shape), affine
-    )
+    return TruthVolume("phantom", _window(made.t2 * bright, low, shape), _window(made.mask, low, shape), affine)
 
 
 def in_shape(one: SimulatedStack) -> SimulatedStack:
@@ -87,9 +86,7 @@ def in_shape(one: SimulatedStack) -> SimulatedStack:
     affine[:3, 3] = stack.grid.world(np.array([low[0], low[1], first]))
     shape = (*STACK_SHAPE[:2], last - first)
     low[2] = first
-    cut = replace(
-        stack, image=_window(stack.image, low, shape), mask=_window(stack.mask, low, shape), affine=affine
-    )
+    cut = replace(stack, image=_window(stack.image, low, shape), mask=_window(stack.mask, low, shape), affine=affine)
     kept = slice(first, last)
     return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.is_void[kept])
 

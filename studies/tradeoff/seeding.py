@@ -34,10 +34,15 @@ def run(options: argparse.Namespace) -> int:
             seconds = result.record["cpu_seconds"]
             rows.append(
                 [
-                    case.name, name, len(result.cloud), f"{scores.psnr_db:.2f}", f"{scores.ssim:.4f}",
-                    f"{seconds['fit to prior']:.1f}", f"{seconds['fit to slices']:.1f}",
+                    case.name,
+                    name,
+                    len(result.cloud),
+                    f"{scores.psnr_db:.2f}",
+                    f"{scores.ssim:.4f}",
+                    f"{seconds['fit to prior']:.1f}",
+                    f"{seconds['fit to slices']:.1f}",
                 ]
-            )  # fmt: skip
+            )
     head = ["case", "bound", "Gaussians", "PSNR, dB", "SSIM", "CPU s, stage 1", "CPU s, stage 2"]
     print(markdown_table(head, rows))
     return 0
@@ -46,9 +51,10 @@ def run(options: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `python -m studies.tradeoff.seeding`."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.seeding", description=__doc__,
+        prog="python -m studies.tradeoff.seeding",
+        description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("cases", nargs="+", type=Path, metavar="CASE", help="folder written by g3r-simulate")
     parser.add_argument("--bounds", nargs="*", type=float, default=[0.03, 0.05, 0.08], help="to compare")
     parser.add_argument("--preset", default="balanced", help="settings")

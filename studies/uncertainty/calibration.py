@@ -33,9 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--no-prior", action="store_true", help="for reconstructions without a prior")
     parser.add_argument("--subjects", type=int, metavar="N", help="the first N alone (None: all)")
     parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="simulated subjects")
-    parser.add_argument(
-        "--figure", type=Path, metavar="PNG", help="also draw error against uncertainty (check)"
-    )
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw error against uncertainty (check)")
     return parser
 
 
@@ -51,13 +49,7 @@ def _run(options: argparse.Namespace) -> int:
     from g3r.reconstruct import GaussianReconstructor
     from studies.runs import preset_settings
     from studies.subjects import test_data_folder
-    from studies.uncertainty.data import (
-        NO_REGISTRATION,
-        check_recipes,
-        fit_recipes,
-        judged,
-        unregistered_recipe,
-    )
+    from studies.uncertainty.data import NO_REGISTRATION, check_recipes, fit_recipes, judged, unregistered_recipe
 
     atlas = test_data_folder() / "atlas"
     use_threads(options.threads or available_cores())
@@ -70,14 +62,15 @@ def _run(options: argparse.Namespace) -> int:
         unregistered = GaussianReconstructor(options.ckpt, changed(settings, NO_REGISTRATION))
         todo.append((*unregistered_recipe(), unregistered))
     start, found = time.perf_counter(), []
-    for recipe, n_stacks, by in todo:
-        one = judged(recipe, n_stacks, by, atlas, options.cache, registered=by is reconstructor)
+    for spec, n_stacks, by in todo:
+        one = judged(spec, n_stacks, by, atlas, options.cache, registered=by is reconstructor)
         found.append(one)
         print(
             f"{one.label}: {one.psnr_db:.2f} dB, poses {one.median_mm:.2f} mm, mean error "
             f"{100 * abs(one.error).mean():.2f} % of the brightest, {one.seconds:.0f} s "
-            f"(map {one.map_seconds:.1f} s)", flush=True,
-        )  # fmt: skip
+            f"(map {one.map_seconds:.1f} s)",
+            flush=True,
+        )
     text = _fit(options, found) if fitting else _check(options, found)
     print(text)
     print(f"{time.perf_counter() - start:.0f} s")
@@ -92,7 +85,7 @@ def _fit(options: argparse.Namespace, found: list[Judged]) -> str:
     from g3r.uncertainty.error_model import fit_model, load_calibration, save_calibration, terms
     from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR
 
-    of_each = [terms(one.evidence) for one in found]
+    of_each = [terms(one.predictors) for one in found]
     samples = {name: np.concatenate([one[name] for one in of_each]) for name in of_each[0]}
     error = np.concatenate([one.error for one in found])
     weight = np.concatenate([np.full(len(one.error), 1 / len(one.error)) for one in found])
@@ -100,13 +93,16 @@ def _fit(options: argparse.Namespace, found: list[Judged]) -> str:
     name = WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
     models, records = load_calibration(CALIBRATION) if CALIBRATION.is_file() else ({}, {})
     records[name] = {
-        "g3r": __version__, "preset": options.preset, "prior": _weights(options),
+        "g3r": __version__,
+        "preset": options.preset,
+        "prior": _weights(options),
         "voxels_per_subject": len(found[0].error),
         "subjects": [
             {"volume": r.volume, "motion": r.motion, "seed": r.seed, "stacks": one.n_stacks}
-            for one in found for r in [one.recipe]
+            for one in found
+            for r in [one.spec]
         ],
-    }  # fmt: skip
+    }
     save_calibration(CALIBRATION, {**models, name: model}, records)
     lines = [f"ln u = {model.intercept:.3f}", *(f"  + {b:.3f} {n}" for n, b in model.coefficients.items())]
     return "\n".join([f"{name}, written to {CALIBRATION.name}:", *lines])
@@ -122,9 +118,7 @@ def _check(options: argparse.Namespace, found: list[Judged]) -> str:
     name = WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
     path = options.output / "check.json"
     record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    record[name] = {
-        "preset": options.preset, "weights": _weights(options), **check_record(found, calibration()[name]),
-    }  # fmt: skip
+    record[name] = {"preset": options.preset, "weights": _weights(options), **check_record(found, calibration()[name])}
     write_json(path, record)
     text = check_text(record)
     write_text(options.output / "check.md", text)

@@ -17,37 +17,51 @@ from g3r.evaluation.metrics import score
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 from g3r.uncertainty.estimate import collect
 from studies.prior.volumes import refined_pose
-from studies.subjects import SubjectRecipe, simulated_subject
+from studies.subjects import SubjectSpec, simulated_subject
 
 FIT_VOLUMES = (
-    ("spina-bifida/sb26-operated", 3, "mild", 51_200), ("spina-bifida/sb33-operated", 1, "mild", 51_209),
-    ("spina-bifida/sb28-operated", 3, "moderate", 51_201), ("spina-bifida/sb25-operated", 1, "mild", 51_205),
-    ("spina-bifida/sb30-operated", 3, "mild", 51_202), ("spina-bifida/sb27-operated", 1, "none", 51_206),
-    ("spina-bifida/sb32-operated", 3, "moderate", 51_203), ("spina-bifida/sb29-operated", 1, "mild", 51_207),
-    ("spina-bifida/sb34-operated", 3, "mild", 51_204), ("spina-bifida/sb31-operated", 1, "mild", 51_208),
-)  # fmt: skip
+    ("spina-bifida/sb26-operated", 3, "mild", 51_200),
+    ("spina-bifida/sb33-operated", 1, "mild", 51_209),
+    ("spina-bifida/sb28-operated", 3, "moderate", 51_201),
+    ("spina-bifida/sb25-operated", 1, "mild", 51_205),
+    ("spina-bifida/sb30-operated", 3, "mild", 51_202),
+    ("spina-bifida/sb27-operated", 1, "none", 51_206),
+    ("spina-bifida/sb32-operated", 3, "moderate", 51_203),
+    ("spina-bifida/sb29-operated", 1, "mild", 51_207),
+    ("spina-bifida/sb34-operated", 3, "mild", 51_204),
+    ("spina-bifida/sb31-operated", 1, "mild", 51_208),
+)
 """Volume, stacks, motion and seed of the subjects that the coefficients are fitted to. No prior was
 trained on these volumes (checkpoints are chosen by them)."""
 
 CHECK_VOLUMES = (
-    ("crl-sta/sta24", 3, "mild", 52_200), ("crl-sta/sta30", 1, "mild", 52_201),
-    ("crl-sta/sta34", 3, "moderate", 52_202), ("crl-sta/sta24", 1, "mild", 52_203),
-    ("crl-sta/sta30", 3, "mild", 52_204), ("crl-sta/sta34", 1, "mild", 52_205),
-    ("crl-sta/sta24", 3, "moderate", 52_206), ("crl-sta/sta30", 1, "none", 52_207),
-    ("crl-sta/sta34", 3, "mild", 52_208), ("crl-sta/sta24", 1, "mild", 52_209),
-)  # fmt: skip
+    ("crl-sta/sta24", 3, "mild", 52_200),
+    ("crl-sta/sta30", 1, "mild", 52_201),
+    ("crl-sta/sta34", 3, "moderate", 52_202),
+    ("crl-sta/sta24", 1, "mild", 52_203),
+    ("crl-sta/sta30", 3, "mild", 52_204),
+    ("crl-sta/sta34", 1, "mild", 52_205),
+    ("crl-sta/sta24", 3, "moderate", 52_206),
+    ("crl-sta/sta30", 1, "none", 52_207),
+    ("crl-sta/sta34", 3, "mild", 52_208),
+    ("crl-sta/sta24", 1, "mild", 52_209),
+)
 """The same of the subjects that they are checked on: weeks left out of every training and choice."""
 
 UNREGISTERED = ("crl-sta/sta24", 3, "moderate", 52_250)
 """One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
 
 NO_REGISTRATION = {
-    "motion.template": False, "motion.network": False, "motion.stacks": False, "motion.runs": False,
-    "motion.n_rounds": 0, "motion.standard_orientation": False,
-}  # fmt: skip
+    "registration.template": False,
+    "registration.network": False,
+    "registration.stacks": False,
+    "registration.segments": False,
+    "registration.n_rounds": 0,
+    "registration.standard_orientation": False,
+}
 
 VOXELS_PER_SUBJECT = 40_000
 
@@ -57,25 +71,25 @@ class Judged:
     """One reconstruction, voxel by voxel.
 
     Attributes:
-        recipe: the subject.
+        spec: the subject.
         n_stacks: how many of its stacks were used.
-        evidence: [n] by name, a random choice of the voxels inside both masks.
+        predictors: [n] by name, a random choice of the voxels inside both masks.
         error: [n] volume minus truth, in normalised intensities.
         psnr_db: of the volume.
         median_mm: error of the poses.
-        trusted: whether the record trusts the registration.
+        reliable: whether the record trusts the registration.
         registered: whether there was one.
         seconds: of reconstruction and judgement; registration comes from the cache.
         map_seconds: of the map alone, processor time.
     """
 
-    recipe: SubjectRecipe
+    spec: SubjectSpec
     n_stacks: int
-    evidence: dict[str, NDArray[np.float64]]
+    predictors: dict[str, NDArray[np.float64]]
     error: NDArray[np.float64]
     psnr_db: float
     median_mm: float
-    trusted: bool | None
+    reliable: bool | None
     seconds: float
     map_seconds: float
     registered: bool = True
@@ -83,32 +97,32 @@ class Judged:
     @property
     def label(self) -> str:
         """Subject and number of stacks."""
-        name = f"{self.recipe.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+        name = f"{self.spec.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
         return name if self.registered else f"{name}, not registered"
 
 
-def fit_recipes() -> list[tuple[SubjectRecipe, int]]:
+def fit_recipes() -> list[tuple[SubjectSpec, int]]:
     """Subjects of the fit with their number of stacks; always the same."""
     return [_recipe(*one) for one in FIT_VOLUMES]
 
 
-def check_recipes() -> list[tuple[SubjectRecipe, int]]:
+def check_recipes() -> list[tuple[SubjectSpec, int]]:
     """Subjects of the check with their number of stacks; always the same."""
     return [_recipe(*one) for one in CHECK_VOLUMES]
 
 
-def unregistered_recipe() -> tuple[SubjectRecipe, int]:
+def unregistered_recipe() -> tuple[SubjectSpec, int]:
     """The subject that the check leaves unregistered."""
     return _recipe(*UNREGISTERED)
 
 
-def _recipe(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectRecipe, int]:
+def _recipe(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectSpec, int]:
     name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
-    return SubjectRecipe(name, volume, motion, seed), n_stacks
+    return SubjectSpec(name, volume, motion, seed), n_stacks
 
 
 def judged(
-    recipe: SubjectRecipe,
+    spec: SubjectSpec,
     n_stacks: int,
     reconstructor: GaussianReconstructor,
     atlas: Path,
@@ -117,27 +131,31 @@ def judged(
     registered: bool = True,
 ) -> Judged:
     """Simulate, register (or take that from the cache), reconstruct and compare with the truth."""
-    case = load_case(simulated_subject(recipe, atlas, cache))
+    case = load_case(simulated_subject(spec, atlas, cache))
     motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
     start = time.perf_counter()
     result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
     pose_error = case.pose_error(result.slices)
-    truth_from_result = refined_pose(
-        result.volume, result.grid, case.truth, case.truth_mask, pose_error.common
-    )
+    truth_from_result = refined_pose(result.volume, result.grid, case.truth, case.truth_mask, pose_error.common)
     truth = resample(case.truth, result.grid, truth_from_result)
     mask = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
     both = result.mask & (resample(mask, result.grid, truth_from_result) > 0.5)
     error = relative_error(result.volume, truth, both) / result.intensity_scale
-    rng = np.random.default_rng(recipe.seed)
+    rng = np.random.default_rng(spec.seed)
     inside = np.flatnonzero(both[result.mask])
     chosen = np.sort(rng.choice(inside, min(VOXELS_PER_SUBJECT, len(inside)), replace=False))
     return Judged(
-        recipe, n_stacks, {name: one[chosen] for name, one in evidence_of(result).items()},
-        error[result.mask][chosen], score(result.volume, truth, both).psnr_db, pose_error.median_mm,
-        result.record["registration"]["trusted"], time.perf_counter() - start,
-        result.record["cpu_seconds"]["uncertainty"], registered,
-    )  # fmt: skip
+        spec,
+        n_stacks,
+        {name: one[chosen] for name, one in predictors_of(result).items()},
+        error[result.mask][chosen],
+        score(result.volume, truth, both).psnr_db,
+        pose_error.median_mm,
+        result.record["registration"]["trusted"],
+        time.perf_counter() - start,
+        result.record["cpu_seconds"]["uncertainty"],
+        registered,
+    )
 
 
 def relative_error(
@@ -152,19 +170,25 @@ def relative_error(
     return volume.astype(np.float64) - factor * truth
 
 
-def evidence_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
+def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
     """What the map of a result was made of."""
     scale = np.float32(result.intensity_scale)
     fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record["shading"])
     return collect(
-        result.volume / scale, result.mask, result.grid, fit, result.prior / scale, result.density,
-        result.prior_grid, result.prior_share,
-    )  # fmt: skip
+        result.volume / scale,
+        result.mask,
+        result.grid,
+        fit,
+        result.prior / scale,
+        result.density,
+        result.prior_grid,
+        result.prior_share,
+    )
 
 
 def cached_registration(
     case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
-) -> MotionEstimate:
+) -> Registration:
     """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
     path = cache / f"{case.name}-{n_stacks}.motion.pkl"
     if path.is_file():

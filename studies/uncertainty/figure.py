@@ -44,9 +44,12 @@ def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
     of_n = [one for one in record["subjects"].values() if one["n_stacks"] == n and one["registered"]]
     for k, one in enumerate(of_n):
         panel.plot(
-            *_points(one, "mean_error"), color=colour, lw=0.8, alpha=0.45,
+            *_points(one, "mean_error"),
+            color=colour,
+            lw=0.8,
+            alpha=0.45,
             label=f"single subjects ({len(of_n)})" if k == 0 else None,
-        )  # fmt: skip
+        )
     together = record["by_stacks"][str(n)]
     panel.plot(*_points(together, "mean_error"), "o-", color=colour, lw=2, ms=5, label="mean absolute error")
     panel.plot(*_points(together, "rms_error"), "s", color="none", mec=colour, ms=5, label="root mean square")

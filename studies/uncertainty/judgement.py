@@ -25,25 +25,31 @@ LEFT_OUT_SHARES = np.linspace(0, 0.95, 20)
 
 def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
     """Figures of every subject, and of all with the same number of stacks together."""
-    stated = [model.expected(one.evidence) for one in found]
+    stated = [model.expected(one.predictors) for one in found]
     subjects = {
         one.label: {
-            "n_stacks": one.n_stacks, "psnr_db": one.psnr_db, "poses_mm": one.median_mm,
-            "trusted": one.trusted, "registered": one.registered, "seconds": one.seconds,
+            "n_stacks": one.n_stacks,
+            "psnr_db": one.psnr_db,
+            "poses_mm": one.median_mm,
+            "trusted": one.reliable,
+            "registered": one.registered,
+            "seconds": one.seconds,
             "map_seconds": one.map_seconds,
             **judge(u, np.abs(one.error)),
         }
         for one, u in zip(found, stated, strict=True)
-    }  # fmt: skip
+    }
     together = {}
     for n in sorted({one.n_stacks for one in found}):
         of_n = [k for k, one in enumerate(found) if one.n_stacks == n and one.registered]
         size = np.concatenate([np.abs(found[k].error) for k in of_n])
         together[str(n)] = judge(np.concatenate([stated[k] for k in of_n]), size)
     return {
-        "intercept": model.intercept, "coefficients": model.coefficients,
-        "subjects": subjects, "by_stacks": together,
-    }  # fmt: skip
+        "intercept": model.intercept,
+        "coefficients": model.coefficients,
+        "subjects": subjects,
+        "by_stacks": together,
+    }
 
 
 def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, Any]:
@@ -65,20 +71,22 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
     order = np.argsort(stated, kind="stable")
     bins = [
         {
-            "stated": float(stated[group].mean()), "mean_error": float(size[group].mean()),
+            "stated": float(stated[group].mean()),
+            "mean_error": float(size[group].mean()),
             "rms_error": float(np.sqrt((size[group] ** 2).mean())),
         }
         for group in np.array_split(order, N_BINS)
-    ]  # fmt: skip
+    ]
     constant = bool(np.ptp(stated) == 0)
     return {
-        "mean_stated": float(stated.mean()), "mean_error": float(size.mean()),
+        "mean_stated": float(stated.mean()),
+        "mean_error": float(size.mean()),
         "coverage": [float((size < factor * stated).mean()) for factor in COVERAGE_FACTORS],
         "spearman": 0.0 if constant else float(spearmanr(stated, size).statistic),
         "gain_over_constant": area / most if most > 0 else 0.0,
         "bins": bins,
         "sparsification": {"stated": curve.tolist(), "ideal": ideal.tolist()},
-    }  # fmt: skip
+    }
 
 
 def sparsification(by: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,19 +108,25 @@ def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
             ratios = [s["mean_error"] / s["mean_stated"] for s in of_n]
             rows.append(
                 [
-                    name, n, len(of_n), *_sizes(figures), f"{min(ratios):.2f}-{max(ratios):.2f}",
-                    *(f"{share:.0%}" for share in figures["coverage"]), f"{_worst_bin(figures):.2f}",
+                    name,
+                    n,
+                    len(of_n),
+                    *_sizes(figures),
+                    f"{min(ratios):.2f}-{max(ratios):.2f}",
+                    *(f"{share:.0%}" for share in figures["coverage"]),
+                    f"{_worst_bin(figures):.2f}",
                     *_ranks(figures),
                 ]
-            )  # fmt: skip
+            )
         for label, s in one["subjects"].items():
-            trusted = {True: "yes", False: "no", None: "unknown"}[s["trusted"]]
+            reliable = {True: "yes", False: "no", None: "unknown"}[s["trusted"]]
             poses = f"{s['poses_mm']:.2f}"
-            each.append([name, label, f"{s['psnr_db']:.1f}", poses, trusted, *_sizes(s), *_ranks(s)])
+            each.append([name, label, f"{s['psnr_db']:.1f}", poses, reliable, *_sizes(s), *_ranks(s)])
     rows.append(
         ["errors of exponential size", *["-"] * 4, "1.00", "-"]
-        + [f"{share:.0%}" for share in EXPONENTIAL_COVERAGE] + ["1.00", "-", "-"]
-    )  # fmt: skip
+        + [f"{share:.0%}" for share in EXPONENTIAL_COVERAGE]
+        + ["1.00", "-", "-"]
+    )
     each_head = ["calibration", "subject", "PSNR dB", "poses mm", "trusted", "mean error %", "stated %"]
     each_head += ["error / stated", "rank correlation", "gain over constant"]
     terms = "; ".join(
@@ -128,10 +142,17 @@ def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
         f"{settings}. Errors are absolute, in % of the brightest tissue; each number of stacks is judged on "
         "all its subjects together, *spread* is the smallest and largest ratio of single subjects, *worst "
         "bin* the ratio furthest from 1 among ten equally large groups of voxels, u the stated uncertainty.",
-        "", markdown_table(head, rows), "",
-        "<details><summary>Every subject, and the coefficients</summary>", "",
-        markdown_table(each_head, each), "", f"{terms}.", "", "</details>",
-    ]  # fmt: skip
+        "",
+        markdown_table(head, rows),
+        "",
+        "<details><summary>Every subject, and the coefficients</summary>",
+        "",
+        markdown_table(each_head, each),
+        "",
+        f"{terms}.",
+        "",
+        "</details>",
+    ]
     return "\n".join(lines)
 
 

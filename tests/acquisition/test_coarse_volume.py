@@ -100,9 +100,7 @@ def test_weight_zero_leaves_pixels_out():
     stacks = [cube_stack(value=7.0), cube_stack(value=9000.0)]
     slices = slices_from_stacks(stacks)
     weight = (slices.stack_id[slices.pixel_plane] == 0).astype(np.float32)
-    coarse, density = coarse_and_density(
-        slices, VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0), weight=weight
-    )
+    coarse, density = coarse_and_density(slices, VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0), weight=weight)
     np.testing.assert_allclose(coarse, 7, rtol=1e-4)
     assert density.mean() == pytest.approx(1, abs=0.02)
 
@@ -122,9 +120,14 @@ def test_gains_are_divided_out():
     slices = slices_from_stacks([cube_stack()])
     gain = np.random.default_rng(0).uniform(0.5, 2, len(slices))
     dark = Slices(
-        slices.planes, (slices.value * np.repeat(gain, np.diff(slices.planes.offset))).astype(np.float32),
-        slices.mask, slices.stack_id, slices.slice_index, slices.thickness_mm, slices.header_pose,
-    )  # fmt: skip
+        slices.planes,
+        (slices.value * np.repeat(gain, np.diff(slices.planes.offset))).astype(np.float32),
+        slices.mask,
+        slices.stack_id,
+        slices.slice_index,
+        slices.thickness_mm,
+        slices.header_pose,
+    )
     grid = VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0)
     np.testing.assert_allclose(coarse_and_density(dark, grid, gain)[0], 7, rtol=2e-3)
     np.testing.assert_allclose(coarse_and_density(dark, grid, gain)[1], coarse_and_density(slices, grid)[1])

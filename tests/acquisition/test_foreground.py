@@ -16,11 +16,7 @@ RADII_MM = np.array([27.0, 32.0, 24.0])
 TRUE_MM3 = 4 / 3 * np.pi * RADII_MM.prod()
 GRID = VolumeGrid.isotropic([-42] * 3, [42] * 3, 1.5)
 WORLD = GRID.world(np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1))
-TURNS = (
-    np.eye(3),
-    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
-)
+TURNS = (np.eye(3), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]))
 
 
 def depth(world: np.ndarray) -> np.ndarray:
@@ -75,8 +71,7 @@ def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: flo
 
 def test_a_left_handed_header_ends_where_a_right_handed_one_does():
     right, left = (
-        foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)]), GRID)
-        for flag in (False, True)
+        foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)]), GRID) for flag in (False, True)
     )
     assert volume_of(left) == pytest.approx(volume_of(right), rel=0.02)
     assert (left != right).sum() < 0.05 * right.sum()

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import Volume, load_mask, load_volume, save_volume
-from g3r.acquisition.nifti import LARGEST_VOXEL_COUNT
+from g3r.acquisition.nifti import MAX_VOXEL_COUNT
 from g3r.acquisition.planes import Planes, slices_from_stacks, volume_from_pixels, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack, load_stack
@@ -63,9 +63,7 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str):
     image, mask = arrays()
     affine = affine_of(AXES[name])
     stack = load_stack(
-        write(tmp_path / "a.nii.gz", image, affine),
-        write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine),
-        2.5,
+        write(tmp_path / "a.nii.gz", image, affine), write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine), 2.5
     )
     kept = mask.sum((0, 1)) >= 12
     slices = slices_from_stacks([stack])
@@ -162,9 +160,7 @@ def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.
     assert normal_sigma == pytest.approx(2.2 / 2.3548, rel=1e-4)
 
 
-def test_without_a_mask_positive_voxels_count_and_a_line_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
+def test_without_a_mask_positive_voxels_count_and_a_line_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     image, mask = arrays()
     stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])))
     np.testing.assert_array_equal(stack.mask, mask)
@@ -200,10 +196,7 @@ def test_take_keeps_pixels_values_and_slices_together(index):
     world, offset = slices.planes.pixel_world_mm(), slices.planes.offset
     part_world = part.planes.pixel_world_mm()
     for new, old in enumerate(chosen):
-        old_pixels, new_pixels = (
-            slice(offset[old], offset[old + 1]),
-            slice(*part.planes.offset[new : new + 2]),
-        )
+        old_pixels, new_pixels = (slice(offset[old], offset[old + 1]), slice(*part.planes.offset[new : new + 2]))
         np.testing.assert_array_equal(part.value[new_pixels], slices.value[old_pixels])
         np.testing.assert_array_equal(part.mask[new_pixels], slices.mask[old_pixels])
         np.testing.assert_array_equal(part_world[new_pixels], world[old_pixels])
@@ -276,10 +269,7 @@ def bad_files(folder: Path) -> dict[str, Path]:
     """One file per way of being unusable."""
     image, _ = arrays()
     affine = affine_of(AXES["RAS"])
-    files = {
-        name: folder / f"{name}.nii.gz"
-        for name in ("missing", "text", "frames", "complex", "colour", "singular")
-    }
+    files = {name: folder / f"{name}.nii.gz" for name in ("missing", "text", "frames", "complex", "colour", "singular")}
     files["text"].write_text("not an image\n")
     write(files["frames"], np.zeros((4, 4, 4, 3), np.float32), affine)
     write(files["complex"], np.ones((4, 4, 4), np.complex64), affine)
@@ -297,9 +287,7 @@ def bad_files(folder: Path) -> dict[str, Path]:
     files["singular"] = raw
     files["folder"] = folder / "folder.nii.gz"
     files["folder"].mkdir()
-    whole = write(
-        folder / "whole.nii.gz", np.random.default_rng(0).normal(size=image.shape), affine
-    ).read_bytes()
+    whole = write(folder / "whole.nii.gz", np.random.default_rng(0).normal(size=image.shape), affine).read_bytes()
     files["cut off"] = folder / "cut.nii.gz"
     files["cut off"].write_bytes(whole[: len(whole) // 2])
     files["cut header"] = folder / "cuthead.nii.gz"
@@ -340,7 +328,7 @@ def test_unusable_files_are_refused_in_one_line_that_names_them(tmp_path: Path, 
     assert path.name in str(caught.value)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 3
-    assert LARGEST_VOXEL_COUNT < 2000**3
+    assert MAX_VOXEL_COUNT < 2000**3
 
 
 def test_an_empty_mask_is_refused(tmp_path: Path):
@@ -380,13 +368,7 @@ SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))
 )
 def test_unusable_stacks_are_refused(change, message):
     image, mask = arrays()
-    good = {
-        "image": image,
-        "mask": mask,
-        "affine": affine_of(AXES["RAS"]),
-        "thickness_mm": 3.0,
-        "name": "a.nii",
-    }
+    good = {"image": image, "mask": mask, "affine": affine_of(AXES["RAS"]), "thickness_mm": 3.0, "name": "a.nii"}
     Stack(**good)
     with pytest.raises(InputError, match=message) as caught:
         Stack(**(good | change))
@@ -410,9 +392,12 @@ def test_no_stack_is_refused():
 )
 def test_planes_without_meaning_are_refused(change):
     good = {
-        "rotation": np.eye(3)[None], "center_mm": [[0.0, 0, 0]], "spacing_mm": [[1.0, 1]], "shape": [[4, 3]],
+        "rotation": np.eye(3)[None],
+        "center_mm": [[0.0, 0, 0]],
+        "spacing_mm": [[1.0, 1]],
+        "shape": [[4, 3]],
         "psf_var_mm2": [[0.1, 0.1, 1.0]],
-    }  # fmt: skip
+    }
     Planes(**good)
     with pytest.raises(ValueError, match=r"planes need|expected|finite"):
         Planes(**(good | change))

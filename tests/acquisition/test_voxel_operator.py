@@ -39,9 +39,7 @@ def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]):
     volume, pixels = rng.normal(size=GRID.shape), rng.normal(size=len(index))
     image, back = operator.forward(volume), operator.adjoint(pixels)
     assert (image == 0).any()  # some pixels see nothing
-    assert np.abs(image @ pixels - (volume * back).sum()) <= 1e-12 * np.linalg.norm(image) * np.linalg.norm(
-        pixels
-    )
+    assert np.abs(image @ pixels - (volume * back).sum()) <= 1e-12 * np.linalg.norm(image) * np.linalg.norm(pixels)
 
 
 def test_the_adjoint_is_exact_with_several_buffers():
@@ -84,9 +82,12 @@ def test_a_gaussian_through_the_psf_has_its_closed_form():
     rng = np.random.default_rng(5)
     spacing = np.tile([0.9, 1.2], (4, 1))
     planes = Planes(
-        Rotation.random(4, rng=rng).as_matrix(), rng.normal(0, 1.5, (4, 3)), spacing, np.full((4, 2), 9),
+        Rotation.random(4, rng=rng).as_matrix(),
+        rng.normal(0, 1.5, (4, 3)),
+        spacing,
+        np.full((4, 2), 9),
         psf_variance_mm2(spacing, np.full(4, 3.0)),
-    )  # fmt: skip
+    )
     pixels = VoxelOperator(planes, grid, None, (5, 5, 9)).forward(volume)
     expected = []
     for k in range(4):

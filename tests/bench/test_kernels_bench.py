@@ -10,7 +10,7 @@ import pytest
 from g3r.bench import kernels
 from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
 from g3r.bench.kernel_scene import count_pixels, head_scene, record_space
-from g3r.gaussians import find_pairs
+from g3r.gaussians import find_overlaps
 from g3r.gaussians.overlap import CloudArrays
 from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
 
@@ -24,16 +24,7 @@ def options(*arguments: str) -> argparse.Namespace:
 def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = tmp_path / "speed.md"
     document.write_text("before\n<!-- kernels:begin -->\nstale\n<!-- kernels:end -->\nafter\n")
-    arguments = [
-        "--sizes",
-        "60",
-        "--repeats",
-        "1",
-        "--output",
-        str(tmp_path / "out"),
-        "--docs",
-        str(document),
-    ]
+    arguments = ["--sizes", "60", "--repeats", "1", "--output", str(tmp_path / "out"), "--docs", str(document)]
     assert kernels.run(options(*arguments)) == 0
     record = json.loads((tmp_path / "out" / "kernels.json").read_text())
     assert {"processor", "cores", "commit", "numba"} <= set(record["machine"])
@@ -54,7 +45,7 @@ def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_pixels_are_counted_as_the_dense_formula_counts_them() -> None:
     scene = head_scene(20, n_slices=2)
     planes, arrays = scene.slices.planes, CloudArrays.of(scene.cloud)
-    pairs = find_pairs(scene.cloud, planes, CUTOFF_SIGMA)
+    pairs = find_overlaps(scene.cloud, planes, CUTOFF_SIGMA)
     described = plane_arguments(planes, planes.center_mm, np.ones(len(planes)), pairs)
     found, _ = count_pixels(arrays.shapes, *described, CUTOFF_SIGMA**2, record_space(pairs.most))
     covariance = np.zeros((20, 3, 3))
@@ -81,5 +72,5 @@ def test_a_scene_fills_the_head() -> None:
     scene = head_scene(500)
     assert len(scene.cloud) == 500
     assert len(np.unique(scene.slices.stack_id)) == 3
-    pairs = find_pairs(scene.cloud, scene.slices.planes, CUTOFF_SIGMA)
+    pairs = find_overlaps(scene.cloud, scene.slices.planes, CUTOFF_SIGMA)
     assert len(pairs) > 10 * 500

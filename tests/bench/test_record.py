@@ -30,9 +30,7 @@ def test_machine_says_what_seconds_depend_on():
 
 
 def test_markdown_table():
-    assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == (
-        "| a | b |\n| --- | ---: |\n| x | 1 |\n| y | 2.5 |"
-    )
+    assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == ("| a | b |\n| --- | ---: |\n| x | 1 |\n| y | 2.5 |")
     with pytest.raises(ValueError, match="row of 1 cells"):
         markdown_table(["a", "b"], [["x"]])
 

@@ -16,9 +16,15 @@ from g3r.cli import bench
 from studies.tradeoff import peer_phantom
 
 MACHINE = {
-    "processor": "made up", "cores": 2, "threads": 2, "python": "3", "torch": "2", "numba": "0", "g3r": "0",
+    "processor": "made up",
+    "cores": 2,
+    "threads": 2,
+    "python": "3",
+    "torch": "2",
+    "numba": "0",
+    "g3r": "0",
     "commit": None,
-}  # fmt: skip
+}
 
 
 def test_names_its_commands(capsys):
@@ -51,17 +57,28 @@ def test_bad_input_is_one_line(words, capsys, tmp_path, monkeypatch):
 
 def preset(seconds, psnr):
     return {
-        "seconds": seconds, "cpu_seconds": 2 * seconds, "peak_bytes": 1_500_000_000, "n_gaussians": 12345,
-        "stages": {"motion": seconds - 5, "fit to slices": 5.0}, "ssim": 0.9, "tre_mm": 0.5, "psnr_db": psnr,
+        "seconds": seconds,
+        "cpu_seconds": 2 * seconds,
+        "peak_bytes": 1_500_000_000,
+        "n_gaussians": 12345,
+        "stages": {"motion": seconds - 5, "fit to slices": 5.0},
+        "ssim": 0.9,
+        "tre_mm": 0.5,
+        "psnr_db": psnr,
         "stages_cpu": {"motion": seconds - 5, "fit to slices": 5.0},
-    }  # fmt: skip
+    }
 
 
 def variant(seconds, psnr, *, same=False):
     return {
-        "seconds": seconds, "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1}, "psnr_db": psnr,
-        "ssim": 0.9, "tre_mm": 0.5, "n_gaussians": 100, "same_as_base": same,
-    }  # fmt: skip
+        "seconds": seconds,
+        "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1},
+        "psnr_db": psnr,
+        "ssim": 0.9,
+        "tre_mm": 0.5,
+        "n_gaussians": 100,
+        "same_as_base": same,
+    }
 
 
 def made_record():
@@ -71,7 +88,7 @@ def made_record():
         "presets": presets,
         "sweeps": {"cut-off": {"2 sigma": variant(10.0, 23.0), "3.2 sigma": variant(20.0, 24.0, same=True)}},
         "fits": {"balanced": fit},
-    }  # fmt: skip
+    }
     return {"machine": MACHINE, "repeats": 3, "base": "balanced", "cases": {"made": case}}
 
 
@@ -102,7 +119,7 @@ def test_work_is_proportional_to_what_grows():
     from dataclasses import replace
 
     from g3r.bench.scenes import SceneSize, made_cloud, made_slices, pixel_evaluations
-    from g3r.gaussians import find_pairs
+    from g3r.gaussians import find_overlaps
 
     base = SceneSize(n_gaussians=400, n_slices=12, n_pixels=256)
     for field in ("n_gaussians", "n_slices", "n_pixels"):
@@ -111,7 +128,7 @@ def test_work_is_proportional_to_what_grows():
             size = replace(base, **{field: factor * getattr(base, field)})
             cloud = made_cloud(size)
             planes = made_slices(size, cloud).planes
-            work.append(pixel_evaluations(cloud, planes, find_pairs(cloud, planes, 3.2), 3.2))
+            work.append(pixel_evaluations(cloud, planes, find_overlaps(cloud, planes, 3.2), 3.2))
         assert work[1] / work[0] == pytest.approx(4, rel=0.1), field
     assert {field for field, *_ in GROWING.values()} == {"n_gaussians", "n_slices", "n_pixels", "n_voxels"}
 

@@ -22,21 +22,18 @@ from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.reconstruct import DEFAULT_CHECKPOINT
 
 OUTPUTS = {
-    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
-    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
-}  # fmt: skip
-QUICK = (
-    "--preset",
-    "draft",
-    "--resolution",
-    "1.5",
-    "--no-prior",
-    "--thickness",
-    "4",
-    "--threads",
-    "1",
-    "--quiet",
-)
+    "volume.nii.gz",
+    "mask.nii.gz",
+    "prior.nii.gz",
+    "coarse.nii.gz",
+    "density.nii.gz",
+    "uncertainty.nii.gz",
+    "gaussians.npz",
+    "slices.tsv",
+    "run.json",
+    "sections.png",
+}
+QUICK = ("--preset", "draft", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 
 
 def run(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -57,17 +54,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three stacks of a small phantom that moves a little, written by g3r-simulate."""
     folder = tmp_path_factory.mktemp("simulated") / "subject"
     done = run(
-        "simulate",
-        "--phantom",
-        22,
-        "--resolution",
-        1.5,
-        "--thickness",
-        4,
-        "--motion",
-        "mild",
-        "--output",
-        folder,
+        "simulate", "--phantom", 22, "--resolution", 1.5, "--thickness", 4, "--motion", "mild", "--output", folder
     )
     assert done.returncode == 0, done.stderr
     return folder
@@ -87,11 +74,7 @@ def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_every_output_is_there_and_nothing_else(reconstructed: Path):
-    assert (
-        {path.name for path in reconstructed.iterdir()}
-        == OUTPUTS
-        == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
-    )
+    assert {path.name for path in reconstructed.iterdir()} == OUTPUTS == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
     assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
 
 
@@ -156,8 +139,8 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
     assert record["motion"]["orientation"] in ("standard", "scanner")
     for stack in record["stacks"]:
         assert stack["pose_confidence"]["sure"] is True
-        assert stack["interleave"] in ((None,) if stack["n_runs"] == 1 else (1, 2, 3))
-        assert 1 <= stack["n_runs"] <= stack["n_slices"]
+        assert stack["interleave"] in ((None,) if stack["n_segments"] == 1 else (1, 2, 3))
+        assert 1 <= stack["n_segments"] <= stack["n_slices"]
 
 
 def test_the_picture_is_a_picture(reconstructed: Path):
@@ -183,9 +166,7 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
 
 
 def test_from_python_in_three_lines(subject: Path, tmp_path: Path):
-    stacks = [
-        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
-    ]
+    stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     result = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
     result.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
@@ -196,15 +177,16 @@ def quick_settings() -> ReconstructionSettings:
     """Without the prior and with a short registration and fit."""
     draft = PRESETS["draft"]
     return replace(
-        draft, resolution_mm=1.5, use_prior=False,
-        motion=replace(draft.motion, n_rounds=2), slice_stage=replace(draft.slice_stage, n_steps=5),
-    )  # fmt: skip
+        draft,
+        resolution_mm=1.5,
+        use_prior=False,
+        registration=replace(draft.motion, n_rounds=2),
+        slice_stage=replace(draft.slice_stage, n_steps=5),
+    )
 
 
 def test_one_registration_serves_several_fits(subject: Path):
-    stacks = [
-        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
-    ]
+    stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     reconstructor = GaussianReconstructor(settings=quick_settings())
     motion = reconstructor.register_stacks(stacks)
     whole, again = reconstructor.reconstruct(stacks), reconstructor.reconstruct(stacks, motion)
@@ -217,9 +199,7 @@ def test_one_registration_serves_several_fits(subject: Path):
 @pytest.mark.parametrize("power", [-20, 20])
 def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int):
     """A power of two (about 1e-6 and 1e6) rounds nothing: no constant may have a hidden unit."""
-    stacks = [
-        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
-    ]
+    stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     plain = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
     factor = np.float32(2.0**power)
     scaled = GaussianReconstructor(settings=quick_settings()).reconstruct(
@@ -234,7 +214,7 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
     """All slices stay in line; as a whole they are turned only where the standard orientation is wanted."""
     stack = load_stack(files(subject, "stack")[0], files(subject, "mask")[0], 4.0)
     settings = quick_settings()
-    settings = replace(settings, motion=replace(settings.motion, standard_orientation=standard))
+    settings = replace(settings, registration=replace(settings.registration, standard_orientation=standard))
     result = GaussianReconstructor(settings=settings).reconstruct([stack])
     assert any("single stack" in note for note in result.record["notes"])
     motion = result.slices.world_from_header()
@@ -248,24 +228,18 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
 
 
 def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Path):
-    stacks = [
-        load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)
-    ]
+    stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     few = np.zeros_like(stacks[0].mask)
     few[20:23, 20:23, 5] = True
     settings = quick_settings()
-    motion = replace(
-        settings.motion, template=False, network=False, stacks=False, runs=False, n_rounds=1
-    )  # fmt: skip
+    motion = replace(settings.registration, template=False, network=False, stacks=False, segments=False, n_rounds=1)
     settings = replace(settings, resolution_mm=2.5, motion=motion)
-    result = GaussianReconstructor(settings=settings).reconstruct(
-        [replace(stacks[0], mask=few), stacks[1], stacks[2]]
-    )
+    result = GaussianReconstructor(settings=settings).reconstruct([replace(stacks[0], mask=few), stacks[1], stacks[2]])
     record = result.record
     assert [one["n_slices"] > 0 for one in record["stacks"]] == [False, True, True]
     assert record["stacks"][0]["interleave"] is None
     assert record["stacks"][0]["pose_confidence"]["sure"] is False
-    assert record["stacks"][2]["n_runs"] == 1
+    assert record["stacks"][2]["n_segments"] == 1
     assert any(stacks[0].name in line for line in record["warnings"])
 
 
@@ -320,15 +294,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
         return ["--stacks", stacks[0], "--masks", masks[1], *options], "mask-1.nii.gz"
     elif kind == "empty mask":
         nib.save(nib.Nifti1Image(np.zeros(data.shape, np.uint8), image.affine), bad)
-        return [
-            "--stacks",
-            *stacks,
-            "--masks",
-            masks[0],
-            masks[1],
-            _like(bad, stacks[2]),
-            *options,
-        ], "bad.nii.gz"
+        return ["--stacks", *stacks, "--masks", masks[0], masks[1], _like(bad, stacks[2]), *options], "bad.nii.gz"
     elif kind == "thickness zero":
         return [*inputs(subject), *options[:1], "--thickness", "0", *options[3:]], "stack-0.nii.gz"
     elif kind == "checkpoint is text":
@@ -356,11 +322,21 @@ def _like(path: Path, image_path: Path) -> Path:
 @pytest.mark.parametrize(
     "kind",
     [
-        "missing file", "text file", "cut off", "cut off after the header", "one slice", "NaN volume",
-        "mask of another grid", "empty mask", "thickness zero", "checkpoint is text",
-        "output is a file", "resolution", "prior of another voxel size",
+        "missing file",
+        "text file",
+        "cut off",
+        "cut off after the header",
+        "one slice",
+        "NaN volume",
+        "mask of another grid",
+        "empty mask",
+        "thickness zero",
+        "checkpoint is text",
+        "output is a file",
+        "resolution",
+        "prior of another voxel size",
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path):
     arguments, name = bad_command(kind, subject, tmp_path)
     before = {path.name for path in tmp_path.iterdir()}

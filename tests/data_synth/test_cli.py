@@ -40,9 +40,25 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_a_subject_from_a_volume(volume: tuple[Path, Path], tmp_path: Path) -> None:
     output = tmp_path / "new" / "case"
     done = run(
-        "--volume", volume[0], "--mask", volume[1], "--output", output, "--stacks", 2, "--resolution", 1.2,
-        "--thickness", 3, "--gap", 0.5, "--motion", "moderate", "--seed", 3,
-    )  # fmt: skip
+        "--volume",
+        volume[0],
+        "--mask",
+        volume[1],
+        "--output",
+        output,
+        "--stacks",
+        2,
+        "--resolution",
+        1.2,
+        "--thickness",
+        3,
+        "--gap",
+        0.5,
+        "--motion",
+        "moderate",
+        "--seed",
+        3,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert str(output) in done.stdout

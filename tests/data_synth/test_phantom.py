@@ -25,9 +25,7 @@ def extent_mm(mask: np.ndarray) -> np.ndarray:
 
 def folding(one: Phantom) -> float:
     """Brain surface over the surface of a ball of the same volume (in voxel faces)."""
-    brain = np.isin(
-        one.labels, [LABELS[n] for n in ("cortical_plate", "white_matter", "deep_grey", "ventricles")]
-    )
+    brain = np.isin(one.labels, [LABELS[n] for n in ("cortical_plate", "white_matter", "deep_grey", "ventricles")])
     faces = sum(int((np.diff(brain.astype(np.int8), axis=axis) != 0).sum()) for axis in range(3))
     return faces / float(brain.sum()) ** (2 / 3)
 
@@ -96,9 +94,7 @@ def test_grid_is_ras_and_centred() -> None:
     assert center[2] * SPACING_MM < -8
 
 
-@pytest.mark.parametrize(
-    ("weeks", "spacing_mm"), [(10, 0.8), (50, 0.8), (float("nan"), 0.8), (30, 0.0), (30, 9.0)]
-)
+@pytest.mark.parametrize(("weeks", "spacing_mm"), [(10, 0.8), (50, 0.8), (float("nan"), 0.8), (30, 0.0), (30, 9.0)])
 def test_impossible_requests(weeks: float, spacing_mm: float) -> None:
     with pytest.raises(InputError, match="expected"):
         fetal_brain_phantom(weeks, spacing_mm)

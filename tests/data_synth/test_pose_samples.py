@@ -11,13 +11,7 @@ from data_synth.pose_data import SliceSetDataModule, SliceSets
 from data_synth.pose_samples import draw_slice_set
 from data_synth.simulator import StackSettings, simulate_stacks
 from data_synth.slice_sampling import Head, sample_slices
-from data_synth.trajectories import (
-    JERK_DEG,
-    QUIET_DEG,
-    load_trajectories,
-    modelled_trajectory,
-    timed_trajectory,
-)
+from data_synth.trajectories import JERK_DEG, QUIET_DEG, load_trajectories, modelled_trajectory, timed_trajectory
 from g3r.acquisition.planes import slices_from_stacks
 from g3r.acquisition.slice_images import slice_images
 from g3r.errors import InputError
@@ -49,9 +43,7 @@ def test_images_show_the_truth_at_their_poses(head, rng):
     assert 5 <= len(image) <= 30
     expected = shown_at(head, one.true_pose, 40, 3.0)
     assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.97  # blur of pixel and thickness
-    wrong = one.true_pose @ RigidPose.from_rotvec(
-        np.full((len(image), 3), 0.15), np.full((len(image), 3), 4.0)
-    )
+    wrong = one.true_pose @ RigidPose.from_rotvec(np.full((len(image), 3), 0.15), np.full((len(image), 3), 4.0))
     assert np.corrcoef(image.ravel(), shown_at(head, wrong, 40, 3.0).ravel())[0, 1] < 0.93
 
 
@@ -79,9 +71,7 @@ def test_the_same_images_as_at_inference(volume, head, rng):
     slices = slices_from_stacks([one.stack for one in stacks])
     images = slice_images(slices, 3.0, 40)
     motion = [stacks[s].true_pose.take([k]) for s, k in zip(slices.stack_id, slices.slice_index, strict=True)]
-    moved = RigidPose(
-        np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion])
-    )
+    moved = RigidPose(np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion]))
     pose = moved @ slices.header_pose @ images.frame_in_slice
     fast, _ = sample_slices(head, np.linalg.inv(head.affine), pose, images.thickness_mm, 3.0, 40)
     for image, other in zip(images.image, fast, strict=True):

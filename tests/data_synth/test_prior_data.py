@@ -90,7 +90,7 @@ def test_batches_of_training_and_validation() -> None:
 
 def make_dataset(augment: bool = True) -> SyntheticSubjects:
     sources = [PhantomSubject("young", 23.0, 1), PhantomSubject("old", 33.0, 2)]
-    return SyntheticSubjects(sources, SPACING_MM, length=4, seed=7, smallest_shape=30, augment=augment)
+    return SyntheticSubjects(sources, SPACING_MM, length=4, seed=7, min_shape=30, augment=augment)
 
 
 def test_a_sample_is_a_function_of_seed_epoch_and_index() -> None:
@@ -204,7 +204,7 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
 
     def dataset(cache: Path | None, seed: int = 7) -> SyntheticSubjects:
         return SyntheticSubjects(
-            sources, 2.5, length=2, seed=seed, smallest_shape=24, augment=False, distinct=1, cache=cache
+            sources, 2.5, length=2, seed=seed, min_shape=24, augment=False, distinct=1, cache=cache
         )
 
     fresh = dataset(None).sample(0, 1)

@@ -63,9 +63,7 @@ def test_a_blob_keeps_its_integral_and_widens_by_the_profile(profile: str, thick
     if profile == "box":
         variance[2] = thickness_mm**2 * (1 + 0.2**2) / 12
     observed = sigma_mm**2 + variance
-    d = np.einsum(
-        "ijkw,kwf->ijkf", true_points_mm(one) - GRID.center_mm, one.true_pose.rotation
-    )  # axial frame
+    d = np.einsum("ijkw,kwf->ijkf", true_points_mm(one) - GRID.center_mm, one.true_pose.rotation)  # axial frame
     expected = 1000 * np.sqrt(sigma_mm**6 / observed.prod()) * np.exp(-0.5 * (d**2 / observed).sum(-1))
     inside = deep(one)
     # quadrature, trilinear reading that blurs differently within a voxel, and the box's own shape
@@ -85,7 +83,7 @@ def test_sampling_the_truth_at_the_true_poses_gives_the_slices(fine: bool) -> No
         replace(CLEAN, orientation=o, motion=LEVELS["severe"], thickness_mm=1.0, gap_mm=2.0, interleave=3)
         for o in ("axial", "sagittal")
     ]
-    settings = [replace(s, motion=replace(s.motion, dropout_share=0.0)) for s in settings]
+    settings = [replace(s, registration=replace(s.motion, dropout_share=0.0)) for s in settings]
     for one in simulate_stacks(volume, BALL, AFFINE, settings, np.random.default_rng(2), fine=fine):
         inside = deep(one)
         expected = map_coordinates(volume, GRID.index(true_points_mm(one)[inside]).T, order=3)
@@ -96,9 +94,7 @@ def test_sampling_the_truth_at_the_true_poses_gives_the_slices(fine: bool) -> No
 def test_without_motion_the_header_is_the_truth() -> None:
     settings = orthogonal_settings(3, "none", gap_mm=0.5, snr=np.inf)
     for one in simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(3)):
-        np.testing.assert_array_equal(
-            one.true_pose.rotation, np.broadcast_to(np.eye(3), one.true_pose.rotation.shape)
-        )
+        np.testing.assert_array_equal(one.true_pose.rotation, np.broadcast_to(np.eye(3), one.true_pose.rotation.shape))
         np.testing.assert_allclose(one.true_pose.translation_mm, 0, atol=1e-12)
         np.testing.assert_allclose(one.stack.spacing_mm, [0.8, 0.8, 2.7])
         assert one.stack.thickness_mm == 2.2
@@ -157,8 +153,7 @@ def test_bright_rim_outside_the_mask_is_not_needed() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"thickness_mm": 0.0}, {"resolution_mm": -1.0}, {"gap_mm": -2.1}, {"snr": 0.0}, {"bias": float("nan")}],
+    "wrong", [{"thickness_mm": 0.0}, {"resolution_mm": -1.0}, {"gap_mm": -2.1}, {"snr": 0.0}, {"bias": float("nan")}]
 )
 def test_impossible_settings(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
@@ -206,10 +201,7 @@ class TestMotion:
         assert max(lengths) < 1.6
         assert 0.35 < np.mean(lengths) < 0.55
         assert 0.7 < np.mean(angles) < 1.2
-        assert (
-            np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max()
-            == 0
-        )
+        assert np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max() == 0
         gross = residual_errors("gross", stack_id, center, np.random.default_rng(0))
         assert 2.0 < np.linalg.norm(gross.apply(center) - center, axis=1).max() < 20
 

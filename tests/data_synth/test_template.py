@@ -6,14 +6,14 @@ from scipy.ndimage import affine_transform, center_of_mass
 
 from data_synth.atlas import AtlasSubject, find_subjects
 from data_synth.heads import PhantomSubject, load_head, weeks_of
-from data_synth.template import mean_heads
+from data_synth.template import atlas_templates
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 
 @pytest.fixture(scope="module")
 def template():
-    return mean_heads([PhantomSubject("a", 25.0, 1), PhantomSubject("b", 31.5, 2)], 3.0, weeks=(25, 31, 37))
+    return atlas_templates([PhantomSubject("a", 25.0, 1), PhantomSubject("b", 31.5, 2)], 3.0, weeks=(25, 31, 37))
 
 
 def test_ages_without_a_subject_are_left_out(template):
@@ -42,9 +42,7 @@ def test_a_head_stands_on_its_centroid():
     assert (head.data[~head.mask] == 0).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "weeks"), [("crl/sta27", 27), ("sb/sb23-notoperated", 23), ("x/ga-31.5_v2", 31.5)]
-)
+@pytest.mark.parametrize(("name", "weeks"), [("crl/sta27", 27), ("sb/sb23-notoperated", 23), ("x/ga-31.5_v2", 31.5)])
 def test_age_from_the_name(tmp_path, name, weeks):
     assert weeks_of(AtlasSubject(name, tmp_path, tmp_path)) == weeks
 
@@ -56,7 +54,7 @@ def test_no_age_in_the_name(tmp_path):
 
 def test_no_subject_near_the_ages():
     with pytest.raises(InputError, match="none of 1 subjects"):
-        mean_heads([PhantomSubject("a", 25.0, 1)], 3.0, weeks=(37,))
+        atlas_templates([PhantomSubject("a", 25.0, 1)], 3.0, weeks=(37,))
 
 
 def test_a_real_atlas_has_its_mid_sagittal_plane_in_the_middle(shared_data):

@@ -10,7 +10,7 @@ from data_synth.contrast import recoloured
 from data_synth.heads import PhantomSubject, load_volume_of
 from data_synth.motion import LEVELS, slice_trajectory
 from data_synth.pathology import enlarged_ventricles, with_lesion, with_lesions
-from data_synth.protocol_sampling import draw_settings, in_line, remasked, with_rim
+from data_synth.protocol_sampling import draw_settings, rigid_stack, with_mask_errors, with_skull_rim
 from data_synth.simulator import StackSettings, simulate_stacks
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import slices_from_stacks
@@ -54,8 +54,8 @@ def test_ventricles_grow_and_the_head_does_not(head: TruthVolume) -> None:
     assert head.ventricles is not None
     before = head.ventricles.sum()
     sizes = []
-    for shift_mm in (0.0, 2.0, 4.0):
-        grown = enlarged_ventricles(head, shift_mm)
+    for translation_mm in (0.0, 2.0, 4.0):
+        grown = enlarged_ventricles(head, translation_mm)
         sizes.append(grown.ventricles.sum() / before)
         np.testing.assert_array_equal(grown.mask, head.mask)
         assert np.isfinite(grown.data).all()
@@ -81,7 +81,7 @@ def test_a_lesion_has_its_size_and_brightness(head: TruthVolume) -> None:
 
 
 def test_a_rim_lies_outside_the_head(head: TruthVolume) -> None:
-    seen = with_rim(head, np.random.default_rng(0))
+    seen = with_skull_rim(head, np.random.default_rng(0))
     np.testing.assert_array_equal(seen.data[head.mask], head.data[head.mask])
     assert seen.data[~head.mask].max() > 0.1
     assert seen.data.min() >= 0
@@ -91,7 +91,7 @@ def test_a_rim_lies_outside_the_head(head: TruthVolume) -> None:
 def test_masks_grow_into_the_rim_or_shrink(head: TruthVolume, grow: bool) -> None:
     rng = np.random.default_rng(2)
     stacks = simulate_stacks(head.data, head.mask, head.affine, [StackSettings(resolution_mm=1.0)], rng)
-    changed = remasked(stacks, rng, grow)
+    changed = with_mask_errors(stacks, rng, grow)
     before, after = stacks[0].stack.mask, changed[0].stack.mask
     assert (after.sum() > before.sum()) == grow
     larger, smaller = (after, before) if grow else (before, after)
@@ -116,9 +116,7 @@ def test_overlapping_slices_measure_more_than_once(head: TruthVolume) -> None:
 def test_spikes_are_stripes_over_a_few_slices(head: TruthVolume) -> None:
     def image(share: float) -> np.ndarray:
         settings = StackSettings(resolution_mm=1.5, thickness_mm=3.0, snr=np.inf, spike_share=share)
-        return simulate_stacks(head.data, head.mask, head.affine, [settings], np.random.default_rng(4))[
-            0
-        ].stack.image
+        return simulate_stacks(head.data, head.mask, head.affine, [settings], np.random.default_rng(4))[0].stack.image
 
     clean, spiked = image(1e-12), image(0.3)
     differs = np.abs(spiked - clean).max((0, 1)) > 0
@@ -146,13 +144,13 @@ def test_draws_cover_what_protocols_do() -> None:
 def test_in_line_is_one_motion_close_to_all() -> None:
     center = np.array([3.0, -40.0, 12.0])
     true = slice_trajectory(30, LEVELS["mild"], center, 2, np.random.default_rng(1))
-    one = in_line(true, center)
+    one = rigid_stack(true, center)
     np.testing.assert_allclose(one.rotation, np.repeat(one.rotation[:1], 30, 0))
     away = np.linalg.norm(
         one.apply(np.tile(center, (30, 1, 1)))[:, 0] - true.apply(np.tile(center, (30, 1, 1)))[:, 0], axis=1
     )
     still = np.linalg.norm(true.apply(np.tile(center, (30, 1, 1)))[:, 0] - center, axis=1)
     assert away.mean() < 0.6 * still.mean()
-    exact = in_line(true.take(np.full(30, 4)), center)
+    exact = rigid_stack(true.take(np.full(30, 4)), center)
     np.testing.assert_allclose(exact.rotation, true.take(np.full(30, 4)).rotation, atol=1e-9)
     np.testing.assert_allclose(exact.translation_mm, true.take(np.full(30, 4)).translation_mm, atol=1e-6)

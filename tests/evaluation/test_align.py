@@ -32,23 +32,20 @@ def on_grid(grid, pose=None):
     return Volume(data, grid.affine, "phantom"), data > 100
 
 
-def pose_deg(rotation, shift_mm):
-    return RigidPose.from_rotvec(np.deg2rad([rotation]), [shift_mm])
+def pose_deg(rotation, translation_mm):
+    return RigidPose.from_rotvec(np.deg2rad([rotation]), [translation_mm])
 
 
 @pytest.mark.parametrize(
-    ("rotation_deg", "shift_mm"),
-    [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))],
+    ("rotation_deg", "shift_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
 )
-def test_a_known_motion_is_found(rotation_deg, shift_mm):
+def test_a_known_motion_is_found(rotation_deg, translation_mm):
     reference, mask = on_grid(GRID)
-    pose = pose_deg(rotation_deg, shift_mm)
+    pose = pose_deg(rotation_deg, translation_mm)
     moved, _ = on_grid(VolumeGrid.isotropic((-52, -60, -50), (56, 60, 48), 1.7), pose)
     found = align_rigid(moved, reference, mask)
     points = GRID.world(np.argwhere(mask)[::50])
-    error = np.linalg.norm(
-        (found.volume_from_reference.apply(points[None]) - pose.apply(points[None]))[0], axis=1
-    )
+    error = np.linalg.norm((found.volume_from_reference.apply(points[None]) - pose.apply(points[None]))[0], axis=1)
     assert error.max() < 0.1 * GRID.spacing_mm[0]
     assert found.ncc > 0.99
     assert found.rotation_deg == pytest.approx(np.linalg.norm(rotation_deg), abs=0.3)
@@ -96,9 +93,7 @@ def test_compare_with_and_without_alignment(rng):
     moved, _ = on_grid(GRID, pose_deg((6, 3, -4), (3, 2, -3)))
     noisy = Volume(moved.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved")
     headers, aligned = compare(noisy, reference, mask), compare(noisy, reference, mask, align=True)
-    still = Volume(
-        reference.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still"
-    )
+    still = Volume(reference.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still")
     assert headers.alignment is None
     assert headers.scores.psnr_db < 20
     # interpolation smooths the noise a little, so the moved volume may score better than the still one

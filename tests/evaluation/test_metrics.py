@@ -63,9 +63,7 @@ def test_known_noise_gives_known_psnr(head, rng, noise_share):
     found = score(volume, reference, mask)
     # the fit shrinks the noisy volume towards the mean: the error keeps the share NCC^2 of its variance
     expected = -20 * np.log10(noise_share * found.ncc)
-    assert found.psnr_db == pytest.approx(
-        expected, abs=0.06
-    )  # 3 sigma of the noise's own variance, 2e4 voxels
+    assert found.psnr_db == pytest.approx(expected, abs=0.06)  # 3 sigma of the noise's own variance, 2e4 voxels
     assert found.data_range == pytest.approx(data_range, rel=1e-6)
 
 
@@ -91,9 +89,7 @@ def test_mask_at_the_border(head, rng):
     reference, mask = head
     reference, mask = reference[12:, :, 8:30] + 100, mask[12:, :, 8:30]
     volume = reference + rng.normal(0, 30, reference.shape)
-    assert score(volume, reference, mask).ssim == pytest.approx(
-        plain(volume, reference, mask)["ssim"], rel=1e-9
-    )
+    assert score(volume, reference, mask).ssim == pytest.approx(plain(volume, reference, mask)["ssim"], rel=1e-9)
 
 
 def test_constant_volume(head):
@@ -106,9 +102,7 @@ def test_constant_volume(head):
 
 def test_thin_volume_has_scores(rng):
     reference = rng.uniform(1, 2, (9, 9, 3))
-    found = score(
-        reference + 0.1 * rng.normal(size=reference.shape), reference, np.ones_like(reference, bool)
-    )
+    found = score(reference + 0.1 * rng.normal(size=reference.shape), reference, np.ones_like(reference, bool))
     assert np.isfinite([found.psnr_db, found.ssim, found.ncc]).all()
 
 

@@ -25,9 +25,7 @@ def header(name: str = "bad.nii.gz", **fields: Any) -> Maker:
     return lambda folder: write_raw(folder / name, None, fields, version=version)
 
 
-def values(
-    data: Callable[[], np.ndarray], name: str = "bad.nii.gz", affine: np.ndarray | None = None
-) -> Maker:
+def values(data: Callable[[], np.ndarray], name: str = "bad.nii.gz", affine: np.ndarray | None = None) -> Maker:
     """A well-formed file of these values."""
     return lambda folder: write(folder / name, data(), affine)
 
@@ -133,7 +131,8 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "zeros": (content("bad.nii", bytes(5000)), NOT_READABLE),
     "random bytes": (content("bad.nii", lambda: np.random.default_rng(0).bytes(5000)), NOT_READABLE),
     "random bytes, packed": (
-        content("bad.nii.gz", lambda: gzip.compress(np.random.default_rng(0).bytes(5000))), NOT_READABLE,
+        content("bad.nii.gz", lambda: gzip.compress(np.random.default_rng(0).bytes(5000))),
+        NOT_READABLE,
     ),
     "packed text": (content("bad.nii.gz", lambda: gzip.compress(b"not an image\n")), NOT_READABLE),
     "DICOM": (content("bad.dcm", bytes(128) + b"DICM" + bytes(500)), "not NIfTI by its name.*dcm2niix"),
@@ -195,15 +194,23 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "voxels far beyond the end": (header(vox_offset=3e38), CUT_OFF),
     "endless extension": (
         lambda folder: write_raw(
-            folder / "bad.nii", None, {"vox_offset": 800}, extensions=((6, b"x" * 100),),
+            folder / "bad.nii",
+            None,
+            {"vox_offset": 800},
+            extensions=((6, b"x" * 100),),
             cut=lambda whole: whole[:352] + (2**31 - 16).to_bytes(4, "little") + whole[356:],
-        ), NOT_READABLE,
+        ),
+        NOT_READABLE,
     ),
     "negative extension": (
         lambda folder: write_raw(
-            folder / "bad.nii.gz", None, {"vox_offset": 800}, extensions=((6, b"x" * 100),),
+            folder / "bad.nii.gz",
+            None,
+            {"vox_offset": 800},
+            extensions=((6, b"x" * 100),),
             cut=lambda whole: whole[:352] + (-16).to_bytes(4, "little", signed=True) + whole[356:],
-        ), NOT_READABLE,
+        ),
+        NOT_READABLE,
     ),
     # where things are
     "NaN affine": (header(**only_sform(bent(a11=np.nan))), "bad header.*fix the sform or qform"),
@@ -214,12 +221,8 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "flat voxels": (header(**only_sform(bent(a22=0))), "bad header.*singular"),
     "huge affine": (header(**only_sform(AFFINE * 1e38)), "bad header|voxels of"),
     "sheared axes": (header(**only_sform(bent(a01=0.3))), "sheared.*resample"),
-    "NaN quaternion": (
-        header(sform_code=0, qform_code=1, quatern_b=np.nan), f"{NOT_READABLE}|bad header",
-    ),
-    "long quaternion": (
-        header(sform_code=0, qform_code=1, quatern_b=2.0, quatern_c=2.0), f"{NOT_READABLE}|bad header",
-    ),
+    "NaN quaternion": (header(sform_code=0, qform_code=1, quatern_b=np.nan), f"{NOT_READABLE}|bad header"),
+    "long quaternion": (header(sform_code=0, qform_code=1, quatern_b=2.0, quatern_c=2.0), f"{NOT_READABLE}|bad header"),
     "pixdim 0": (header(sform_code=0, qform_code=1, pixdim=[1, 0, 1, 3, 0, 0, 0, 0]), "pixdim is 0"),
     "pixdim 0, no codes": (header(sform_code=0, qform_code=0, pixdim=[1, 1, 1, 0, *[0] * 4]), "pixdim is 0"),
     "pixdim NaN": (header(sform_code=0, pixdim=[1, np.nan, 1, 3, 0, 0, 0, 0]), "bad header"),
@@ -242,15 +245,15 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
     "one slice": (values(lambda: image(shape=(24, 20, 1))), "holds 1 slice; expected a stack"),
     "one pixel": (values(lambda: image(shape=(1, 1, 8))), "12 masked pixels"),
     "a mask": (values(lambda: ball()), "every value inside the mask is 1; expected an image"),
-}  # fmt: skip
+}
 
 
 LITTLE = "stack.nii.gz: no slice with 12 masked pixels; check the masks"
 
 
-def moved(*shift_mm: float) -> np.ndarray:
+def moved(*translation_mm: float) -> np.ndarray:
     affine = AFFINE.copy()
-    affine[:3, 3] += shift_mm
+    affine[:3, 3] += translation_mm
     return affine
 
 
@@ -283,12 +286,25 @@ BAD_MASKS: dict[str, tuple[Maker, str]] = {
     "NaN affine": (header(**only_sform(bent(a11=np.nan))), "bad header"),
     "the stack itself": (values(image), "as an image does; .*pass the mask"),
     "the stack as int16": (values(lambda: image().astype(np.int16)), "as an image does"),
-}  # fmt: skip
+}
 """Masks for `stack.nii.gz`, the good stack."""
 
 USABLE_AS_A_VOLUME = {
-    "sheared axes", "metres without a word", "micrometres without a word", "one infinite", "beyond float32",
-    "constant", "too faint to divide by", "too bright to square", "one slice", "one pixel", "a mask",
-    "slope beyond float32", "all infinite", "all zero", "all negative", "all NaN",
-}  # fmt: skip
+    "sheared axes",
+    "metres without a word",
+    "micrometres without a word",
+    "one infinite",
+    "beyond float32",
+    "constant",
+    "too faint to divide by",
+    "too bright to square",
+    "one slice",
+    "one pixel",
+    "a mask",
+    "slope beyond float32",
+    "all infinite",
+    "all zero",
+    "all negative",
+    "all NaN",
+}
 """Bad as a stack of thick slices; as a volume each command judges for itself."""

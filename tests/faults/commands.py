@@ -13,20 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-MOST_SECONDS = 5.0
+MAX_SECONDS = 5.0
 """Of a processor: the machine may be busy with something else."""
 
-MOST_WAITING_SECONDS = 60.0
+MAX_WAITING_SECONDS = 60.0
 """For what waits without computing, such as a pipe that nobody writes to."""
 
-MOST_BYTES = 500_000_000
+MAX_BYTES = 500_000_000
 """By which a refusal may raise the peak of memory: far under what the files claim."""
 
 Main = Callable[[Sequence[str]], int]
 
 
 class TooSlowError(BaseException):
-    """A command took longer than `MOST_SECONDS`; no handler of the code under test catches it."""
+    """A command took longer than `MAX_SECONDS`; no handler of the code under test catches it."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,7 @@ def within(seconds: float) -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         raise TooSlowError(f"longer than {seconds} s")
 
-    clocks = (
-        (signal.ITIMER_PROF, signal.SIGPROF, seconds),
-        (signal.ITIMER_REAL, signal.SIGALRM, MOST_WAITING_SECONDS),
-    )
+    clocks = ((signal.ITIMER_PROF, signal.SIGPROF, seconds), (signal.ITIMER_REAL, signal.SIGALRM, MAX_WAITING_SECONDS))
     before = [signal.signal(number, stop) for _, number, _ in clocks]
     for timer, _, limit in clocks:
         signal.setitimer(timer, limit)
@@ -68,7 +65,7 @@ def run(main: Main, arguments: Sequence[object], watched: Path) -> Outcome:
     """Run a command's `main`; an exception other than the parser's exit goes on."""
     out, err = io.StringIO(), io.StringIO()
     before, peak, start = state(watched), _peak_bytes(), time.monotonic()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), within(MOST_SECONDS):
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), within(MAX_SECONDS):
         try:
             code = main([str(one) for one in arguments])
         except SystemExit as stop:
@@ -89,7 +86,7 @@ def assert_refused(outcome: Outcome, command: str, names: str, says: str) -> Non
     assert re.search(r"[;,] ", lines[0]), f"no remedy: {lines[0]}"
     assert outcome.out == ""
     assert outcome.changed == set()
-    assert outcome.gained_bytes < MOST_BYTES
+    assert outcome.gained_bytes < MAX_BYTES
 
 
 def state(folder: Path) -> set[tuple[str, object]]:

@@ -15,10 +15,9 @@ import sys
 import tempfile
 import time
 
-import g3r.memory
-
 import g3r.cli.infer
 import g3r.output.sections
+import g3r.planning.memory_limit
 import g3r.reconstruct
 
 
@@ -47,9 +46,7 @@ def run(request: dict) -> dict:
         _, status = os.waitpid(child, 0)
         output.seek(0)
         said = output.read().decode(errors="replace")
-    return {
-        "code": os.waitstatus_to_exitcode(status), "output": said, "seconds": time.monotonic() - begun,
-    }  # fmt: skip
+    return {"code": os.waitstatus_to_exitcode(status), "output": said, "seconds": time.monotonic() - begun}
 
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from commands import TooSlowError, within
 
 from g3r.errors import InputError
 
-MOST_SECONDS = 5.0
-MOST_GAINED_BYTES = 1_500_000_000
+MAX_SECONDS = 5.0
+MAX_GAINED_BYTES = 1_500_000_000
 """Of address space, beyond what the process holds once everything is imported."""
 
-MOST_TOLD = 20
+MAX_TOLD = 20
 """Failures that are described; all are counted."""
 
 
@@ -58,16 +58,16 @@ def run_cases(kind: str, n_cases: int, seed: int, folder: Path, first: int = 0) 
         for number in range(first, first + n_cases):
             counts["tried"] += 1
             try:
-                with within(MOST_SECONDS):
+                with within(MAX_SECONDS):
                     fuzz.run(number)
                 counts["survived"] += 1
             except InputError as error:
                 if is_one_line(str(error)):
                     counts["refused"] += 1
-                elif len(counts["failures"]) < MOST_TOLD:
+                elif len(counts["failures"]) < MAX_TOLD:
                     counts["failures"].append(f"case {number}: no good line: {error!s:.300}")
             except (Exception, TooSlowError):
-                if len(counts["failures"]) < MOST_TOLD:
+                if len(counts["failures"]) < MAX_TOLD:
                     counts["failures"].append(f"case {number}: {traceback.format_exc(limit=-4)}")
     finally:
         logging.disable(logging.NOTSET)
@@ -76,12 +76,7 @@ def run_cases(kind: str, n_cases: int, seed: int, folder: Path, first: int = 0) 
 
 def is_one_line(message: str) -> bool:
     """A refusal: a name, what was found, what to do; not too long to read."""
-    return (
-        ": " in message
-        and ("; " in message or ", " in message)
-        and "\n" not in message
-        and len(message) < 600
-    )
+    return ": " in message and ("; " in message or ", " in message) and "\n" not in message and len(message) < 600
 
 
 def main() -> None:
@@ -90,7 +85,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run_cases(kind, 20, seed, Path(folder), first=10**6)  # imports and compiles
         held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        limit = held + MOST_GAINED_BYTES
+        limit = held + MAX_GAINED_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         print(json.dumps(run_cases(kind, n_cases, seed, Path(folder))))
 

@@ -32,9 +32,7 @@ def small_prior(path: Path) -> Path:
     """A prior of a few hundred weights."""
     torch.manual_seed(0)
     network = DensityGatedPriorNetwork((4, 4), (1, 1), 2)
-    save_prior_checkpoint(
-        path, network, PriorCheckpoint(network.arguments(), 0.8, "nobody", {"val/psnr": 30.0})
-    )
+    save_prior_checkpoint(path, network, PriorCheckpoint(network.arguments(), 0.8, "nobody", {"val/psnr": 30.0}))
     return path
 
 
@@ -160,15 +158,40 @@ def damaged_pickle(rng: np.random.Generator, pickled: bytes) -> bytes:
 def odd_value(rng: np.random.Generator) -> Any:
     """Something that an entry should not be."""
     values: list[Callable[[], Any]] = [
-        lambda: None, lambda: True, lambda: -1, lambda: 0, lambda: 2**70, lambda: 10**400, lambda: 1e300,
-        lambda: float("nan"), lambda: float("-inf"), lambda: 4096, lambda: 0.5, lambda: "",
-        lambda: "x" * 100_000, lambda: "a\nb\x1b[31m", lambda: [], lambda: {}, lambda: [1] * 1000,
-        lambda: {"a": {"b": {}}}, lambda: torch.zeros(3), lambda: torch.tensor(float("nan")),
-        lambda: torch.zeros(2, 2).expand(2, 2), lambda: torch.zeros(1).expand(100_000, 100_000),
-        lambda: torch.zeros(0), lambda: torch.ones(2, dtype=torch.bool), lambda: torch.full((2,), 10**9),
-        lambda: torch.ones(1, dtype=torch.complex64), lambda: (1, 2), lambda: [10**9, 10**9],
-        lambda: [4096] * 8, lambda: ["x"], lambda: b"bytes", lambda: {1: 2}, lambda: {None},
-    ]  # fmt: skip
+        lambda: None,
+        lambda: True,
+        lambda: -1,
+        lambda: 0,
+        lambda: 2**70,
+        lambda: 10**400,
+        lambda: 1e300,
+        lambda: float("nan"),
+        lambda: float("-inf"),
+        lambda: 4096,
+        lambda: 0.5,
+        lambda: "",
+        lambda: "x" * 100_000,
+        lambda: "a\nb\x1b[31m",
+        lambda: [],
+        lambda: {},
+        lambda: [1] * 1000,
+        lambda: {"a": {"b": {}}},
+        lambda: torch.zeros(3),
+        lambda: torch.tensor(float("nan")),
+        lambda: torch.zeros(2, 2).expand(2, 2),
+        lambda: torch.zeros(1).expand(100_000, 100_000),
+        lambda: torch.zeros(0),
+        lambda: torch.ones(2, dtype=torch.bool),
+        lambda: torch.full((2,), 10**9),
+        lambda: torch.ones(1, dtype=torch.complex64),
+        lambda: (1, 2),
+        lambda: [10**9, 10**9],
+        lambda: [4096] * 8,
+        lambda: ["x"],
+        lambda: b"bytes",
+        lambda: {1: 2},
+        lambda: {None},
+    ]
     return values[rng.integers(len(values))]()
 
 

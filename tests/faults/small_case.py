@@ -15,15 +15,23 @@ from typing import Any
 from data_synth.cli import main as simulate
 from g3r._version import __version__
 from g3r.cli.infer import main as infer
-from g3r.output.earlier_run import FileMark, Inputs
+from g3r.output.earlier_run import FileHash, Inputs
 from g3r.planning.presets import PRESETS
 
 FOLDER = Path(__file__).parent
 
 WHOLE = {
-    "volume.nii.gz", "mask.nii.gz", "prior.nii.gz", "coarse.nii.gz", "density.nii.gz",
-    "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "run.json", "sections.png",
-}  # fmt: skip
+    "volume.nii.gz",
+    "mask.nii.gz",
+    "prior.nii.gz",
+    "coarse.nii.gz",
+    "density.nii.gz",
+    "uncertainty.nii.gz",
+    "gaussians.npz",
+    "slices.tsv",
+    "run.json",
+    "sections.png",
+}
 """Files of a result without a prior network."""
 
 
@@ -38,9 +46,17 @@ class SmallCase:
     def arguments(self, output: Path, *further: str) -> list[str]:
         """Of g3r-infer, for the quick run."""
         return [
-            "--stacks", *self.files("stack"), "--masks", *self.files("mask"), "--config", str(self.config),
-            "--quiet", "--output", str(output), *further,
-        ]  # fmt: skip
+            "--stacks",
+            *self.files("stack"),
+            "--masks",
+            *self.files("mask"),
+            "--config",
+            str(self.config),
+            "--quiet",
+            "--output",
+            str(output),
+            *further,
+        ]
 
     def files(self, kind: str) -> list[str]:
         """Of stacks or masks."""
@@ -57,16 +73,26 @@ def make_small_case(folder: Path) -> SmallCase:
     assert simulate([*options, "--seed", "61001", "--output", str(folder / "stacks")]) == 0
     draft = PRESETS["draft"]
     motion = replace(
-        draft.motion, template=False, network=False, stacks=False, runs=False, n_rounds=1,
+        draft.motion,
+        template=False,
+        network=False,
+        stacks=False,
+        segments=False,
+        n_rounds=1,
         standard_orientation=False,
-    )  # fmt: skip  # a fraction of a second; the poses do not matter here
+    )  # a fraction of a second; the poses do not matter here
     settings = replace(draft, motion=motion, resolution_mm=2.0, use_prior=False)
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
-    inputs = Inputs(*(tuple(map(FileMark.of, case.files(kind))) for kind in ("stack", "mask")))
+    inputs = Inputs(*(tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask")))
     record = {
-        "g3r": __version__, "partial": False, "settings": asdict(settings), "inputs": inputs.record(),
-        "stacks": [{"thickness_mm": 4.0}] * 3, "command": {"threads": 1}, "time_budget": None,
-    }  # fmt: skip
+        "g3r": __version__,
+        "partial": False,
+        "settings": asdict(settings),
+        "inputs": inputs.record(),
+        "stacks": [{"thickness_mm": 4.0}] * 3,
+        "command": {"threads": 1},
+        "time_budget": None,
+    }
     case.config.write_text(json.dumps(record))
     assert case.run(folder / "out") == 0
     return replace(case, volume=(folder / "out" / "volume.nii.gz").read_bytes())
@@ -86,9 +112,12 @@ def fork_server() -> Iterator[Killed]:
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join([str(FOLDER.parents[1]), os.environ.get("PYTHONPATH", "")])
     with subprocess.Popen(
-        [sys.executable, str(FOLDER / "fork_server.py")], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, env=environment,
-    ) as server:  # fmt: skip
+        [sys.executable, str(FOLDER / "fork_server.py")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as server:
         assert server.stdin is not None
         assert server.stdout is not None
         write, read = server.stdin, server.stdout

@@ -64,9 +64,7 @@ class Tally:
 
 def table(rows: dict[str, Counts]) -> list[str]:
     """The counts as lines of text, with a sum."""
-    total = Counts(
-        *(sum(getattr(row, name) for row in rows.values()) for name in ("tried", "survived", "refused"))
-    )
+    total = Counts(*(sum(getattr(row, name) for row in rows.values()) for name in ("tried", "survived", "refused")))
     width = max(len(name) for name in [*rows, "all"])
     lines = [f"{'':<{width}} {'tried':>7} {'survived':>9} {'refused':>8} {'lost':>5}"]
     lines += [

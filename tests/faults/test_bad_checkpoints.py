@@ -46,10 +46,7 @@ def packed_again(path: Path) -> None:
 def zeros_unfold(path: Path) -> None:
     """A small archive with an entry that unfolds to 64 MB."""
     small_prior(path)
-    with (
-        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("prior/data/999", "w") as entry,
-    ):
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("prior/data/999", "w") as entry:
         for _ in range(64):
             entry.write(bytes(2**20))
 
@@ -77,7 +74,8 @@ BAD: dict[str, tuple[Maker, str]] = {
     "stack": (lambda path: path.write_bytes(write(path.with_name("x.nii")).read_bytes()), PICKLED),
     "pickle": (lambda path: path.write_bytes(pickle.dumps({"format": "g3r-prior"})), PICKLED),
     "older format": (
-        lambda path: torch.save({"format": "g3r-prior"}, path, _use_new_zipfile_serialization=False), PICKLED,
+        lambda path: torch.save({"format": "g3r-prior"}, path, _use_new_zipfile_serialization=False),
+        PICKLED,
     ),
     "half of it": (first_half, f"is damaged .*{ANOTHER}"),
     "zip of text": (lambda path: zipfile.ZipFile(path, "w").writestr("a.txt", "hello"), "is damaged"),
@@ -87,7 +85,8 @@ BAD: dict[str, tuple[Maker, str]] = {
     "whole network": (lambda path: torch.save(torch.nn.Linear(2, 2), path), "it names 'torch.nn"),
     "pose network": (small_pose, "format is 'g3r-pose', expected 'g3r-prior'"),
     "training checkpoint": (
-        lambda path: torch.save({"pytorch-lightning_version": "2.6", "state_dict": {}}, path), "g3r-export",
+        lambda path: torch.save({"pytorch-lightning_version": "2.6", "state_dict": {}}, path),
+        "g3r-export",
     ),
     "another version": (changed(format_version=2), "format version is 2, this g3r reads 1"),
     "version as a tensor": (changed(format_version=torch.ones(3)), "format version is a Tensor"),
@@ -100,7 +99,7 @@ BAD: dict[str, tuple[Maker, str]] = {
     "wide channels": (changed(network_arguments={"channels": [4096, 4096]}), "do not fit together"),
     "NaN alpha": (changed(alpha=float("nan"), network_arguments={"alpha": float("nan")}), "alpha is nan"),
     "another voxel size": (small_prior, "was trained on voxels of 0.8 mm, expected 1 mm"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -127,17 +126,11 @@ def test_a_bad_pose_network(name: str, tmp_path: Path, tally: Tally):
 
 WAYS: dict[str, Callable[[Path, Canary], object]] = {
     "bare": lambda path, canary: path.write_bytes(pickle.dumps(canary)),
-    "older format": lambda path, canary: torch.save(
-        {"x": canary}, path, _use_new_zipfile_serialization=False
-    ),
+    "older format": lambda path, canary: torch.save({"x": canary}, path, _use_new_zipfile_serialization=False),
     "archive": lambda path, canary: torch.save({"format": "g3r-prior", "x": canary}, path),
     "whole pickle": lambda path, canary: rewritten(small_prior(path), lambda _: pickle.dumps(canary)),
-    "text protocol": lambda path, canary: rewritten(
-        small_prior(path), lambda _: pickle.dumps(canary, protocol=0)
-    ),
-    "newest protocol": lambda path, canary: rewritten(
-        small_prior(path), lambda _: pickle.dumps(canary, protocol=5)
-    ),
+    "text protocol": lambda path, canary: rewritten(small_prior(path), lambda _: pickle.dumps(canary, protocol=0)),
+    "newest protocol": lambda path, canary: rewritten(small_prior(path), lambda _: pickle.dumps(canary, protocol=5)),
 }
 
 

@@ -74,9 +74,14 @@ def pairs(folder: Path) -> dict[str, tuple[list[Path], str, str]]:
 
 
 PAIRS = (
-    "the same file twice", "the same file by another way", "the same file as the third", "a link to it",
-    "a copy of it", "its image with another header", "10 m away",
-)  # fmt: skip
+    "the same file twice",
+    "the same file by another way",
+    "the same file as the third",
+    "a link to it",
+    "a copy of it",
+    "its image with another header",
+    "10 m away",
+)
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -132,16 +137,12 @@ OUTPUTS: dict[str, tuple[Callable[[Path], Path], str]] = {
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
-def test_an_output_that(
-    name: str, stack: Path, tmp_path: Path, tally: Tally, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, monkeypatch: pytest.MonkeyPatch):
     make, says = OUTPUTS[name]
     folder = make(tmp_path)
     if name == "cannot be written" and os.access(folder.parent, os.W_OK):  # to root everything is open
         allowed = os.access
-        monkeypatch.setattr(
-            os, "access", lambda path, mode: "closed" not in str(path) and allowed(path, mode)
-        )
+        monkeypatch.setattr(os, "access", lambda path, mode: "closed" not in str(path) and allowed(path, mode))
     with tally.case() as case:
         outcome = run(main, ["--stacks", stack, "--output", folder], tmp_path)
         assert_refused(outcome, REFUSES, "out", says)
@@ -161,9 +162,7 @@ def test_an_input_is_never_in_the_way_of_an_output(role: str, tmp_path: Path, ta
     with tally.case() as case:
         line = ["--stacks", stack, "--masks", mask, "--output", folder, "--force"]
         outcome = run(main, line, tmp_path)
-        assert_refused(
-            outcome, REFUSES, "", "would be replaced by a result of its name; choose another --output"
-        )
+        assert_refused(outcome, REFUSES, "", "would be replaced by a result of its name; choose another --output")
         case.refused()
 
 
@@ -200,13 +199,31 @@ def test_a_value_without_meaning(
 
 
 USAGE = [
-    [], ["--output", "out"], ["--stacks"], ["--stacks", "a.nii"], ["--stacks", "a.nii", "--output"],
-    ["--masks", "m.nii"], ["--masks", "m.nii", "m.nii", "m.nii"], ["--thickness", "1", "2"],
-    ["--thickness", "thick"], ["--seed", "-1"], ["--seed", "1.5"], ["--threads", "0"], ["--threads", "-1"],
-    ["--resolution", "fine"], ["--preset", "best"], ["--space", "outer"], ["--device", "tpu"],
-    ["--time-budget", "0"], ["--time-budget", "inf"], ["--max-memory", "lots"], ["--max-memory", "-1G"],
-    ["--ckpt", "p.pt", "--no-prior"], ["--preset", "draft", "--time-budget", "9"], ["--nonsense"],
-]  # fmt: skip
+    [],
+    ["--output", "out"],
+    ["--stacks"],
+    ["--stacks", "a.nii"],
+    ["--stacks", "a.nii", "--output"],
+    ["--masks", "m.nii"],
+    ["--masks", "m.nii", "m.nii", "m.nii"],
+    ["--thickness", "1", "2"],
+    ["--thickness", "thick"],
+    ["--seed", "-1"],
+    ["--seed", "1.5"],
+    ["--threads", "0"],
+    ["--threads", "-1"],
+    ["--resolution", "fine"],
+    ["--preset", "best"],
+    ["--space", "outer"],
+    ["--device", "tpu"],
+    ["--time-budget", "0"],
+    ["--time-budget", "inf"],
+    ["--max-memory", "lots"],
+    ["--max-memory", "-1G"],
+    ["--ckpt", "p.pt", "--no-prior"],
+    ["--preset", "draft", "--time-budget", "9"],
+    ["--nonsense"],
+]
 
 
 @pytest.mark.parametrize("words", USAGE, ids=" ".join)

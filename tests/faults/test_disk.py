@@ -88,11 +88,7 @@ def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path:
 
 
 def test_a_write_that_fails_leaves_the_earlier_result(
-    case: SmallCase,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tally: Tally,
+    case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
 ):
     """As on a disk that is full when the last file is written."""
     out = tmp_path / "out"
@@ -119,11 +115,7 @@ def test_a_write_that_fails_leaves_the_earlier_result(
 
 
 def test_stages_that_cannot_be_kept_do_not_end_a_run(
-    case: SmallCase,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tally: Tally,
+    case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
 ):
     def full(*arguments: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -138,11 +130,11 @@ def test_stages_that_cannot_be_kept_do_not_end_a_run(
 def test_stages_give_way_where_only_that_makes_room(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
 ):
-    from g3r.run.output_folder import UnfinishedRun
+    from g3r.run.output_folder import OutputFolder
 
-    with UnfinishedRun(tmp_path / "out") as run:
+    with OutputFolder(tmp_path / "out") as run:
         run.stages.mkdir()
-        (run.stages / "motion.npz").write_bytes(bytes(1000))
+        (run.stages / "registration.npz").write_bytes(bytes(1000))
         free = shutil.disk_usage(tmp_path)
         monkeypatch.setattr("shutil.disk_usage", lambda path: free._replace(free=500))
         run.make_room(400)
@@ -174,9 +166,11 @@ def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally:
             line = [sys.executable, "-m", "g3r.cli.infer", *case.arguments(out)]
             done = subprocess.run(
                 ["bash", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "-", *line],
-                check=False, capture_output=True, text=True,
+                check=False,
+                capture_output=True,
+                text=True,
                 env=os.environ | {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")},
-            )  # fmt: skip
+            )
             codes.append(done.returncode)
             if done.returncode:
                 if done.returncode == 4:

@@ -16,9 +16,7 @@ from g3r.cli import evaluate
 def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) -> bool:
     """Whether a command refused; asserts that it did so properly, or else went through."""
     if must or outcome.code:
-        assert_refused(
-            outcome, command, bad.name.replace("\0", "\\x00") if must else "", says if must else ""
-        )
+        assert_refused(outcome, command, bad.name.replace("\0", "\\x00") if must else "", says if must else "")
         return True
     return False
 
@@ -53,7 +51,10 @@ def test_evaluate_with_a_bad_mask(name: str, tmp_path: Path, tally: Tally):
 
 
 TABLES = {
-    "missing": None, "empty": b"", "no columns": b"a\tb\n1\t2\n", "binary": bytes(range(256)),
+    "missing": None,
+    "empty": b"",
+    "no columns": b"a\tb\n1\t2\n",
+    "binary": bytes(range(256)),
     "text for a number": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\tx\t0\t0\t0\t0\t0\t0\n",
     "NaN": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\tnan\t0\t0\t0\t0\t0\n",
     "short row": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n0\t0\t0\n",
@@ -61,7 +62,7 @@ TABLES = {
     "negative stack": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n-7\t0\t0\t0\t0\t0\t0\t0\n",
     "a billion stacks": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n999999999\t0\t0\t0\t0\t0\t0\t0\n",
     "beyond int64": b"stack\tslice\trx\try\trz\ttx\tty\ttz\n" + b"9" * 30 + b"\t0\t0\t0\t0\t0\t0\t0\n",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -71,18 +72,7 @@ def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Ta
     if TABLES[name] is not None:
         table.write_bytes(TABLES[name] or b"")
     with tally.case() as case:
-        line = [
-            "--volume",
-            volume,
-            "--reference",
-            volume,
-            "--mask",
-            mask,
-            "--poses",
-            table,
-            "--slices",
-            table,
-        ]
+        line = ["--volume", volume, "--reference", volume, "--mask", mask, "--poses", table, "--slices", table]
         assert_refused(run(evaluate.main, line, tmp_path), "g3r-evaluate", "", "expected|check|no such file")
         case.refused()
 
@@ -91,16 +81,7 @@ def test_evaluate_writes_nowhere_else(tmp_path: Path, tally: Tally):
     volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
     for option in ("--json", "--sections"):
         with tally.case() as case:
-            line = [
-                "--volume",
-                volume,
-                "--reference",
-                volume,
-                "--mask",
-                mask,
-                option,
-                tmp_path / "no" / "out",
-            ]
+            line = ["--volume", volume, "--reference", volume, "--mask", mask, option, tmp_path / "no" / "out"]
             outcome = run(evaluate.main, line, tmp_path)
             assert outcome.code == 3
             assert len(outcome.err.splitlines()) == 1

@@ -25,9 +25,11 @@ FIELD_EPSILON = float(np.finfo(np.float32).eps)
 """NIfTI-1 keeps affines as float32."""
 
 quick = settings(
-    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    derandomize=True,
     phases=(Phase.explicit, Phase.generate),  # shrinking takes minutes, and these cases are small
-)  # fmt: skip
+)
 
 
 @st.composite
@@ -97,8 +99,9 @@ def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack:
 numbers = st.one_of(st.sampled_from(NUMBERS), st.floats(), st.integers(-(2**31), 2**31 - 1))
 headers = st.dictionaries(
     st.sampled_from([name for name in FIELDS if name not in ("magic", "descrip")]),
-    st.lists(numbers, min_size=1, max_size=8), max_size=4,
-)  # fmt: skip
+    st.lists(numbers, min_size=1, max_size=8),
+    max_size=4,
+)
 
 
 def fitted(fields: dict[str, list[float]]) -> dict[str, Any]:
@@ -146,7 +149,5 @@ def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], e
 @pytest.mark.usefixtures("networks_once")
 @given(headers, st.sampled_from([".nii", ".nii.gz"]), st.sampled_from(["stack", "mask"]))
 @settings(quick, max_examples=1000)
-def test_a_dry_run_of_any_header_at_length(
-    tally: Tally, fields: dict[str, list[float]], ending: str, role: str
-):
+def test_a_dry_run_of_any_header_at_length(tally: Tally, fields: dict[str, list[float]], ending: str, role: str):
     dry_run(fields, ending, role, tally)

@@ -104,9 +104,7 @@ def test_a_signal_at_any_moment_gives_nothing_a_marked_volume_or_the_whole(
 def check_interrupted(ended: dict[str, Any], out: Path, case: SmallCase, code: int) -> None:
     """What a first signal may leave: see the name of the test."""
     assert "Traceback" not in ended["output"], ended
-    if ended["code"] in (0, -signal.SIGTERM) or (
-        ended["code"] == 130 and "interrupted" not in ended["output"]
-    ):
+    if ended["code"] in (0, -signal.SIGTERM) or (ended["code"] == 130 and "interrupted" not in ended["output"]):
         # before it listened (the command had just begun), or after all was done
         assert not out.exists() or is_whole(out, case)
         return

@@ -27,15 +27,13 @@ CANARY = "DOE^JANE 1987"
 """As short as the shortest text field, so that each can hold it whole."""
 
 WORDS = {
-    "descrip": b"of DOE^JANE 1987 on 2026-11-21", "aux_file": b"/ DOE^JANE 1987",
-    "intent_name": b"DOE^JANE 1987", "db_name": b"DOE^JANE 1987", "data_type": b"E^JANE 198",
-}  # fmt: skip
-EXTENSIONS = (
-    (6, b"DOE^JANE 1987"),
-    (2, b"\0\1DOE^JANE 1987\xff"),
-    (4, b"<DOE^JANE 1987/>"),
-    (44, b"DOE^JANE 1987"),
-)
+    "descrip": b"of DOE^JANE 1987 on 2026-11-21",
+    "aux_file": b"/ DOE^JANE 1987",
+    "intent_name": b"DOE^JANE 1987",
+    "db_name": b"DOE^JANE 1987",
+    "data_type": b"E^JANE 198",
+}
+EXTENSIONS = ((6, b"DOE^JANE 1987"), (2, b"\0\1DOE^JANE 1987\xff"), (4, b"<DOE^JANE 1987/>"), (44, b"DOE^JANE 1987"))
 
 
 def planted(path: Path, data: np.ndarray) -> Path:
@@ -58,9 +56,21 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def line(subject: Path, output: Path) -> list[str]:
     files = [[str(subject / f"{kind}-{n}.nii.gz") for n in range(2)] for kind in ("stack", "mask")]
     return [
-        "--stacks", *files[0], "--masks", *files[1], "--preset", "draft", "--no-prior", "--resolution", "3",
-        "--threads", "1", "--quiet", "--output", str(output),
-    ]  # fmt: skip
+        "--stacks",
+        *files[0],
+        "--masks",
+        *files[1],
+        "--preset",
+        "draft",
+        "--no-prior",
+        "--resolution",
+        "3",
+        "--threads",
+        "1",
+        "--quiet",
+        "--output",
+        str(output),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -136,8 +146,7 @@ def test_it_is_there_when_asked_for(
             assert text.fields == {name: value.decode() for name, value in WORDS.items()}
             assert text.extensions == EXTENSIONS
         np.testing.assert_array_equal(
-            load_volume(tmp_path / "out" / "volume.nii.gz").data,
-            load_volume(result[0] / "volume.nii.gz").data,
+            load_volume(tmp_path / "out" / "volume.nii.gz").data, load_volume(result[0] / "volume.nii.gz").data
         )
         record = json.loads((tmp_path / "out" / "run.json").read_text())
         assert [one["fields"]["descrip"] for one in record["header_text"]] == [WORDS["descrip"].decode()] * 2
@@ -158,17 +167,6 @@ def test_simulated_stacks_say_nothing_of_their_volume(subject: Path, tmp_path: P
     volume = planted(subject / "volume.nii.gz", image(5, (20, 20, 12)))
     mask = planted(subject / "head.nii.gz", ball((20, 20, 12)))
     with tally.case():
-        words = [
-            "--volume",
-            volume,
-            "--mask",
-            mask,
-            "--stacks",
-            1,
-            "--resolution",
-            2,
-            "--output",
-            tmp_path / "out",
-        ]
+        words = ["--volume", volume, "--mask", mask, "--stacks", 1, "--resolution", 2, "--output", tmp_path / "out"]
         assert simulate.main([str(word) for word in words]) == 0
         assert traces(tmp_path / "out") == []

@@ -24,12 +24,7 @@ from g3r.cli.infer import main as infer
 @pytest.fixture(autouse=True, scope="module")
 def everything_is_imported() -> None:
     """What a command imports when it first needs it takes seconds, and is not what is measured here."""
-    for module in (
-        "data_synth.export",
-        "data_synth.phantom",
-        "data_synth.simulator",
-        "g3r.pose_network.network",
-    ):
+    for module in ("data_synth.export", "data_synth.phantom", "data_synth.simulator", "g3r.pose_network.network"):
         import_module(module)
     import_module("g3r.prior.dgpn")
 
@@ -51,12 +46,28 @@ def test_simulate(name: str, tmp_path: Path, tally: Tally):
 @pytest.mark.parametrize(
     "option",
     [
-        "--resolution=0", "--resolution=-1", "--resolution=nan", "--thickness=0", "--thickness=nan",
-        "--gap=-9", "--gap=nan", "--snr=0", "--snr=nan", "--snr=-3", "--bias=nan", "--gain=nan", "--gain=-1",
-        "--phantom=5", "--phantom=nan", "--phantom=1e9", "--seed=-1", "--stacks=0", "--motion=wild",
+        "--resolution=0",
+        "--resolution=-1",
+        "--resolution=nan",
+        "--thickness=0",
+        "--thickness=nan",
+        "--gap=-9",
+        "--gap=nan",
+        "--snr=0",
+        "--snr=nan",
+        "--snr=-3",
+        "--bias=nan",
+        "--gain=nan",
+        "--gain=-1",
+        "--phantom=5",
+        "--phantom=nan",
+        "--phantom=1e9",
+        "--seed=-1",
+        "--stacks=0",
+        "--motion=wild",
         "--stacks=many",
     ],
-)  # fmt: skip
+)
 def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tally: Tally):
     with tally.case() as case:
         source = [] if option.startswith("--phantom") else ["--phantom", "22"]
@@ -69,17 +80,22 @@ def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tall
 
 SAID = {"training_data": "", "optimiser_steps": 1}
 RUNS = {
-    "missing": None, "empty": b"", "text": b"weights\n", "zip": b"PK\x03\x04" + bytes(100),
-    "plain values": {"state_dict": {}}, "nothing in it": {"state_dict": {}, "g3r_prior": {}},
+    "missing": None,
+    "empty": b"",
+    "text": b"weights\n",
+    "zip": b"PK\x03\x04" + bytes(100),
+    "plain values": {"state_dict": {}},
+    "nothing in it": {"state_dict": {}, "g3r_prior": {}},
     "text for a description": {"state_dict": {}, "g3r_prior": "prior"},
     "text for weights": {"state_dict": {"network.a": "heavy"}, "g3r_prior": SAID},
     "list of weights": {"state_dict": [1], "g3r_pose": SAID},
-    "a list": [1, 2], "a tensor": torch.zeros(2),
+    "a list": [1, 2],
+    "a tensor": torch.zeros(2),
     "huge numbers": {
         "state_dict": {"network.a": torch.zeros(1)},
         "g3r_prior": {**SAID, "network_arguments": {"channels": 10**400}},
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -95,9 +111,7 @@ def test_export(name: str, tmp_path: Path, tally: Tally):
         case.refused()
 
 
-@pytest.mark.parametrize(
-    "content", [None, b"", b"{", b"[1]", b'{"thickness_mm": "thick"}', b'{"thickness": []}']
-)
+@pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"thickness_mm": "thick"}', b'{"thickness": []}'])
 def test_bench_of_a_broken_case(content: bytes | None, tmp_path: Path, tally: Tally):
     folder = tmp_path / "case"
     folder.mkdir()
@@ -132,9 +146,7 @@ def test_as_a_process(command: str, tmp_path: Path, tally: Tally):
     with tally.case() as case:
         line = [sys.executable, "-m", f"g3r.cli.{command}", *words]
         root = Path(infer.__code__.co_filename).parents[2]
-        done = subprocess.run(
-            line, cwd=tmp_path, capture_output=True, text=True, check=False, env=_environment(root)
-        )
+        done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, env=_environment(root))
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert done.returncode == code, done.stderr
         assert "Traceback" not in done.stderr

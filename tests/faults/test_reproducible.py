@@ -17,7 +17,7 @@ from tally import Tally
 
 from g3r.cli.infer import main as infer
 from g3r.errors import InputError
-from g3r.output.earlier_run import FileMark, read_run
+from g3r.output.earlier_run import FileHash, read_run
 
 SAME = ("volume.nii.gz", "mask.nii.gz", "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "sections.png")
 QUICK = ("--preset", "draft", "--resolution", "2", "--thickness", "4")
@@ -39,9 +39,7 @@ def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: 
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize(
-    ("threads", "further"), [("1", ("--no-prior",)), ("2", ("--space", "scanner", "--seed", "5"))]
-)
+@pytest.mark.parametrize(("threads", "further"), [("1", ("--no-prior",)), ("2", ("--space", "scanner", "--seed", "5"))])
 def test_options_then_config_then_config_of_that(
     case: SmallCase, tmp_path: Path, tally: Tally, threads: str, further: tuple[str, ...]
 ):
@@ -89,7 +87,7 @@ def test_run_json_says_what_is_needed_and_no_paths(case: SmallCase, tmp_path: Pa
     asked = read_run(case.config).settings
     used = replace(asked, slice_stage=replace(asked.slice_stage, prior_error=0.0))  # of several stacks
     assert run.settings == used
-    assert run.inputs.stacks == tuple(map(FileMark.of, case.files("stack")))
+    assert run.inputs.stacks == tuple(map(FileHash.of, case.files("stack")))
     assert (run.n_threads, run.thickness_mm, run.time_budget) == (1, (4.0, 4.0, 4.0), None)
 
 
@@ -111,9 +109,15 @@ def test_other_inputs_are_told_and_noted(
 
 @pytest.mark.parametrize(
     "options",
-    [["--preset", "draft"], ["--seed", "0"], ["--no-prior"], ["--resolution", "1"], ["--time-budget", "9"],
-     ["--space", "scanner"]],
-)  # fmt: skip
+    [
+        ["--preset", "draft"],
+        ["--seed", "0"],
+        ["--no-prior"],
+        ["--resolution", "1"],
+        ["--time-budget", "9"],
+        ["--space", "scanner"],
+    ],
+)
 def test_options_that_the_config_decides_are_refused(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ):
@@ -129,12 +133,18 @@ def spoilt(text: str) -> dict[str, str]:
     other = {**record, "settings": {**record["settings"], "surprise": 1}}
     wrong = {**record, "settings": {**record["settings"], "seed": "five"}}
     return {
-        "cut off": text[:200], "empty": "", "not json": "hello", "a list": "[]", "a number": "3",
-        "nested": "[" * 100_000, "without settings": json.dumps({"partial": False}),
-        "partial": json.dumps({**record, "partial": True}), "another setting": json.dumps(other),
+        "cut off": text[:200],
+        "empty": "",
+        "not json": "hello",
+        "a list": "[]",
+        "a number": "3",
+        "nested": "[" * 100_000,
+        "without settings": json.dumps({"partial": False}),
+        "partial": json.dumps({**record, "partial": True}),
+        "another setting": json.dumps(other),
         "a word for a number": json.dumps(wrong),
         "settings that are a list": json.dumps({**record, "settings": []}),
-    }  # fmt: skip
+    }
 
 
 def test_a_bad_config_is_refused_in_one_line(
@@ -156,9 +166,9 @@ def test_a_bad_config_is_refused_in_one_line(
 def test_files_are_told_by_their_bytes(tmp_path: Path):
     (tmp_path / "a").write_bytes(b"abc")
     known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert FileMark.of(tmp_path / "a") == FileMark("a", known)
+    assert FileHash.of(tmp_path / "a") == FileHash("a", known)
     with pytest.raises(InputError, match="absent: cannot be read"):
-        FileMark.of(tmp_path / "absent")
+        FileHash.of(tmp_path / "absent")
 
 
 def test_fractions_of_the_pace_survive_json():

@@ -19,7 +19,7 @@ from tally import Tally
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
-from g3r.run.output_folder import UnfinishedRun
+from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 from g3r.run.stage_store import NAMES, RECORDS, Stages, stage_rng
 
@@ -31,9 +31,7 @@ def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stages of a whole run, which ends without writing its result."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "g3r.output.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError)
-        )
+        patch.setattr("g3r.output.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError))
         assert case.run(folder / "out") == 4
     assert names(folder / "out.unfinished" / "stages") == {"made_of.json", *(f"{s}.npz" for s in STAGES)}
     return folder / "out.unfinished"
@@ -71,13 +69,7 @@ def test_a_stage_that_was_cut_off_is_made_again(
 
 @pytest.mark.parametrize(("key", "n_stages"), [("seed", 4), ("distillation", 4)])
 def test_stages_of_another_run_are_refused_by_name(
-    case: SmallCase,
-    kept: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    tally: Tally,
-    key,
-    n_stages,
+    case: SmallCase, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally, key, n_stages
 ):
     with tally.case() as one:
         shutil.copytree(kept, tmp_path / "out.unfinished")
@@ -87,9 +79,7 @@ def test_stages_of_another_run_are_refused_by_name(
         arguments = SmallCase(case.folder, tmp_path / "other.json", b"")
         assert arguments.run(tmp_path / "out", "--resume") == 3
         assert f"the earlier run differs in setting {key}; " in capsys.readouterr().err
-        assert (
-            len(list((tmp_path / "out.unfinished" / "stages").glob("*.npz"))) == n_stages
-        )  # nothing is lost
+        assert len(list((tmp_path / "out.unfinished" / "stages").glob("*.npz"))) == n_stages  # nothing is lost
         one.refused()
 
 
@@ -105,31 +95,31 @@ def test_without_resume_a_run_begins_anew(case: SmallCase, kept: Path, tmp_path:
 def test_nothing_of_a_living_run_is_touched(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
 ):
-    with tally.case() as one, UnfinishedRun(tmp_path / "out") as living:
+    with tally.case() as one, OutputFolder(tmp_path / "out") as living:
         (living.folder / "stages").mkdir()
-        (living.folder / "stages" / "motion.npz").write_text("mine")
+        (living.folder / "stages" / "registration.npz").write_text("mine")
         assert case.run(tmp_path / "out") == 3
         assert f"another run is writing it (process {os.getpid()})" in capsys.readouterr().err
         assert names(living.folder) == {"lock", "stages"}
-        assert (living.folder / "stages" / "motion.npz").read_text() == "mine"
+        assert (living.folder / "stages" / "registration.npz").read_text() == "mine"
         one.refused()
 
 
 def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tally):
     code = (
-        "import sys, time\nfrom g3r.run.output_folder import UnfinishedRun\n"
-        "run = UnfinishedRun(sys.argv[1]).__enter__()\nprint('in', flush=True)\ntime.sleep(60)"
+        "import sys, time\nfrom g3r.run.output_folder import OutputFolder\n"
+        "run = OutputFolder(sys.argv[1]).__enter__()\nprint('in', flush=True)\ntime.sleep(60)"
     )
     with tally.case():
         line = [sys.executable, "-c", code, str(tmp_path / "out")]
         with subprocess.Popen(line, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]) as other:
             assert other.stdout is not None
             assert other.stdout.readline() == b"in\n"
-            with pytest.raises(InputError, match=f"process {other.pid}"), UnfinishedRun(tmp_path / "out"):
+            with pytest.raises(InputError, match=f"process {other.pid}"), OutputFolder(tmp_path / "out"):
                 pass
             other.kill()
             other.wait()
-        with UnfinishedRun(tmp_path / "out"):
+        with OutputFolder(tmp_path / "out"):
             pass
         assert names(tmp_path) == set()
 
@@ -140,14 +130,14 @@ def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, ta
         (unfinished / "earlier").mkdir(parents=True)
         (unfinished / "whole").mkdir()
         (unfinished / "earlier" / "volume").write_text("old")
-        with UnfinishedRun(out, ["volume"]):
+        with OutputFolder(out, ["volume"]):
             assert (out / "volume").read_text() == "old"
         assert names(tmp_path) == {"out"}
     with tally.case():  # killed after them: what is not of a result is brought over
         (unfinished / "earlier").mkdir(parents=True)
         (unfinished / "earlier" / "volume").write_text("older")
         (unfinished / "earlier" / "notes").write_text("mine")
-        with UnfinishedRun(out, ["volume"]):
+        with OutputFolder(out, ["volume"]):
             pass
         assert (out / "volume").read_text() == "old"
         assert names(out) == {"volume", "notes"}

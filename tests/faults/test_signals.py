@@ -51,13 +51,7 @@ def test_before_there_is_a_volume_nothing_is_written(
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_in_the_fit_the_cloud_so_far_is_the_volume(
-    case: SmallCase,
-    interrupt_at,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    tally: Tally,
-    number,
-    code,
+    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally, number, code
 ):
     with tally.case():
         out = tmp_path / "out"
@@ -84,17 +78,13 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
         assert names(tmp_path) == {"out", "whole.nii.gz"}
 
 
-def test_before_the_fit_to_slices_the_prior_is_the_volume(
-    case: SmallCase, interrupt_at, tmp_path: Path, tally: Tally
-):
+def test_before_the_fit_to_slices_the_prior_is_the_volume(case: SmallCase, interrupt_at, tmp_path: Path, tally: Tally):
     with tally.case():
         out = tmp_path / "out"
         interrupt_at("fit to prior", 3)
         assert case.run(out) == 130
         assert json.loads((out / "run.json").read_text())["interrupted"]["stage"] == "fit to prior"
-        volume, prior, mask = (
-            load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask")
-        )
+        volume, prior, mask = (load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask"))
         np.testing.assert_array_equal(volume, prior * mask)
         assert len(GaussianCloud.load(out / "gaussians.npz")) == 0
 

@@ -37,16 +37,7 @@ def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refu
         shutil.copy(Path(__file__).with_name(name), tmp_path)
     test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
     (tmp_path / "test_kills.py").write_text(test)
-    line = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-p",
-        "no:cacheprovider",
-        str(tmp_path),
-        "--rootdir",
-        str(tmp_path),
-    ]
+    line = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(tmp_path), "--rootdir", str(tmp_path)]
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == (pytest.ExitCode.TESTS_FAILED if refused == 1 else 0), done.stdout
     lines = [line.split() for line in done.stdout.splitlines()]

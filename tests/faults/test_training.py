@@ -26,9 +26,15 @@ from g3r.training.prior_module import PriorModule  # noqa: E402
 NETWORK = {"channels": [4, 4], "units": [1, 1], "tail_channels": 2, "warmup_steps": 2}
 # ten patches an epoch in batches of three: one is left over each time
 DATA = {
-    "spacing_mm": 2.0, "patch_size": 24, "patches_per_subject": 2, "batch_size": 3, "subjects_per_epoch": 5,
-    "val_subjects": 1, "val_crop": 24, "seed": 3,
-}  # fmt: skip
+    "spacing_mm": 2.0,
+    "patch_size": 24,
+    "patches_per_subject": 2,
+    "batch_size": 3,
+    "subjects_per_epoch": 5,
+    "val_subjects": 1,
+    "val_crop": 24,
+    "seed": 3,
+}
 N_EPOCHS = 4
 
 
@@ -52,10 +58,16 @@ def trained(folder: Path, end_at: int | None = None, resume: Path | None = None)
     best = lightning.callbacks.ModelCheckpoint(folder, filename="best", monitor="val/l1_prior")
     last = lightning.callbacks.ModelCheckpoint(folder, filename="last", enable_version_counter=False)
     trainer = lightning.Trainer(
-        accelerator="cpu", max_epochs=N_EPOCHS, default_root_dir=folder, logger=False, num_sanity_val_steps=0,
-        enable_progress_bar=False, enable_model_summary=False, callbacks=[best, last, losses],
+        accelerator="cpu",
+        max_epochs=N_EPOCHS,
+        default_root_dir=folder,
+        logger=False,
+        num_sanity_val_steps=0,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[best, last, losses],
         plugins=[WholeCheckpoints()],
-    )  # fmt: skip
+    )
     try:
         module, data = PriorModule(**NETWORK), StackSynthesisDataModule("phantom", **DATA)
         trainer.fit(module, data, ckpt_path=resume, weights_only=True if resume else None)
@@ -137,15 +149,7 @@ trainer:
 def command(folder: Path, *options: str) -> list[str]:
     folder.mkdir(exist_ok=True)
     (folder / "config.yaml").write_text(CONFIG.replace("FOLDER", str(folder)))
-    return [
-        sys.executable,
-        "-m",
-        "g3r.cli.pretrain",
-        "fit",
-        "--config",
-        str(folder / "config.yaml"),
-        *options,
-    ]
+    return [sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(folder / "config.yaml"), *options]
 
 
 def losses(folder: Path) -> dict[int, float]:
@@ -169,9 +173,8 @@ def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: 
             before = last.stat().st_mtime_ns if last.exists() else 0
             options = ["--ckpt_path", str(last)] if last.exists() else []
             run = subprocess.Popen(
-                command(folder, *options), start_new_session=True, stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )  # fmt: skip
+                command(folder, *options), start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
             while run.poll() is None and not (last.exists() and last.stat().st_mtime_ns > before):
                 time.sleep(0.02)
             time.sleep(n_more)

@@ -100,7 +100,8 @@ STACKS: dict[str, tuple[Maker, str]] = {
     "an extension": (lambda folder: write_raw(folder / "odd.nii.gz", extensions=((6, b"hello"),)), ""),
     "an unknown extension": (lambda folder: write_raw(folder / "odd.nii", extensions=((77, b"x" * 99),)), ""),
     "bytes behind the voxels": (
-        lambda folder: write_raw(folder / "odd.nii.gz", cut=lambda whole: whole + bytes(1000)), "",
+        lambda folder: write_raw(folder / "odd.nii.gz", cut=lambda whole: whole + bytes(1000)),
+        "",
     ),
     "gzip members": (in_members, ""),
     "header size 0": (header("odd.nii", sizeof_hdr=0), "sizeof_hdr should be 348"),
@@ -118,7 +119,8 @@ STACKS: dict[str, tuple[Maker, str]] = {
     "negative spacings": (lambda folder: write(folder / "odd.nii.gz", image(), oblique((-1, -1, -3))), ""),
     "10 m from the origin": (lambda folder: write(folder / "odd.nii.gz", image(), moved(0, 1e4, 0)), ""),
     "slices on the first axis": (
-        lambda folder: write(folder / "odd.nii.gz", image(shape=(8, 24, 20)), np.diag([3.0, 1, 1, 1])), "",
+        lambda folder: write(folder / "odd.nii.gz", image(shape=(8, 24, 20)), np.diag([3.0, 1, 1, 1])),
+        "",
     ),
     "no orientation": (header("odd.nii.gz", sform_code=0, qform_code=0), "header holds no orientation"),
     "qform alone": (header("odd.nii.gz", **QFORM), ""),
@@ -127,20 +129,17 @@ STACKS: dict[str, tuple[Maker, str]] = {
         "sform and qform differ by up to 20 mm; the sform is used",
     ),
     "a qform that cannot be read": (
-        header("odd.nii.gz", qform_code=1, quatern_b=2.0), "the qform cannot be read; the sform is used",
+        header("odd.nii.gz", qform_code=1, quatern_b=2.0),
+        "the qform cannot be read; the sform is used",
     ),
     "qfac 0": (header("odd.nii.gz", **QFORM, pixdim=[0, 1, 1, 3, 0, 0, 0, 0]), ""),
-    "negative pixdim": (
-        header("odd.nii.gz", **QFORM, pixdim=[1, -1, 1, 3, 0, 0, 0, 0]), "pixdim.* should be positive",
-    ),
+    "negative pixdim": (header("odd.nii.gz", **QFORM, pixdim=[1, -1, 1, 3, 0, 0, 0, 0]), "pixdim.* should be positive"),
     "pixdim 0 under an sform": (
-        header("odd.nii.gz", qform_code=0, pixdim=[1, 0, 0, 0, 0, 0, 0, 0]), "pixdim.* should be non-zero",
+        header("odd.nii.gz", qform_code=0, pixdim=[1, 0, 0, 0, 0, 0, 0, 0]),
+        "pixdim.* should be non-zero",
     ),
     # what is in it
-    "500 slices": (
-        lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 500)), DENSE),
-        "",
-    ),
+    "500 slices": (lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 500)), DENSE), ""),
     "slices thinner than pixels": (
         lambda folder: write(folder / "odd.nii.gz", image(), THIN),
         "thickness 0.9 mm is less than the pixels' 2 x 2 mm; check --thickness",
@@ -148,20 +147,14 @@ STACKS: dict[str, tuple[Maker, str]] = {
     "two slices": (lambda folder: write(folder / "odd.nii.gz", image(shape=(24, 20, 2))), ""),
     "NaN around the head": (nan_around, ""),
     "negative around the head": (
-        lambda folder: write(folder / "odd.nii.gz", np.where(ball() > 0, image(), -image())), "",
+        lambda folder: write(folder / "odd.nii.gz", np.where(ball() > 0, image(), -image())),
+        "",
     ),
     "faint": (lambda folder: write(folder / "odd.nii.gz", image() * np.float32(1e-9)), ""),
     "bright": (lambda folder: write(folder / "odd.nii.gz", image() * np.float32(1e20)), ""),
-}  # fmt: skip
+}
 
-AS_GOOD = (
-    "one frame",
-    "frames of one",
-    "gzip members",
-    "NIfTI-2",
-    "big-endian",
-    "header and voxels apart",
-)
+AS_GOOD = ("one frame", "frames of one", "gzip members", "NIfTI-2", "big-endian", "header and voxels apart")
 
 
 @pytest.mark.parametrize("name", STACKS)

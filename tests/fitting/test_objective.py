@@ -10,17 +10,17 @@ from test_stages import BALL, GRID, make_slices, seeded, true_cloud
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.errors import NumericalError
-from g3r.fitting.bias_field import StackShading
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.overlap import PairFinder
+from g3r.gaussians.overlap import OverlapFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
 
-SETTINGS = SliceStageSettings(scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0)
+SETTINGS = SliceStageSettings(scale_weight=0.3, bias_field_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4
 
 
@@ -36,15 +36,15 @@ class Scene:
     """
 
     def __init__(
-        self, volume: np.ndarray, seed: int, amplitude: str = "exact", cutoff_sigma: float = CUTOFF_SIGMA
+        self, volume: np.ndarray, seed: int, attenuation: str = "exact", cutoff_sigma: float = CUTOFF_SIGMA
     ) -> None:
         rng = np.random.default_rng(seed)
         self.slices = make_slices()
-        n, self.amplitude = len(self.slices), amplitude
-        self.trust = rng.uniform(0.2, 1, n).astype(np.float32).astype(float)
+        n, self.attenuation = len(self.slices), attenuation
+        self.slice_weight = rng.uniform(0.2, 1, n).astype(np.float32).astype(float)
         cloud = seeded(volume)
         cloud = cloud.take(torch.arange(0, len(cloud), 3))
-        self.shading = StackShading(self.slices)
+        self.bias_field = StackBiasField(self.slices)
         blocks = {
             "turn": (rng.normal(0, 0.05, (n, 3)), 1e-3),
             "shift": (rng.normal(0, 0.3, (n, 3)), 0.03),
@@ -54,10 +54,10 @@ class Scene:
         self.parameters = FitParameters(cloud, LearningRates(), blocks)
         self.prior = VolumeTarget.of(0.9 * volume, (BALL * 0.7).astype(np.float32), GRID)
         self.chosen = np.array([1, 5, 9, 14])
-        exact = amplitude == "exact"
+        exact = attenuation == "exact"
         ones = np.ones(n)
         self.term = SliceTerm(
-            self.slices, ones, self.trust, self.parameters, self.shading, exact, cutoff_sigma
+            self.slices, ones, self.slice_weight, self.parameters, self.bias_field, exact, cutoff_sigma
         )
         self.distilled = ImageTerm(
             self.prior.planes, self.prior.value, self.prior.weight, cloud.origin_mm, cutoff_sigma=cutoff_sigma
@@ -65,7 +65,7 @@ class Scene:
         self.distilled.choose(self.chosen)
         self.objective = CloudObjective(self.parameters, [self.term, self.distilled], SETTINGS.scale_weight)
         self.seed = self.objective.seed_log_scale
-        for name in ("mean_mm", "log_scale", "quaternion_wxyz", "peak"):
+        for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude"):
             value = self.parameters.value[name]
             value += rng.normal(0, 0.1, value.shape).astype(np.float32)
 
@@ -77,26 +77,24 @@ class Scene:
         distance = self.objective.add(self.distilled, STRENGTH)
         self.image = image
         regulariser = self.objective.finish()
-        others = self.term.finish(image, SETTINGS.pose_prior_mm, SETTINGS.shading_ridge)
+        others = self.term.finish(image, SETTINGS.pose_prior_mm, SETTINGS.bias_field_ridge)
         return image + STRENGTH * distance + regulariser + others
 
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
         """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
-        leaves = {
-            name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()
-        }
-        cloud = GaussianCloud(*[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "peak")],
-                              self.parameters.origin_mm)  # fmt: skip
+        leaves = {name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()}
+        cloud = GaussianCloud(
+            *[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
+        )
         log_gain = leaves["log_gain"] - leaves["log_gain"].mean()
         twist = torch.cat([leaves["turn"], leaves["shift"]], 1)
         pixels = render(
-            cloud, self.slices.planes, twist=twist, log_gain=log_gain, backend="reference",
-            amplitude=self.amplitude,
-        )  # fmt: skip
-        basis = torch.tensor(self.shading.basis).double()
+            cloud, self.slices.planes, twist=twist, log_gain=log_gain, backend="reference", attenuation=self.attenuation
+        )
+        basis = torch.tensor(self.bias_field.basis).double()
         of_pixel = self.slices.stack_id[self.slices.planes.plane_id()]
         pixels = pixels * (leaves["shading"][of_pixel] * basis.T).sum(1).exp()
-        weight = torch.tensor(self.slices.mask * self.trust[self.slices.planes.plane_id()])
+        weight = torch.tensor(self.slices.mask * self.slice_weight[self.slices.planes.plane_id()])
         image = (weight * (pixels - torch.tensor(self.slices.value)).abs()).sum() / weight.sum()
         part = self.prior.take(self.chosen)
         weight = torch.tensor(part.weight).double()
@@ -104,10 +102,8 @@ class Scene:
         loss = image + STRENGTH * (weight * near.abs()).sum() / weight.sum()
         away = leaves["log_scale"] - torch.tensor(self.seed)
         loss = loss + SETTINGS.scale_weight * away.square().mean()
-        loss = loss + SETTINGS.shading_ridge * leaves["shading"].square().mean()
-        radius = (
-            np.sqrt(((self.slices.planes.shape * self.slices.planes.spacing_mm / 2) ** 2).sum(1)).mean() / 2
-        )
+        loss = loss + SETTINGS.bias_field_ridge * leaves["shading"].square().mean()
+        radius = np.sqrt(((self.slices.planes.shape * self.slices.planes.spacing_mm / 2) ** 2).sum(1)).mean() / 2
         moved = leaves["shift"].square().sum(1) + (radius * leaves["turn"]).square().sum(1)
         loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
         loss.backward()
@@ -161,9 +157,7 @@ def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray):
 
 def test_where_nothing_counts_the_term_is_zero(volume: np.ndarray):
     scene = Scene(volume, 5)
-    term = ImageTerm(
-        scene.prior.planes, scene.prior.value, 0 * scene.prior.weight, scene.parameters.origin_mm
-    )
+    term = ImageTerm(scene.prior.planes, scene.prior.value, 0 * scene.prior.weight, scene.parameters.origin_mm)
     objective = CloudObjective(scene.parameters, [term], 0.0)
     objective.begin()
     assert objective.add(term, 1.0) == 0
@@ -178,7 +172,7 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
         loss = scene.evaluate()
         for term in scene.objective.terms:
             shapes, cutoff = scene.objective.shapes, CUTOFF_SIGMA
-            finder = PairFinder(len(shapes))
+            finder = OverlapFinder(len(shapes))
             needed = finder.find(shapes, term.planes, term.rotation, term.center_mm, cutoff)
             for k in range(len(term.planes)):
                 held = term.pairs.gaussian[term.pairs.start[k] : term.pairs.start[k + 1]]
@@ -216,9 +210,8 @@ def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: 
         for n_threads in (1, 2):
             numba.set_num_threads(n_threads)
             fit = fit_slices(
-                seeded(volume), slices, ones, ones, prior, SliceStageSettings(n_steps=8),
-                np.random.default_rng(0),
-            )  # fmt: skip
+                seeded(volume), slices, ones, ones, prior, SliceStageSettings(n_steps=8), np.random.default_rng(0)
+            )
             images.append(render(fit.cloud, volume_planes(GRID)).numpy())
     finally:
         numba.set_num_threads(before)
@@ -227,9 +220,8 @@ def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: 
 
 def one_gaussian() -> GaussianCloud:
     return GaussianCloud(
-        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0),
-        np.zeros(3),
-    )  # fmt: skip
+        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0), np.zeros(3)
+    )
 
 
 def test_a_step_is_that_of_torch_adam():
@@ -237,7 +229,7 @@ def test_a_step_is_that_of_torch_adam():
     rates = LearningRates()
     parameters = FitParameters(one_gaussian(), rates, {"extra": (rng.normal(size=(5, 2)), 0.01)})
     leaves = {name: torch.tensor(value.copy()) for name, value in parameters.value.items()}
-    steps = (rates.mean_share, rates.log_scale, rates.quaternion, rates.peak_share * 2, 0.01)
+    steps = (rates.mean_share, rates.log_scale, rates.quaternion, rates.amplitude_share * 2, 0.01)
     groups = [{"params": [leaf], "lr": step} for leaf, step in zip(leaves.values(), steps, strict=True)]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
     for n in range(20):
@@ -263,7 +255,7 @@ def test_a_step_is_about_as_long_as_its_rate_says():
     cloud = parameters.cloud()
     np.testing.assert_allclose(cloud.mean_mm, -0.5 * rates.mean_share, rtol=1e-4)  # sigma is 1 mm
     np.testing.assert_allclose(cloud.log_scale, -0.5 * rates.log_scale, rtol=1e-4)
-    np.testing.assert_allclose(cloud.peak, 2 - 0.5 * rates.peak_share * 2, rtol=1e-4)
+    np.testing.assert_allclose(cloud.amplitude, 2 - 0.5 * rates.amplitude_share * 2, rtol=1e-4)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -272,7 +264,7 @@ def test_a_loss_that_is_not_finite_stops_the_fit(bad: float):
     with pytest.raises(NumericalError, match="not finite") as caught:
         parameters.step(bad, 1.0)
     assert caught.value.exit_code == 4
-    assert torch.equal(parameters.cloud().peak, one_gaussian().peak)
+    assert torch.equal(parameters.cloud().amplitude, one_gaussian().amplitude)
 
 
 def test_a_gradient_that_is_not_finite_stops_the_fit():
@@ -286,8 +278,6 @@ def test_pixels_that_are_not_finite_stop_the_fit(volume: np.ndarray):
     slices, ones = make_slices(), np.ones(24)
     value = slices.value.copy()
     value[np.flatnonzero(slices.mask)[5]] = np.nan
-    settings = SliceStageSettings(n_steps=2, peak_iterations=0)
+    settings = SliceStageSettings(n_steps=2, amplitude_iterations=0)
     with pytest.raises(NumericalError, match="not finite"):
-        fit_slices(
-            seeded(volume), replace(slices, value=value), ones, ones, None, settings, np.random.default_rng(0)
-        )
+        fit_slices(seeded(volume), replace(slices, value=value), ones, ones, None, settings, np.random.default_rng(0))

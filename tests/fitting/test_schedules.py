@@ -41,10 +41,16 @@ def test_annealed_weight_may_grow_and_may_be_zero():
 @pytest.mark.parametrize(
     "arguments",
     [
-        (0.5, 0.1, 0.8, 0.2), (0.5, 0.1, -0.1, 0.5), (0.5, 0.1, 0.5, 1.1), (0.5, 0.1, math.nan, 0.5),
-        (-0.5, 0.1), (0.5, -0.1), (math.nan, 0.1), (math.inf, 0.1),
+        (0.5, 0.1, 0.8, 0.2),
+        (0.5, 0.1, -0.1, 0.5),
+        (0.5, 0.1, 0.5, 1.1),
+        (0.5, 0.1, math.nan, 0.5),
+        (-0.5, 0.1),
+        (0.5, -0.1),
+        (math.nan, 0.1),
+        (math.inf, 0.1),
     ],
-)  # fmt: skip
+)
 def test_annealed_weight_refuses(arguments):
     with pytest.raises(InputError, match="expected"):
         AnnealedWeight(*arguments)

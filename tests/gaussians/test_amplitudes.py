@@ -1,4 +1,4 @@
-"""Peaks by conjugate gradients: the system's adjoint, exact recovery, and what is left alone."""
+"""Amplitudes by conjugate gradients: the system's adjoint, exact recovery, and what is left alone."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, render, solve_peaks
-from g3r.gaussians.amplitudes import PeakSystem
+from g3r.gaussians import GaussianCloud, render, solve_amplitudes
+from g3r.gaussians.amplitudes import AmplitudeSystem
 
 
 def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
@@ -31,56 +31,60 @@ def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
     rotation = np.repeat(frames, 7, axis=0)
     center = cloud.origin_mm + rotation[:, :, 2] * np.tile(np.arange(7) * 2.2 - 6.6, 3)[:, None]
     spacing = np.full((21, 2), 1.0)
-    return cloud, Planes(
-        rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2))
-    )
+    return cloud, Planes(rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2)))
 
 
 @pytest.mark.parametrize("amplitude", ["exact", "printed"])
-def test_the_adjoint_of_the_system(amplitude: str):
+def test_the_adjoint_of_the_system(attenuation: str):
     cloud, planes = scene()
     rng = np.random.default_rng(1)
-    system = PeakSystem.of(cloud, planes, rng.uniform(0.5, 2, len(planes)), amplitude=amplitude)
-    peak, pixels = (rng.normal(size=n).astype(np.float32) for n in (len(cloud), planes.n_pixels))
-    image, back = system.forward(peak).astype(np.float64), system.adjoint(pixels)
+    system = AmplitudeSystem.of(cloud, planes, rng.uniform(0.5, 2, len(planes)), attenuation=attenuation)
+    amplitude, pixels = (rng.normal(size=n).astype(np.float32) for n in (len(cloud), planes.n_pixels))
+    image, back = system.forward(amplitude).astype(np.float64), system.adjoint(pixels)
     # both directions sum in float32
-    assert abs(image @ pixels - peak @ back) < 1e-5 * np.linalg.norm(image) * np.linalg.norm(pixels)
+    assert abs(image @ pixels - amplitude @ back) < 1e-5 * np.linalg.norm(image) * np.linalg.norm(pixels)
 
 
 def test_the_system_is_the_renderer():
     cloud, planes = scene()
     gain = np.linspace(0.5, 2, len(planes))
     expected = render(cloud, planes, log_gain=torch.tensor(np.log(gain)))
-    found = PeakSystem.of(cloud, planes, gain).forward(cloud.peak.numpy())
+    found = AmplitudeSystem.of(cloud, planes, gain).forward(cloud.amplitude.numpy())
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_records_that_may_not_be_kept_are_made_again():
     cloud, planes = scene()
-    whole = PeakSystem.of(cloud, planes)
-    parted = PeakSystem.of(cloud, planes, record_bytes=5000)
+    whole = AmplitudeSystem.of(cloud, planes)
+    parted = AmplitudeSystem.of(cloud, planes, projection_bytes=5000)
     assert len(whole.parts) == 1
     assert len(parted.parts) > 3
     assert parted.parts[0][0] == 0
     assert parted.parts[-1][1] == len(planes)
-    peak, pixels = cloud.peak.numpy(), np.ones(planes.n_pixels, np.float32)
+    amplitude, pixels = cloud.amplitude.numpy(), np.ones(planes.n_pixels, np.float32)
     for _ in range(2):
-        np.testing.assert_array_equal(parted.forward(peak), whole.forward(peak))
+        np.testing.assert_array_equal(parted.forward(amplitude), whole.forward(amplitude))
         np.testing.assert_allclose(parted.adjoint(pixels), whole.adjoint(pixels), rtol=1e-12)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])
 @pytest.mark.parametrize("amplitude", ["exact", "printed"])
-def test_known_peaks_are_recovered(amplitude: str, damping: float):
+def test_known_peaks_are_recovered(attenuation: str, damping: float):
     cloud, planes = scene()
     gain = np.linspace(0.5, 2, len(planes))
-    target = PeakSystem.of(cloud, planes, gain, amplitude=amplitude).forward(cloud.peak.numpy())
-    start = cloud.with_peak(torch.zeros(len(cloud)))
-    found = solve_peaks(
-        start, planes, target, np.ones(planes.n_pixels, np.float32), gain=gain, n_iterations=60,
-        damping=damping, amplitude=amplitude,
-    )  # fmt: skip
-    assert (found.peak - cloud.peak).abs().max() < 2e-3
+    target = AmplitudeSystem.of(cloud, planes, gain, attenuation=attenuation).forward(cloud.amplitude.numpy())
+    start = cloud.with_amplitude(torch.zeros(len(cloud)))
+    found = solve_amplitudes(
+        start,
+        planes,
+        target,
+        np.ones(planes.n_pixels, np.float32),
+        gain=gain,
+        n_iterations=60,
+        damping=damping,
+        attenuation=attenuation,
+    )
+    assert (found.amplitude - cloud.amplitude).abs().max() < 2e-3
     assert torch.equal(found.mean_mm, cloud.mean_mm)
 
 
@@ -88,12 +92,11 @@ def test_more_iterations_never_fit_worse():
     cloud, planes = scene()
     rng = np.random.default_rng(2)
     target = (render(cloud, planes).numpy() + rng.normal(0, 0.1, planes.n_pixels)).astype(np.float32)
-    start, weight = cloud.with_peak(torch.zeros(len(cloud))), np.ones(planes.n_pixels, np.float32)
+    start, weight = cloud.with_amplitude(torch.zeros(len(cloud))), np.ones(planes.n_pixels, np.float32)
     errors = [
         float(
             (
-                (render(solve_peaks(start, planes, target, weight, n_iterations=n), planes).numpy() - target)
-                ** 2
+                (render(solve_amplitudes(start, planes, target, weight, n_iterations=n), planes).numpy() - target) ** 2
             ).sum()
         )
         for n in (0, 1, 2, 4, 8, 16)
@@ -108,39 +111,37 @@ def test_pixels_of_weight_zero_do_not_count():
     weight = np.ones(planes.n_pixels, np.float32)
     weight[::3] = 0
     target[::3] = 1e3
-    start = cloud.with_peak(torch.zeros(len(cloud)))
-    found = solve_peaks(start, planes, target, weight, n_iterations=80, damping=1e-6)
-    assert (found.peak - cloud.peak).abs().max() < 5e-3
+    start = cloud.with_amplitude(torch.zeros(len(cloud)))
+    found = solve_amplitudes(start, planes, target, weight, n_iterations=80, damping=1e-6)
+    assert (found.amplitude - cloud.amplitude).abs().max() < 5e-3
 
 
 def test_what_no_pixel_sees_stays():
     cloud, planes = scene()
-    away = Planes(
-        planes.rotation, planes.center_mm + 500, planes.spacing_mm, planes.shape, planes.psf_var_mm2
-    )
+    away = Planes(planes.rotation, planes.center_mm + 500, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
     ones = np.ones(planes.n_pixels, np.float32)
-    assert torch.equal(solve_peaks(cloud, away, ones, ones).peak, cloud.peak)
-    assert torch.equal(solve_peaks(cloud, planes, ones, 0 * ones).peak, cloud.peak)
+    assert torch.equal(solve_amplitudes(cloud, away, ones, ones).amplitude, cloud.amplitude)
+    assert torch.equal(solve_amplitudes(cloud, planes, ones, 0 * ones).amplitude, cloud.amplitude)
     # one Gaussian out of sight among others that are seen
     mean = cloud.mean_mm.clone()
     mean[5] += 300
     lost = GaussianCloud(mean, *cloud.parameters[1:], cloud.origin_mm)
-    found = solve_peaks(lost, planes, ones, ones)
-    assert found.peak[5] == cloud.peak[5]
-    assert not torch.equal(found.peak, cloud.peak)
+    found = solve_amplitudes(lost, planes, ones, ones)
+    assert found.amplitude[5] == cloud.amplitude[5]
+    assert not torch.equal(found.amplitude, cloud.amplitude)
 
 
 def test_no_gaussian_at_all():
     cloud, planes = scene()
     ones = np.ones(planes.n_pixels, np.float32)
-    assert len(solve_peaks(cloud.take(torch.zeros(0, dtype=torch.long)), planes, ones, ones)) == 0
+    assert len(solve_amplitudes(cloud.take(torch.zeros(0, dtype=torch.long)), planes, ones, ones)) == 0
 
 
 def test_strong_damping_holds_the_peaks():
     cloud, planes = scene()
     ones = np.ones(planes.n_pixels, np.float32)
     change = [
-        float((solve_peaks(cloud, planes, ones, ones, damping=d).peak - cloud.peak).norm())
+        float((solve_amplitudes(cloud, planes, ones, ones, damping=d).amplitude - cloud.amplitude).norm())
         for d in (1e-3, 1.0, 1e3)
     ]
     assert change[0] > change[1] > change[2]

@@ -1,4 +1,4 @@
-"""Blobs of a residual, and Gaussians that nobody would miss."""
+"""ResidualExtrema of a residual, and Gaussians that nobody would miss."""
 
 import numpy as np
 import pytest
@@ -12,12 +12,12 @@ from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.cloud import rotation_from_quaternion
 from g3r.gaussians.densification import (
     FIRST_SHARE,
-    crowded,
-    find_blobs,
-    joined,
+    concatenated,
+    exceeds_density,
+    find_extrema,
     local_rms,
-    with_twins_merged,
-    without_faint,
+    pruned,
+    with_duplicates_merged,
 )
 from g3r.geometry import VolumeGrid
 
@@ -28,16 +28,11 @@ GRID = VolumeGrid((40, 42, 38), AFFINE)
 ALL = np.ones(GRID.shape, bool)
 
 
-def cloud_of(mean, sigma, peak, rotation=None) -> GaussianCloud:
+def cloud_of(mean, sigma, amplitude, rotation=None) -> GaussianCloud:
     mean = np.atleast_2d(np.asarray(mean, float))
     n = len(mean)
     turn = Rotation.identity(n) if rotation is None else rotation
-    arrays = (
-        mean,
-        np.log(np.broadcast_to(sigma, (n, 3))),
-        turn.as_quat()[:, [3, 0, 1, 2]],
-        np.array(peak, float),
-    )
+    arrays = (mean, np.log(np.broadcast_to(sigma, (n, 3))), turn.as_quat()[:, [3, 0, 1, 2]], np.array(amplitude, float))
     return GaussianCloud.of([torch.from_numpy(np.array(a, np.float32)) for a in arrays], GRID.center_mm)
 
 
@@ -45,22 +40,22 @@ def shown(cloud: GaussianCloud) -> np.ndarray:
     return volume_from_pixels(render(cloud, volume_planes(GRID), cutoff_sigma=6.0).numpy(), GRID)
 
 
-@pytest.mark.parametrize("peak", [0.6, -0.3])
-def test_a_blob_is_found_with_its_place_shape_and_height(peak: float):
+@pytest.mark.parametrize("amplitude", [0.6, -0.3])
+def test_a_blob_is_found_with_its_place_shape_and_height(amplitude: float):
     turn = Rotation.from_rotvec([[0.4, -0.7, 0.2]])
-    true = cloud_of([[1.1, -2.0, 0.5]], [2.6, 1.8, 1.1], [peak], turn)
-    blobs = find_blobs(shown(true), ALL, GRID, 1.2, 0.5)
+    true = cloud_of([[1.1, -2.0, 0.5]], [2.6, 1.8, 1.1], [amplitude], turn)
+    blobs = find_extrema(shown(true), ALL, GRID, 1.2, 0.5)
     best = blobs.take(np.array([np.argmax(blobs.gain)]))
     found = best.cloud(GRID, GRID.center_mm)
     assert np.linalg.norm((found.mean_mm - true.mean_mm).numpy()) < 0.8
     np.testing.assert_allclose(np.sort(best.sigma_mm[0]), [1.1, 1.8, 2.6], rtol=0.2)
-    assert float(found.peak[0]) == pytest.approx(FIRST_SHARE * peak, rel=0.2)
+    assert float(found.amplitude[0]) == pytest.approx(FIRST_SHARE * amplitude, rel=0.2)
     thin = rotation_from_quaternion(found.quaternion_wxyz)[0][:, int(found.log_scale[0].argmin())]
     assert abs(float(thin @ torch.from_numpy(turn.as_matrix()[0][:, 2]).float())) > 0.95
 
 
 def test_a_residual_of_zero_has_no_blobs():
-    blobs = find_blobs(np.zeros(GRID.shape, np.float32), ALL, GRID, 1.2, 0.5)
+    blobs = find_extrema(np.zeros(GRID.shape, np.float32), ALL, GRID, 1.2, 0.5)
     assert len(blobs) == 0
     assert len(blobs.cloud(GRID, GRID.center_mm)) == 0
 
@@ -78,8 +73,8 @@ def test_lattices_are_crowded_at_their_own_spacing_and_not_at_half_of_it():
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     lattice = cloud_of(points, 1.2, np.ones(len(points)))
     asked = GRID.center_mm + np.random.default_rng(0).uniform(-6, 6, (50, 3))
-    assert crowded(lattice, asked, 2.4).all()
-    assert not crowded(lattice, asked, 1.0).any()
+    assert exceeds_density(lattice, asked, 2.4).all()
+    assert not exceeds_density(lattice, asked, 1.0).any()
 
 
 @settings(max_examples=25, deadline=None)
@@ -93,28 +88,28 @@ def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolera
         rng.uniform(1.0, 2.2, (1, 3)),
         rng.uniform(0.02, 0.5, 1),
         Rotation.random(1, rng=rng),
-    )  # fmt: skip
-    pair = joined(one, near)
-    for cloud, fewer in ((one, without_faint(one, tolerance)), (pair, with_twins_merged(pair, tolerance))):
+    )
+    pair = concatenated(one, near)
+    for cloud, fewer in ((one, pruned(one, tolerance)), (pair, with_duplicates_merged(pair, tolerance))):
         change = float(((shown(cloud) - shown(fewer)) ** 2).sum()) * GRID.voxel_volume_mm3
         assert change < 1.02 * tolerance + 1e-6
         if len(fewer) == len(cloud):
-            torch.testing.assert_close(fewer.peak, cloud.peak)
+            torch.testing.assert_close(fewer.amplitude, cloud.amplitude)
 
 
 def test_twins_become_one_and_opposites_stay():
     twins = cloud_of([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
-    merged = with_twins_merged(twins, 0.05)
+    merged = with_duplicates_merged(twins, 0.05)
     assert len(merged) == 1
     assert float(merged.mean_mm[0, 0]) == pytest.approx(0.1, abs=1e-5)
     assert np.abs(shown(twins) - shown(merged)).max() < 0.01
     opposite = cloud_of([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
-    assert len(with_twins_merged(opposite, 0.05)) == 2
+    assert len(with_duplicates_merged(opposite, 0.05)) == 2
 
 
 def test_clouds_of_none_or_one_pass_through():
     one = cloud_of([[0, 0, 0]], 1.5, [1.0])
     none = one.take(torch.zeros(1, dtype=torch.bool))
-    assert len(with_twins_merged(one, 1.0)) == 1
-    assert len(with_twins_merged(none, 1.0)) == len(without_faint(none, 1.0)) == 0
-    assert len(without_faint(one, 1e9)) == 0
+    assert len(with_duplicates_merged(one, 1.0)) == 1
+    assert len(with_duplicates_merged(none, 1.0)) == len(pruned(none, 1.0)) == 0
+    assert len(pruned(one, 1e9)) == 0

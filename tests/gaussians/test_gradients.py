@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import GaussianCloud, render
 
-NAMES = ("mean_mm", "log_scale", "quaternion_wxyz", "peak", "twist", "log_gain")
+NAMES = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude", "twist", "log_gain")
 
 
 def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0):
@@ -48,29 +48,27 @@ def gradients(leaves, planes, pixel_weight, dtype, **options):
 @pytest.mark.parametrize("amplitude", ["exact", "printed"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("psf", [1.0, 0.0])
-def test_numba_gradients_agree_with_float64_autograd(seed, amplitude, psf):
+def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
     leaves, planes, weight = scene(seed, psf=psf)
     expected, expected_grad = gradients(
-        leaves, planes, weight, torch.float64, backend="reference", amplitude=amplitude
+        leaves, planes, weight, torch.float64, backend="reference", attenuation=attenuation
     )
-    found, found_grad = gradients(
-        leaves, planes, weight, torch.float32, cutoff_sigma=6.0, amplitude=amplitude
-    )
-    # the cut-off at 6 sigma leaves 1.5e-8 of a peak, the polynomial exponential 2e-7
+    found, found_grad = gradients(leaves, planes, weight, torch.float32, cutoff_sigma=6.0, attenuation=attenuation)
+    # the cut-off at 6 sigma leaves 1.5e-8 of a amplitude, the polynomial exponential 2e-7
     assert (found - expected).abs().max() < 3e-6 * expected.abs().max()
     for name, a, b in zip(NAMES, expected_grad, found_grad, strict=True):
         assert (a - b).norm() <= 1e-4 * a.norm(), name
 
 
 @pytest.mark.parametrize("amplitude", ["exact", "printed"])
-def test_reference_gradcheck(amplitude):
+def test_reference_gradcheck(attenuation):
     leaves, planes, _ = scene(3, n=2, n_planes=2)
     planes = Planes(
         planes.rotation, planes.center_mm, planes.spacing_mm * 4, np.array([[5, 4]] * 2), planes.psf_var_mm2
     )
     leaves = [leaf.requires_grad_() for leaf in leaves]
     assert torch.autograd.gradcheck(
-        lambda *x: image(x, planes, backend="reference", amplitude=amplitude),
+        lambda *x: image(x, planes, backend="reference", attenuation=attenuation),
         leaves,
         rtol=1e-8,
         atol=1e-8,

@@ -11,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.errors import InputError
-from g3r.gaussians import GaussianCloud, find_pairs, render
+from g3r.gaussians import GaussianCloud, find_overlaps, render
 from g3r.geometry import RigidPose, VolumeGrid
 
 
-def make_cloud(
-    seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0, -30.0, 20.0)
-) -> GaussianCloud:
+def make_cloud(seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0, -30.0, 20.0)) -> GaussianCloud:
     rng = np.random.default_rng(seed)
     return GaussianCloud(
         torch.tensor(rng.normal(0, spread_mm, (n, 3))),
@@ -46,12 +44,12 @@ def single(cloud: GaussianCloud) -> GaussianCloud:
 
 def volume_at(cloud: GaussianCloud, points_mm: np.ndarray) -> np.ndarray:
     """V(x) of Eq. 3 at points [P, 3]."""
-    mean, log_scale, wxyz, peak = (p.double().numpy() for p in cloud.parameters)
+    mean, log_scale, wxyz, amplitude = (p.double().numpy() for p in cloud.parameters)
     total = np.zeros(len(points_mm))
     for j in range(len(mean)):
         axes = Rotation.from_quat(np.roll(wxyz[j], -1)).as_matrix()
         white = (points_mm - cloud.origin_mm - mean[j]) @ axes / np.exp(log_scale[j])
-        total += peak[j] * np.exp(-0.5 * (white**2).sum(1))
+        total += amplitude[j] * np.exp(-0.5 * (white**2).sum(1))
     return total
 
 
@@ -76,11 +74,7 @@ def quadrature(cloud: GaussianCloud, planes: Planes) -> np.ndarray:
         n_x, n_y = planes.shape[k]
         for i in range(n_x):
             for j in range(n_y):
-                u = [
-                    (i - (n_x - 1) / 2) * planes.spacing_mm[k, 0],
-                    (j - (n_y - 1) / 2) * planes.spacing_mm[k, 1],
-                    0.0,
-                ]
+                u = [(i - (n_x - 1) / 2) * planes.spacing_mm[k, 0], (j - (n_y - 1) / 2) * planes.spacing_mm[k, 1], 0.0]
                 points = (nodes + u) @ planes.rotation[k].T + planes.center_mm[k]
                 pixels.append(weight @ volume_at(cloud, points))
     return np.array(pixels)
@@ -97,7 +91,7 @@ def test_both_backends_agree_with_quadrature(seed: int):
     # float32 parameters and sums, polynomial exponential 2e-7, cut-off exp(-18) = 1.5e-8 per Gaussian
     assert np.abs(found - expected).max() < 3e-6 * scale
     default = render(single(cloud), planes).numpy()
-    assert np.abs(default - expected).max() < 0.006 * float(cloud.peak.abs().sum())
+    assert np.abs(default - expected).max() < 0.006 * float(cloud.amplitude.abs().sum())
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
@@ -107,14 +101,10 @@ def test_the_printed_amplitude_is_off_by_the_factor_of_the_design(backend: str):
         torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1), np.zeros(3)
     )
     planes = Planes(
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        [[0.8, 0.8]],
-        [[1, 1]],
-        psf_variance_mm2([[0.8, 0.8]], np.array([3.0])),
+        np.eye(3)[None], np.zeros((1, 3)), [[0.8, 0.8]], [[1, 1]], psf_variance_mm2([[0.8, 0.8]], np.array([3.0]))
     )
     exact = render(one, planes, backend=backend).item()
-    printed = render(one, planes, backend=backend, amplitude="printed").item()
+    printed = render(one, planes, backend=backend, attenuation="printed").item()
     assert exact / printed == pytest.approx(0.5295, abs=2e-4)
     assert quadrature(one, planes)[0] == pytest.approx(exact, rel=1e-5)
 
@@ -161,9 +151,12 @@ def test_moving_the_whole_world_changes_nothing():
     wxyz = cloud.quaternion_wxyz.numpy()
     turned = (turn * Rotation.from_quat(np.roll(wxyz, -1, axis=1))).as_quat()
     moved = GaussianCloud(
-        torch.tensor(turn.apply(cloud.mean_mm.numpy())), cloud.log_scale,
-        torch.tensor(np.roll(turned, 1, axis=1)), cloud.peak, motion.apply(cloud.origin_mm[None, None])[0, 0],
-    )  # fmt: skip
+        torch.tensor(turn.apply(cloud.mean_mm.numpy())),
+        cloud.log_scale,
+        torch.tensor(np.roll(turned, 1, axis=1)),
+        cloud.amplitude,
+        motion.apply(cloud.origin_mm[None, None])[0, 0],
+    )
     assert_same_images((cloud, planes), (moved, planes.moved(motion)))
 
 
@@ -178,7 +171,7 @@ def test_q_and_minus_q_and_their_length_do_not_matter():
     cloud, planes = make_cloud(7, 10), make_planes(7)
     for factor in (-1.0, 3.7, -1e-3):
         other = GaussianCloud(
-            cloud.mean_mm, cloud.log_scale, factor * cloud.quaternion_wxyz, cloud.peak, cloud.origin_mm
+            cloud.mean_mm, cloud.log_scale, factor * cloud.quaternion_wxyz, cloud.amplitude, cloud.origin_mm
         )
         assert_same_images((cloud, planes), (other, planes))
 
@@ -193,9 +186,7 @@ def test_ten_metres_from_the_origin_no_digit_is_lost():
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
     away = GaussianCloud(*cloud.parameters, far)
-    moved = Planes(
-        planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2
-    )
+    moved = Planes(planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
     for (first, _), (second, _) in zip(images(cloud, planes), images(away, moved), strict=True):
         assert np.abs(first - second).max() < 1e-6 * np.abs(first).max()
 
@@ -205,7 +196,7 @@ def test_intensities_scale_with_the_peaks():
     plain = render(cloud, planes)
     for factor in (1e-6, 1e6, -1.0):
         torch.testing.assert_close(
-            render(cloud.with_peak(cloud.peak * factor), planes),
+            render(cloud.with_amplitude(cloud.amplitude * factor), planes),
             plain * factor,
             rtol=2e-5,
             atol=1e-6 * abs(factor),
@@ -223,9 +214,12 @@ def test_gain_and_twist_are_what_they_say(backend: str):
     by_hand = planes.with_pose(RigidPose(turned, planes.center_mm + twist[:, 3:]))
     expected = render(cloud, by_hand, backend=backend).numpy() * np.repeat(gain, np.diff(planes.offset))
     found = render(
-        cloud, planes, backend=backend, twist=torch.tensor(twist, dtype=cloud.peak.dtype),
-        log_gain=torch.tensor(np.log(gain), dtype=cloud.peak.dtype),
-    )  # fmt: skip
+        cloud,
+        planes,
+        backend=backend,
+        twist=torch.tensor(twist, dtype=cloud.amplitude.dtype),
+        log_gain=torch.tensor(np.log(gain), dtype=cloud.amplitude.dtype),
+    )
     assert np.abs(found.numpy() - expected).max() < (1e-12 if backend == "reference" else 2e-5)
 
 
@@ -248,33 +242,25 @@ def test_no_plane_renders_nothing(backend: str):
 def test_one_gaussian_and_one_pixel():
     cloud, planes = make_cloud(14, 1), make_planes(14, n=1, shape=(1, 1))
     assert_same_images((cloud, planes), (cloud, planes))
-    assert render(cloud, planes, backend="reference").item() == pytest.approx(
-        quadrature(cloud, planes)[0], rel=1e-8
-    )
+    assert render(cloud, planes, backend="reference").item() == pytest.approx(quadrature(cloud, planes)[0], rel=1e-8)
 
 
 def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed():
     cloud, planes = single(make_cloud(15, 10)), make_planes(15)
     away = planes.moved(RigidPose.from_rotvec([[0.0, 0, 0]], [[500.0, 0, 0]]))
-    both = Planes(
-        *(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__)
-    )
+    both = Planes(*(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__))
     pixels = render(cloud, both)
     assert (pixels[: away.n_pixels] == 0).all()
     torch.testing.assert_close(pixels[away.n_pixels :], render(cloud, planes), rtol=1e-6, atol=1e-7)
-    assert len(find_pairs(cloud, away, 3.2)) == 0
+    assert len(find_overlaps(cloud, away, 3.2)) == 0
 
 
 @pytest.mark.parametrize("log_scale", [[-3.9, -3.9, -3.9], [4.6, 4.6, 4.6], [-3.5, 3.4, 0.0]])
 @pytest.mark.parametrize("psf", [0.0, 1.0])
-def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(
-    log_scale: list[float], psf: float
-):
+def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(log_scale: list[float], psf: float):
     """Sigma 0.02 and 100 mm, and an axis ratio of 1000."""
     base, planes = make_cloud(16, 5, spread_mm=0.2), make_planes(16, psf=psf, shape=(15, 15))
-    cloud = GaussianCloud(
-        base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:], base.origin_mm
-    )
+    cloud = GaussianCloud(base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:], base.origin_mm)
     expected = render(cloud, planes, backend="reference")
     leaves = [p.float().requires_grad_() for p in cloud.parameters]
     twist = torch.zeros(len(planes), 6, requires_grad=True)
@@ -290,9 +276,11 @@ def test_large_and_slanted_ellipses_of_several_strips_agree_with_the_reference()
     base = make_cloud(24, 12, spread_mm=15)
     rng = np.random.default_rng(24)
     cloud = GaussianCloud(
-        base.mean_mm, torch.tensor(np.log(rng.uniform([0.3, 1, 4], [1, 4, 15], (12, 3)))),
-        *base.parameters[2:], base.origin_mm,
-    )  # fmt: skip
+        base.mean_mm,
+        torch.tensor(np.log(rng.uniform([0.3, 1, 4], [1, 4, 15], (12, 3)))),
+        *base.parameters[2:],
+        base.origin_mm,
+    )
     for psf in (0.0, 1.0):
         planes = make_planes(24, n=4, shape=(70, 61), psf=psf)
         expected = render(cloud, planes, backend="reference").numpy()
@@ -309,9 +297,9 @@ def test_the_cut_off_bounds_the_error(cutoff: float):
     cloud, planes = make_cloud(17, 20), make_planes(17, shape=(25, 25))
     exact = render(cloud, planes, backend="reference").numpy()
     found = render(single(cloud), planes, cutoff_sigma=cutoff).numpy()
-    heights = render(cloud.with_peak(cloud.peak.abs()), planes, backend="reference")
+    heights = render(cloud.with_amplitude(cloud.amplitude.abs()), planes, backend="reference")
     assert heights.min() >= 0
-    bound = float(cloud.peak.abs().sum()) * np.exp(-0.5 * cutoff**2) + 1e-6
+    bound = float(cloud.amplitude.abs().sum()) * np.exp(-0.5 * cutoff**2) + 1e-6
     error = np.abs(found - exact).max()
     assert error < bound
     assert error > 1e-4 * bound  # it does cut
@@ -319,7 +307,7 @@ def test_the_cut_off_bounds_the_error(cutoff: float):
 
 def test_pair_lists_with_a_margin_give_the_same_pixels_and_stay_valid():
     cloud, planes = single(make_cloud(18, 60, spread_mm=8)), make_planes(18, shape=(12, 12))
-    tight, wide = find_pairs(cloud, planes, 3.2), find_pairs(cloud, planes, 4.2)
+    tight, wide = find_overlaps(cloud, planes, 3.2), find_overlaps(cloud, planes, 4.2)
     assert len(tight) < len(wide)
     assert (np.diff(wide.start) >= np.diff(tight.start)).all()
     plain = render(cloud, planes)
@@ -395,5 +383,5 @@ def test_what_is_no_cloud_is_refused(tmp_path, kind: str):
 
 def test_shapes_that_do_not_belong_together_are_refused():
     cloud = make_cloud(23, 3)
-    with pytest.raises(ValueError, match="peak has shape"):
-        cloud.with_peak(torch.zeros(2))
+    with pytest.raises(ValueError, match="amplitude has shape"):
+        cloud.with_amplitude(torch.zeros(2))

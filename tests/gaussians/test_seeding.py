@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.gaussians import render
 from g3r.gaussians.cloud import rotation_from_quaternion
-from g3r.gaussians.seeding import MOST_ANISOTROPY, SCALE_PER_SPACING, seed_cloud
+from g3r.gaussians.seeding import MAX_ANISOTROPY, SCALE_PER_SPACING, seed_cloud
 from g3r.geometry import VolumeGrid
 
 AFFINE = np.eye(4)
@@ -49,17 +49,13 @@ def test_seeds_are_flattened_across_an_edge():
     assert edge.sum() > 20
     log_scale = cloud.log_scale[edge].double()
     smallest = log_scale.argmin(1)
-    axis = rotation_from_quaternion(cloud.quaternion_wxyz[edge].double())[
-        torch.arange(int(edge.sum())), :, smallest
-    ]
+    axis = rotation_from_quaternion(cloud.quaternion_wxyz[edge].double())[torch.arange(int(edge.sum())), :, smallest]
     normal = AFFINE[:3, 2]
     assert np.abs(axis.numpy() @ normal).min() > 0.95
     ratio = (log_scale - log_scale.mean(1, keepdim=True)).exp()
     assert ratio.min() < 0.8
-    assert ratio.max() < MOST_ANISOTROPY**2
-    torch.testing.assert_close(
-        log_scale.mean(1).exp(), torch.full((int(edge.sum()),), 1.2).double(), rtol=1e-4, atol=0
-    )
+    assert ratio.max() < MAX_ANISOTROPY**2
+    torch.testing.assert_close(log_scale.mean(1).exp(), torch.full((int(edge.sum()),), 1.2).double(), rtol=1e-4, atol=0)
 
 
 def test_an_empty_foreground_is_refused():

@@ -12,7 +12,7 @@ from g3r.acquisition.planes import Planes
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.gaussians import GaussianCloud
-from g3r.gaussians.amplitudes import PeakSystem
+from g3r.gaussians.amplitudes import AmplitudeSystem
 from studies.numerics.errors import FULL_CUTOFF, gradients
 from studies.numerics.scenes import single
 
@@ -34,12 +34,16 @@ def numba(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
 def objective(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
     """The kernel of the fits: with targets far away on one side, L1 is a weighted sum and a constant."""
     sign, size = weight.sign().numpy(), weight.abs().numpy()
-    far = 10 * float(cloud.peak.abs().sum()) + 1
+    far = 10 * float(cloud.amplitude.abs().sum()) + 1
     parameters = FitParameters(single(cloud), LearningRates())
     term = ImageTerm(
-        planes, (-far * sign).astype(np.float32), size.astype(np.float32), cloud.origin_mm, with_pose=True,
+        planes,
+        (-far * sign).astype(np.float32),
+        size.astype(np.float32),
+        cloud.origin_mm,
+        with_pose=True,
         cutoff_sigma=FULL_CUTOFF,
-    )  # fmt: skip
+    )
     made = CloudObjective(parameters, [term], 0.0)
     made.begin()
     mean = made.add(term, 1.0)
@@ -49,20 +53,27 @@ def objective(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated
     plane = torch.from_numpy(term.plane_gradient) * total
     assert np.isfinite(mean)
     return torch.zeros(0), {
-        "centre": one["mean_mm"], "shape": torch.cat([one["log_scale"], one["quaternion_wxyz"]], 1),
-        "peak": one["peak"], "turn": plane[:, :3], "shift": plane[:, 3:6], "gain": plane[:, 6:],
-    }  # fmt: skip
+        "centre": one["mean_mm"],
+        "shape": torch.cat([one["log_scale"], one["quaternion_wxyz"]], 1),
+        "amplitude": one["amplitude"],
+        "turn": plane[:, :3],
+        "shift": plane[:, 3:6],
+        "gain": plane[:, 6:],
+    }
 
 
-def peaks(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
-    """The linear system of the peaks and its adjoint."""
-    system = PeakSystem.of(single(cloud), planes, cutoff_sigma=FULL_CUTOFF)
-    pixels = torch.from_numpy(system.forward(cloud.peak.numpy())).double()
-    return pixels, {"peak": torch.from_numpy(system.adjoint(weight.numpy().astype(np.float32)))}
+def amplitudes(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
+    """The linear system of the amplitudes and its adjoint."""
+    system = AmplitudeSystem.of(single(cloud), planes, cutoff_sigma=FULL_CUTOFF)
+    pixels = torch.from_numpy(system.forward(cloud.amplitude.numpy())).double()
+    return pixels, {"amplitude": torch.from_numpy(system.adjoint(weight.numpy().astype(np.float32)))}
 
 
 BACKENDS: dict[str, Callable[[GaussianCloud, Planes, Tensor], Evaluated]] = {
-    "reference64": reference64, "reference32": reference32, "numba": numba, "objective": objective,
-    "peaks": peaks,
-}  # fmt: skip
-FAST = ("numba", "objective", "peaks")
+    "reference64": reference64,
+    "reference32": reference32,
+    "numba": numba,
+    "objective": objective,
+    "amplitudes": amplitudes,
+}
+FAST = ("numba", "objective", "amplitudes")

@@ -1,4 +1,4 @@
-"""Peaks where they are not determined, densities from nothing to a million, and where naive formulas fail."""
+"""Amplitudes where they are not determined, densities from nothing to a million, and where naive formulas fail."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from g3r.acquisition.coarse_volume import coarse_and_density, confidence
-from g3r.gaussians import GaussianCloud, render, solve_peaks
-from g3r.gaussians.amplitudes import PeakSystem
+from g3r.gaussians import GaussianCloud, render, solve_amplitudes
+from g3r.gaussians.amplitudes import AmplitudeSystem
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
-from studies.numerics.oracles import naive_peaks, naive_render
+from studies.numerics.oracles import naive_amplitudes, naive_render
 from studies.numerics.scenes import head_scene, single, slender_scenes
 
 
@@ -29,12 +29,12 @@ def test_identical_gaussians_share_the_peak(n: int, damping: float, tally):
     cloud, several = copies(n)
     target, ones = render(cloud, planes).numpy(), np.ones(planes.n_pixels, np.float32)
     with tally.case():
-        start = several.with_peak(torch.zeros(len(several)))
-        found = solve_peaks(start, planes, target, ones, n_iterations=40, damping=damping).peak
+        start = several.with_amplitude(torch.zeros(len(several)))
+        found = solve_amplitudes(start, planes, target, ones, n_iterations=40, damping=damping).amplitude
         shares = found.reshape(n, -1)
         assert torch.isfinite(found).all()
         assert (shares - shares[0]).abs().max() < 1e-5
-        residual = np.abs(render(several.with_peak(found), planes).numpy() - target).max()
+        residual = np.abs(render(several.with_amplitude(found), planes).numpy() - target).max()
         assert residual < (0.02 if damping else 1e-3) * target.max()
 
 
@@ -48,8 +48,8 @@ def test_more_gaussians_than_pixels(damping: float, tally):
     target = np.linspace(0.1, 1, 9).astype(np.float32)
     with tally.case():
         start = single(scene.cloud)
-        found = solve_peaks(start, planes, target, np.ones(9, np.float32), n_iterations=60, damping=damping)
-        assert torch.isfinite(found.peak).all()
+        found = solve_amplitudes(start, planes, target, np.ones(9, np.float32), n_iterations=60, damping=damping)
+        assert torch.isfinite(found.amplitude).all()
         assert np.abs(render(found, planes).numpy() - target).max() < (0.2 if damping else 5e-3)
 
 
@@ -58,10 +58,10 @@ def test_peaks_scale_with_the_intensities(factor: float, tally):
     planes, cloud = head_scene().planes, single(head_scene().cloud)
     target = render(cloud, planes).numpy() + np.random.default_rng(0).normal(0, 0.1, planes.n_pixels)
     ones = np.ones(planes.n_pixels, np.float32)
-    start = cloud.with_peak(torch.zeros(len(cloud)))
-    plain = solve_peaks(start, planes, target.astype(np.float32), ones).peak
+    start = cloud.with_amplitude(torch.zeros(len(cloud)))
+    plain = solve_amplitudes(start, planes, target.astype(np.float32), ones).amplitude
     with tally.case():
-        scaled = solve_peaks(start, planes, target.astype(np.float32) * np.float32(factor), ones).peak
+        scaled = solve_amplitudes(start, planes, target.astype(np.float32) * np.float32(factor), ones).amplitude
         change = (scaled.double() / factor - plain.double()).abs().max()
         assert change <= (0 if np.log2(factor).is_integer() else 1e-4) * plain.abs().max()
 
@@ -70,39 +70,42 @@ def test_peaks_scale_with_the_intensities(factor: float, tally):
 def test_weights_of_any_size(factor: float, tally):
     planes, cloud = head_scene().planes, single(head_scene().cloud)
     target = render(cloud, planes).numpy()
-    start = cloud.with_peak(torch.zeros(len(cloud)))
+    start = cloud.with_amplitude(torch.zeros(len(cloud)))
     with tally.case():
         weight = np.full(planes.n_pixels, factor, np.float32)
-        found = solve_peaks(start, planes, target, weight, n_iterations=30).peak
+        found = solve_amplitudes(start, planes, target, weight, n_iterations=30).amplitude
         assert torch.isfinite(found).all()
         if factor:
-            unit = solve_peaks(start, planes, target, weight / np.float32(factor), n_iterations=30).peak
+            unit = solve_amplitudes(start, planes, target, weight / np.float32(factor), n_iterations=30).amplitude
             assert (found - unit).abs().max() < 2e-3
         else:
             assert (found == 0).all()
 
 
 def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit():
-    """Sums over a narrow Gaussian are small: the epsilon decides the naive peak, and ours does not move."""
+    """Sums over a narrow Gaussian are small: the epsilon decides the naive amplitude, and ours does not move."""
     cloud = GaussianCloud(
-        torch.zeros(1, 3), torch.full((1, 3), float(np.log(0.02))), torch.tensor([[1.0, 0, 0, 0]]),
-        torch.ones(1), head_scene().cloud.origin_mm,
-    )  # fmt: skip
+        torch.zeros(1, 3),
+        torch.full((1, 3), float(np.log(0.02))),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.ones(1),
+        head_scene().cloud.origin_mm,
+    )
     planes = head_scene().planes.take([4, 5])
-    shown = PeakSystem.of(cloud, planes).forward(np.ones(1, np.float32))
+    shown = AmplitudeSystem.of(cloud, planes).forward(np.ones(1, np.float32))
     matrix = shown[:, None].astype(np.float32)
     assert 0 < matrix.sum() < 1e-4
     target = np.full(planes.n_pixels, 1.0, np.float32)
-    naive = [float(naive_peaks(matrix, target, epsilon)[0]) for epsilon in (0.0, 1e-8, 1e-4)]
+    naive = [float(naive_amplitudes(matrix, target, epsilon)[0]) for epsilon in (0.0, 1e-8, 1e-4)]
     assert naive[0] == pytest.approx(1.0)
     assert naive[2] < 0.6  # an epsilon that harms no other Gaussian
-    start = cloud.with_peak(torch.zeros(1))
+    start = cloud.with_amplitude(torch.zeros(1))
     found = [
-        solve_peaks(start, planes, shown * factor, np.full(planes.n_pixels, weight, np.float32), damping=0.0)
+        solve_amplitudes(start, planes, shown * factor, np.full(planes.n_pixels, weight, np.float32), damping=0.0)
         for factor, weight in ((1.0, 1.0), (1.0, 1e-4), (1e-4, 1.0))
     ]
     for c, expected in zip(found, (1.0, 1.0, 1e-4), strict=True):
-        assert float(c.peak) == pytest.approx(expected, rel=1e-4)
+        assert float(c.amplitude) == pytest.approx(expected, rel=1e-4)
 
 
 def test_determinant_and_inverse_fail_where_the_renderer_does_not():

@@ -14,7 +14,7 @@ from g3r.registration.normal_equations import correlation
 from g3r.registration.slice_rounds import SliceRounds, refine_slices, slice_weights
 from studies.numerics.fits import slices_of_small_head
 
-ROUNDS = SliceRounds(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6, pixels_at_most=400_000)
+ROUNDS = SliceRounds(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6, max_pixels=400_000)
 
 
 def plain() -> Slices:
@@ -33,11 +33,16 @@ def far_away() -> Slices:
 
 
 CASES: dict[str, Callable[[], Slices]] = {
-    "as they are": plain, "10 m away": far_away, "constant": lambda: of_value(0.5),
-    "zero": lambda: of_value(0.0), "negative": lambda: of_value(-1.0), "one slice": lambda: plain().take([5]),
-    "two slices of one stack": lambda: plain().take([4, 5]), "tiny": lambda: plain().scaled(1e-6),
+    "as they are": plain,
+    "10 m away": far_away,
+    "constant": lambda: of_value(0.5),
+    "zero": lambda: of_value(0.0),
+    "negative": lambda: of_value(-1.0),
+    "one slice": lambda: plain().take([5]),
+    "two slices of one stack": lambda: plain().take([4, 5]),
+    "tiny": lambda: plain().scaled(1e-6),
     "large": lambda: plain().scaled(1e6),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CASES)

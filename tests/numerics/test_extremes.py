@@ -13,36 +13,28 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, find_pairs, render
+from g3r.gaussians import GaussianCloud, find_overlaps, render
 from g3r.gaussians.cloud import SIGMA_RANGE_MM
 from g3r.geometry import RigidPose
 from studies.numerics.errors import gradient_tolerance, shape_tolerance, sized_scenes
 from studies.numerics.oracles import volume_at
-from studies.numerics.scenes import (
-    ORIGIN_MM,
-    Scene,
-    cloud_of,
-    head_scene,
-    single,
-    slender_scenes,
-    stacks_of_planes,
-)
+from studies.numerics.scenes import ORIGIN_MM, Scene, cloud_of, head_scene, single, slender_scenes, stacks_of_planes
 
 
 def of_sigma(sigma_mm: float, thickness_mm: float) -> Scene:
     return sized_scenes(sigma_mm, thickness_mm, 1)[0]
 
 
-def with_peaks(factor: float) -> Scene:
+def with_amplitudes(factor: float) -> Scene:
     scene = head_scene()
-    return Scene(scene.cloud.with_peak(scene.cloud.peak * factor), scene.planes)
+    return Scene(scene.cloud.with_amplitude(scene.cloud.amplitude * factor), scene.planes)
 
 
 def with_quaternions(length: float) -> Scene:
     scene = head_scene()
-    mean, log_scale, quaternion, peak = scene.cloud.parameters
+    mean, log_scale, quaternion, amplitude = scene.cloud.parameters
     unit = quaternion / quaternion.norm(dim=1, keepdim=True)
-    return Scene(GaussianCloud(mean, log_scale, unit * length, peak, scene.cloud.origin_mm), scene.planes)
+    return Scene(GaussianCloud(mean, log_scale, unit * length, amplitude, scene.cloud.origin_mm), scene.planes)
 
 
 def of_thickness(thickness_mm: float) -> Scene:
@@ -66,16 +58,21 @@ def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) 
     rng = np.random.default_rng(5)
     turns = Rotation.random(n, rng=rng)
     cloud = cloud_of(
-        rng.normal(0, 2, (n, 3)), np.tile([100.0, 100.0, 0.02], (n, 1)), np.roll(turns.as_quat(), 1, axis=1),
+        rng.normal(0, 2, (n, 3)),
+        np.tile([100.0, 100.0, 0.02], (n, 1)),
+        np.roll(turns.as_quat(), 1, axis=1),
         rng.uniform(0.2, 1, n),
-    )  # fmt: skip
+    )
     tilted = turns * Rotation.from_rotvec(rng.normal(0, tilt_rad, (n, 3)))
     spacing = np.full((n, 2), 4.0)
     aside = turns.apply(np.array([0, 0, aside_mm]) * rng.choice([-1, 1], (n, 1)))
     planes = Planes(
-        tilted.as_matrix(), ORIGIN_MM + cloud.mean_mm.numpy() + aside, spacing, np.full((n, 2), 40),
+        tilted.as_matrix(),
+        ORIGIN_MM + cloud.mean_mm.numpy() + aside,
+        spacing,
+        np.full((n, 2), 40),
         psf_variance_mm2(spacing, np.full(n, 0.1)) * (1.0 if psf else 0.0),
-    )  # fmt: skip
+    )
     return Scene(cloud, planes)
 
 
@@ -101,17 +98,23 @@ def pixels_of(shape: tuple[int, int], n_planes: int) -> Scene:
 
 
 SCENES: dict[str, tuple[Callable[[], Scene], float]] = {
-    **{f"sigma {s:g} mm, slices of {t:g} mm": (lambda s=s, t=t: of_sigma(s, t), 1.5)
-       for s in (0.02, 0.3, 100.0) for t in (0.0, 0.1, 2.2, 20.0)},
-    **{f"axis ratio {r:g}{', PSF' * psf}": (lambda r=r, psf=psf: slender_scenes(r, 20.0, psf, 1, 9)[0], r)
-       for r in (30.0, 1000.0) for psf in (False, True)},
+    **{
+        f"sigma {s:g} mm, slices of {t:g} mm": (lambda s=s, t=t: of_sigma(s, t), 1.5)
+        for s in (0.02, 0.3, 100.0)
+        for t in (0.0, 0.1, 2.2, 20.0)
+    },
+    **{
+        f"axis ratio {r:g}{', PSF' * psf}": (lambda r=r, psf=psf: slender_scenes(r, 20.0, psf, 1, 9)[0], r)
+        for r in (30.0, 1000.0)
+        for psf in (False, True)
+    },
     "flat discs in V(x)": (lambda: flat(False), 5000.0),
     "flat discs in thin slices": (lambda: flat(True), 5000.0),
     **{f"slices of {t:g} mm": (lambda t=t: of_thickness(t), 3.0) for t in (0.1, 20.0)},
     **{f"{d:g} m away": (lambda d=d: head_scene(np.array([1, -1, 1.0]) * d * 1e3), 3.0) for d in (0.0, 10.0)},
     **{f"planes turned by {a:g} rad": (lambda a=a: turned(a), 3.0) for a in (0.0, 1e-8, np.pi)},
     **{f"quaternions of length {n:g}": (lambda n=n: with_quaternions(n), 3.0) for n in (1e-10, 1e10)},
-    **{f"peaks times {f:g}": (lambda f=f: with_peaks(f), 3.0) for f in (0.0, 1e-6, 1e6, -1.0)},
+    **{f"amplitudes times {f:g}": (lambda f=f: with_amplitudes(f), 3.0) for f in (0.0, 1e-6, 1e6, -1.0)},
     "identical Gaussians": (identical, 3.0),
     "no Gaussian": (lambda: Scene(head_scene().cloud.take([]), head_scene().planes), 3.0),
     "one Gaussian": (lambda: Scene(head_scene().cloud.take([0]), head_scene().planes), 3.0),
@@ -121,7 +124,7 @@ SCENES: dict[str, tuple[Callable[[], Scene], float]] = {
     "planes beside the Gaussians": (lambda: apart(40.0), 3.0),
     "planes that meet no Gaussian": (lambda: apart(1e4), 3.0),
     "Gaussians outside every plane": (astray, 3.0),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -131,14 +134,14 @@ def test_value_and_every_gradient_are_finite_and_right(name: str, tally):
     cloud, planes = scene.cloud, scene.planes
     weight = torch.tensor(np.random.default_rng(0).normal(size=planes.n_pixels))
     expected, expected_gradient = BACKENDS["reference64"](cloud, planes, weight)
-    height = float(cloud.peak.abs().sum())
+    height = float(cloud.amplitude.abs().sum())
     largest = float(expected.abs().max()) if len(expected) else 0.0
     assert torch.isfinite(expected).all()
     for backend in BACKENDS:
         with tally.case():
             found, gradient = BACKENDS[backend](cloud, planes, weight)
             if len(found):
-                # what nearly misses the planes is cut off at 6 sigma: 1.5e-8 of each peak
+                # what nearly misses the planes is cut off at 6 sigma: 1.5e-8 of each amplitude
                 bound = shape_tolerance(ratio) * max(largest, 1e-6 * height) + 2e-8 * height
                 assert float((found - expected).abs().max()) <= bound, backend
             for what, g in gradient.items():
@@ -159,7 +162,7 @@ def test_turns_of_the_twist_of_any_size(angle: float, tally):
     grads = {}
     for backend, cloud in (("reference", scene.cloud), ("numba", single(scene.cloud))):
         with tally.case():
-            leaf = twist.to(cloud.peak.dtype).clone().requires_grad_()
+            leaf = twist.to(cloud.amplitude.dtype).clone().requires_grad_()
             options = {"cutoff_sigma": 6.0} if backend == "numba" else {}
             pixels = render(cloud, scene.planes, twist=leaf, backend=backend, **options)
             (pixels * weight.to(pixels.dtype)).sum().backward()
@@ -175,12 +178,11 @@ def test_a_million_gaussians(tally):
     n = 1_000_000
     rng = np.random.default_rng(6)
     cloud = cloud_of(
-        rng.uniform(-60, 60, (n, 3)), rng.uniform(0.2, 0.6, (n, 3)), rng.normal(size=(n, 4)),
-        rng.uniform(0, 1, n),
-    )  # fmt: skip
+        rng.uniform(-60, 60, (n, 3)), rng.uniform(0.2, 0.6, (n, 3)), rng.normal(size=(n, 4)), rng.uniform(0, 1, n)
+    )
     planes = stacks_of_planes(ORIGIN_MM, n_slices=1)
     weight = torch.ones(planes.n_pixels).double()
-    near = torch.tensor(find_pairs(single(cloud), planes, 6.0).gaussian.astype(np.int64)).unique()
+    near = torch.tensor(find_overlaps(single(cloud), planes, 6.0).gaussian.astype(np.int64)).unique()
     assert 1000 < len(near) < n // 10
     with tally.case():
         found, gradient = BACKENDS["numba"](cloud, planes, weight)
@@ -222,10 +224,10 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
 def test_pairs_of_flat_gaussians_are_not_missed():
     """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
     scene = flat(False, 40, 1e-5, 0.03)
-    pairs = find_pairs(single(scene.cloud), scene.planes, 3.2)
+    pairs = find_overlaps(single(scene.cloud), scene.planes, 3.2)
     for k in range(len(scene.planes)):
         shown = render(scene.cloud.take([k]), scene.planes.take([k]), backend="reference")
-        assert shown.max() > 0.3 * scene.cloud.peak[k]
+        assert shown.max() > 0.3 * scene.cloud.amplitude[k]
         assert k in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
 
 
@@ -233,7 +235,7 @@ def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair():
     """Centres in float64, 10 m from the cloud's own origin."""
     scene = head_scene()
     far = GaussianCloud(scene.cloud.mean_mm + 1e4, *scene.cloud.parameters[1:], scene.cloud.origin_mm - 1e4)
-    near, away = (find_pairs(c, scene.planes, 3.2) for c in (scene.cloud, far))
+    near, away = (find_overlaps(c, scene.planes, 3.2) for c in (scene.cloud, far))
     assert abs(len(near) - len(away)) <= 1e-3 * len(near)
     found = render(far, scene.planes, cutoff_sigma=6.0)
     exact = render(scene.cloud, scene.planes, backend="reference")
@@ -241,11 +243,16 @@ def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair():
 
 
 BAD_CLOUDS = {
-    "NaN centre": (0, np.nan), "infinite centre": (0, np.inf), "NaN sigma": (1, np.nan),
-    "sigma of 1e-9 mm": (1, np.log(1e-9)), "sigma of 1e9 mm": (1, np.log(1e9)),
-    "NaN quaternion": (2, np.nan), "zero quaternion": (2, 0.0), "NaN peak": (3, np.nan),
-    "infinite peak": (3, -np.inf),
-}  # fmt: skip
+    "NaN centre": (0, np.nan),
+    "infinite centre": (0, np.inf),
+    "NaN sigma": (1, np.nan),
+    "sigma of 1e-9 mm": (1, np.log(1e-9)),
+    "sigma of 1e9 mm": (1, np.log(1e9)),
+    "NaN quaternion": (2, np.nan),
+    "zero quaternion": (2, 0.0),
+    "NaN amplitude": (3, np.nan),
+    "infinite amplitude": (3, -np.inf),
+}
 
 
 @pytest.mark.parametrize("name", BAD_CLOUDS)
@@ -263,10 +270,7 @@ def test_clouds_that_are_not_numbers_are_refused(name: str, tally):
 def test_calls_that_make_no_sense_are_refused(backend: str, tally):
     scene = head_scene()
     cloud, n = single(scene.cloud), len(scene.planes)
-    bad = [
-        {"twist": torch.full((n, 6), torch.nan)}, {"log_gain": torch.full((n,), torch.inf)},
-        {"amplitude": "other"},
-    ]  # fmt: skip
+    bad = [{"twist": torch.full((n, 6), torch.nan)}, {"log_gain": torch.full((n,), torch.inf)}, {"amplitude": "other"}]
     refused = tally.refused
     for options in bad:
         with tally.case(may_refuse=True):
@@ -284,7 +288,7 @@ def test_a_sigma_of_more_pixels_than_integers_hold_is_refused(tally):
     cloud = GaussianCloud(scene.cloud.mean_mm, log_scale, *scene.cloud.parameters[2:], ORIGIN_MM)
     with tally.case():
         pixels = render(single(cloud), scene.planes, cutoff_sigma=6.0)
-        assert (pixels - cloud.peak.sum()).abs().max() < 1e-4 * cloud.peak.sum()
+        assert (pixels - cloud.amplitude.sum()).abs().max() < 1e-4 * cloud.amplitude.sum()
     fine = replace(scene.planes, spacing_mm=scene.planes.spacing_mm * 1e-3)
     with pytest.raises(ValueError, match="pixels wide"):
         render(single(cloud), fine)

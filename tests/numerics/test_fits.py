@@ -11,9 +11,9 @@ import torch
 
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, NumericalError
-from g3r.fitting import divergence_guard as safeguard
+from g3r.fitting import divergence_guard as divergence_guard
 from g3r.fitting import prior_stage
-from g3r.fitting.divergence_guard import Safeguard
+from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.schedules import AnnealedWeight
@@ -41,7 +41,7 @@ def assert_finite(result: SliceFit) -> None:
     for array in (result.gain, result.weight, result.slices.planes.rotation, result.slices.planes.center_mm):
         assert np.isfinite(array).all()
     assert np.isfinite([value for entry in result.history for value in entry.values()]).all()
-    assert np.isfinite(np.array(result.shading, dtype=float)).all()
+    assert np.isfinite(np.array(result.bias_field, dtype=float)).all()
     assert torch.isfinite(render(result.cloud, result.slices.planes)).all()
 
 
@@ -81,8 +81,8 @@ DEGENERATE = {
     "Gaussians as large as the head": lambda: (grown(seeded(), 3.0), slices_of_small_head()[0]),
     "Gaussians far below a pixel": lambda: (grown(seeded(), -4.5), slices_of_small_head()[0]),
     "Gaussians beside the slices": lambda: (shifted(seeded(), 300.0), slices_of_small_head()[0]),
-    "peaks of zero": lambda: (seeded().with_peak(torch.zeros(len(seeded()))), slices_of_small_head()[0]),
-}  # fmt: skip
+    "amplitudes of zero": lambda: (seeded().with_amplitude(torch.zeros(len(seeded()))), slices_of_small_head()[0]),
+}
 
 
 def grown(cloud: GaussianCloud, by: float) -> GaussianCloud:
@@ -93,12 +93,12 @@ def shifted(cloud: GaussianCloud, by_mm: float) -> GaussianCloud:
     return GaussianCloud(cloud.mean_mm + by_mm, *cloud.parameters[1:], cloud.origin_mm)
 
 
-@pytest.mark.parametrize("peaks_first", [True, False])
+@pytest.mark.parametrize("amplitudes_first", [True, False])
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_fits_end_in_finite_numbers(name: str, peaks_first: bool, tally):
+def test_degenerate_fits_end_in_finite_numbers(name: str, amplitudes_first: bool, tally):
     cloud, slices = DEGENERATE[name]()
     with tally.case():
-        result = fit(cloud, slices, n_steps=15, peak_iterations=6 if peaks_first else 0)
+        result = fit(cloud, slices, n_steps=15, amplitude_iterations=6 if amplitudes_first else 0)
         assert_finite(result)
 
 
@@ -114,9 +114,9 @@ def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally
         target = VolumeTarget.of(volume * np.float32(scale), mask.astype(np.float32), grid)
         with tally.case():
             start = seed_cloud(volume, mask, grid, 2.8)
-            start = start.with_peak(start.peak * scale)
+            start = start.with_amplitude(start.amplitude * scale)
             found, _ = fit_prior(start, target, PriorStageSettings(n_steps=0), np.random.default_rng(0))
-            fitted.append(found.peak / scale)
+            fitted.append(found.amplitude / scale)
     assert torch.equal(*fitted)
 
 
@@ -135,7 +135,7 @@ def test_steps_that_are_too_large_are_taken_back(factor: float, tally, caplog):
         shown = render(result.cloud, result.slices.planes).numpy()
         return float(np.abs(shown - slices.value)[slices.mask].mean())
 
-    assert any("step_back" in entry for entry in rash.history)
+    assert any("rollback" in entry for entry in rash.history)
     assert "back to the best state" in caplog.text
     assert residual(rash) < rash.history[0]["image"]
     assert residual(rash) < 1.5 * residual(plain)
@@ -173,11 +173,7 @@ def test_stage_1_steps_back_as_well(monkeypatch, caplog):
 
 def one_gaussian() -> FitParameters:
     cloud = GaussianCloud(
-        torch.zeros(1, 3),
-        torch.zeros(1, 3),
-        torch.tensor([[1.0, 0, 0, 0]]),
-        torch.full((1,), 2.0),
-        np.zeros(3),
+        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0), np.zeros(3)
     )
     return FitParameters(cloud, LearningRates())
 
@@ -186,25 +182,25 @@ def one_gaussian() -> FitParameters:
 def test_a_bad_loss_brings_the_best_state_back_with_shorter_steps(bad: float):
     parameters = one_gaussian()
     parameters.gradients[:] = 1.0
-    guard = Safeguard(parameters, level=1.0)
+    guard = DivergenceGuard(parameters, level=1.0)
     best = parameters.values.copy()
     assert guard.step(0.5, 1.0)
     assert not np.array_equal(parameters.values, best)
     assert not guard.step(bad, 1.0)
     assert np.array_equal(parameters.values, best)
-    assert guard.step_factor == safeguard.SHORTER
+    assert guard.step_factor == divergence_guard.SHORTER
     assert guard.n_back == 1
     assert guard.step(0.5, 1.0)
     shorter = np.abs(parameters.values - best).max()
     parameters.restart(best)
     parameters.gradients[:] = 1.0
     parameters.step(0.5, 1.0)
-    assert shorter == pytest.approx(safeguard.SHORTER * np.abs(parameters.values - best).max(), rel=1e-4)
+    assert shorter == pytest.approx(divergence_guard.SHORTER * np.abs(parameters.values - best).max(), rel=1e-4)
 
 
 def test_a_bad_gradient_after_good_steps_goes_back_and_one_at_the_start_is_an_error():
     parameters = one_gaussian()
-    guard = Safeguard(parameters, level=1.0)
+    guard = DivergenceGuard(parameters, level=1.0)
     best = parameters.values.copy()
     assert guard.step(0.5, 1.0)
     parameters.gradients[2] = np.nan
@@ -212,13 +208,13 @@ def test_a_bad_gradient_after_good_steps_goes_back_and_one_at_the_start_is_an_er
     assert np.array_equal(parameters.values, best)
     parameters.gradients[2] = np.nan
     with pytest.raises(NumericalError):
-        Safeguard(parameters, level=1.0).step(0.5, 1.0)
+        DivergenceGuard(parameters, level=1.0).step(0.5, 1.0)
 
 
 def test_a_fit_ends_at_its_best_state_if_it_never_came_back_to_it():
     parameters = one_gaussian()
     parameters.gradients[:] = 1.0
-    guard = Safeguard(parameters, level=1.0)
+    guard = DivergenceGuard(parameters, level=1.0)
     best = parameters.values.copy()
     guard.step(0.5, 1.0)
     guard.step(5.0, 1.0)
@@ -229,7 +225,7 @@ def test_a_fit_ends_at_its_best_state_if_it_never_came_back_to_it():
 
 def test_a_small_rise_is_no_reason_to_go_back():
     parameters = one_gaussian()
-    guard = Safeguard(parameters, level=1.0)
+    guard = DivergenceGuard(parameters, level=1.0)
     assert guard.step(0.010, 1.0)
     assert guard.step(0.100, 1.0)  # ten times, but nothing beside the pixels
     assert guard.step(0.159, 1.0)
@@ -256,9 +252,13 @@ def test_annealing_in_one_step_fits(tau: float, tally):
     prior = VolumeTarget.of(guess, mask.astype(np.float32), grid)
     with tally.case():
         result = fit(
-            seeded(), slices_of_small_head()[0], prior, n_steps=10, prior_error=0.0,
+            seeded(),
+            slices_of_small_head()[0],
+            prior,
+            n_steps=10,
+            prior_error=0.0,
             distillation=AnnealedWeight(0.5, 0.1, tau, tau),
-        )  # fmt: skip
+        )
         assert_finite(result)
         weights = [entry["distillation_weight"] for entry in result.history]
         assert weights == [0.5 if n / 10 < tau else 0.1 for n in range(10)]

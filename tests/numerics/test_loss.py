@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
-from g3r.fitting.bias_field import StackShading
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.parameters import FitParameters
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight
@@ -23,12 +23,17 @@ from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings, _blocks
 from g3r.gaussians import GaussianCloud, render
 from studies.numerics.scenes import head_scene, single
 
-CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "peak")
+CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
 STEP = 1e-5
 SETTINGS = SliceStageSettings(
-    scale_weight=0.3, shading_ridge=0.05, pose_prior_mm=2.0, cutoff_sigma=6.0, prior_error=0.05,
-    distillation=AnnealedWeight(0.4, 0.1), distillation_planes=0.4,
-)  # fmt: skip
+    scale_weight=0.3,
+    bias_field_ridge=0.05,
+    pose_prior_mm=2.0,
+    cutoff_sigma=6.0,
+    prior_error=0.05,
+    distillation=AnnealedWeight(0.4, 0.1),
+    distillation_planes=0.4,
+)
 FRACTION = 0.5
 
 
@@ -43,19 +48,27 @@ class CompleteLoss:
         planes = replace(planes, shape=np.full((6, 2), 16), spacing_mm=np.full((6, 2), 1.4))
         mask = rng.uniform(size=planes.n_pixels) < 0.8
         slices = Slices(
-            planes, np.zeros(planes.n_pixels, np.float32), mask, np.repeat(np.arange(3), 2),
-            np.tile([0, 1], 3), np.full(6, 2.2), planes.pose,
-        )  # fmt: skip
-        self.gain, self.trust = np.exp(rng.normal(0, 0.1, 6)), rng.uniform(0.2, 1, 6)
-        self.shading = StackShading(slices)
-        self.parameters = FitParameters(
-            cloud, SETTINGS.rates, _blocks(slices, self.gain, self.shading, SETTINGS)
+            planes,
+            np.zeros(planes.n_pixels, np.float32),
+            mask,
+            np.repeat(np.arange(3), 2),
+            np.tile([0, 1], 3),
+            np.full(6, 2.2),
+            planes.pose,
         )
+        self.gain, self.slice_weight = np.exp(rng.normal(0, 0.1, 6)), rng.uniform(0.2, 1, 6)
+        self.bias_field = StackBiasField(slices)
+        self.parameters = FitParameters(cloud, SETTINGS.rates, _blocks(slices, self.gain, self.bias_field, SETTINGS))
         self.seed = self.parameters.value["log_scale"].astype(float).copy()
         for name, size in {
-            "mean_mm": 0.3, "log_scale": 0.2, "quaternion_wxyz": 0.2, "turn": 0.1, "shift": 0.4,
-            "log_gain": 0.2, "shading": 0.2,
-        }.items():  # fmt: skip
+            "mean_mm": 0.3,
+            "log_scale": 0.2,
+            "quaternion_wxyz": 0.2,
+            "turn": 0.1,
+            "shift": 0.4,
+            "log_gain": 0.2,
+            "shading": 0.2,
+        }.items():
             value = self.parameters.value[name]
             value += rng.normal(0, size, value.shape).astype(np.float32)
         self.prior = self._prior(rng)
@@ -63,7 +76,7 @@ class CompleteLoss:
         away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.4, planes.n_pixels)
         self.slices = replace(slices, value=(self._shown(self._values()) + away).astype(np.float32))
         self.loss = SliceLoss(
-            self.parameters, self.slices, self.gain, self.trust, self.shading, self.prior, SETTINGS
+            self.parameters, self.slices, self.gain, self.slice_weight, self.bias_field, self.prior, SETTINGS
         )
         self.loss.objective.seed_log_scale[...] = self.seed  # the fit is under way
         self.loss.draw(np.random.default_rng(seed))
@@ -78,9 +91,12 @@ class CompleteLoss:
         n = 6
         spacing = np.full((n, 2), 1.9)
         planes = Planes(
-            np.tile(np.eye(3), (n, 1, 1)), np.array([[0, 0, z] for z in np.linspace(-6, 6, n)]), spacing,
-            np.full((n, 2), 11), np.zeros((n, 3)),
-        )  # fmt: skip
+            np.tile(np.eye(3), (n, 1, 1)),
+            np.array([[0, 0, z] for z in np.linspace(-6, 6, n)]),
+            spacing,
+            np.full((n, 2), 11),
+            np.zeros((n, 3)),
+        )
         shown = render(self._cloud(self._values()), planes, backend="reference").numpy()
         away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.3, planes.n_pixels)
         weight = rng.uniform(0, 1, planes.n_pixels) * (rng.uniform(size=planes.n_pixels) < 0.7)
@@ -93,12 +109,12 @@ class CompleteLoss:
         pixels = render(self._cloud(value), moved, backend="reference").numpy()
         plane = planes.plane_id()
         gain = np.exp(value["log_gain"] - value["log_gain"].mean())[plane]
-        field = (value["shading"][self.slices.stack_id[plane]] * self.shading.basis.T.astype(float)).sum(1)
+        field = (value["shading"][self.slices.stack_id[plane]] * self.bias_field.basis.T.astype(float)).sum(1)
         return pixels * gain * np.exp(field)
 
     def float64(self, value: dict[str, np.ndarray], frozen: float | None = None) -> float:
         """The loss; `frozen` is the image term where it stands as a weight and has no gradient."""
-        weight = self.slices.mask * self.trust[self.slices.planes.plane_id()]
+        weight = self.slices.mask * self.slice_weight[self.slices.planes.plane_id()]
         image = (weight * np.abs(self._shown(value) - self.slices.value)).sum() / weight.sum()
         frozen = image if frozen is None else frozen
         self.image = image
@@ -114,7 +130,7 @@ class CompleteLoss:
         radius = np.sqrt((half**2).sum(1)).mean() / 2
         moved = (value["shift"] ** 2).sum(1) + radius**2 * (value["turn"] ** 2).sum(1)
         loss += frozen * moved.mean() / SETTINGS.pose_prior_mm**2
-        return float(loss + SETTINGS.shading_ridge * (value["shading"] ** 2).mean())
+        return float(loss + SETTINGS.bias_field_ridge * (value["shading"] ** 2).mean())
 
     def _is_chosen(self) -> np.ndarray:
         drawn = self.loss.distilled.planes.center_mm[:, 2]
@@ -159,16 +175,17 @@ def test_a_wrong_term_would_be_seen(tally):
     complete = CompleteLoss(0)
     complete.loss.evaluate(FRACTION)
     for name, change in {
-        "scale": {"scale_weight": 0.0}, "poses": {"pose_prior_mm": 1e9}, "shading": {"shading_ridge": 0.0},
+        "scale": {"scale_weight": 0.0},
+        "poses": {"pose_prior_mm": 1e9},
+        "shading": {"bias_field_ridge": 0.0},
         "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
-    }.items():  # fmt: skip
+    }.items():
         before = {n: g.copy() for n, g in complete.parameters.gradient.items()}
         complete.loss.settings = replace(SETTINGS, **change)
         complete.loss.objective.scale_weight = complete.loss.settings.scale_weight
         complete.loss.evaluate(FRACTION)
         moved = [
-            np.linalg.norm(g - before[n]) / np.linalg.norm(before[n])
-            for n, g in complete.parameters.gradient.items()
+            np.linalg.norm(g - before[n]) / np.linalg.norm(before[n]) for n, g in complete.parameters.gradient.items()
         ]
         assert max(moved) > 1e-2, name
         complete.loss.settings = SETTINGS

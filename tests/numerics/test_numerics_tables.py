@@ -58,7 +58,7 @@ def test_values_by_axis_ratio(tally):
 def test_gradients_by_axis_ratio(tally):
     rows = gradient_rows()
     for row in rows:
-        for name in ("centre", "shape", "peak", "turn", "shift", "gain"):
+        for name in ("centre", "shape", "amplitude", "turn", "shift", "gain"):
             with tally.case():
                 assert row[name] <= gradient_tolerance(row["ratio"]), (name, row)
     assert_written("gradient", numerics.gradient_table(rows), 8.0)
@@ -82,7 +82,7 @@ def test_what_samples_show_of_gaussians_below_a_pixel(tally):
         for name in ("volume", "slices"):
             with tally.case():
                 low, high = row[f"{name} lower bound"], row[f"{name} upper bound"]
-                # the exponential is good to 2e-7 of a peak, and a peak shows `high` times the mass
+                # the exponential is good to 2e-7 of a amplitude, and a amplitude shows `high` times the mass
                 assert row[f"{name} least"] >= low * (1 - 1e-5) - 3e-6 * max(1.0, high)
                 assert row[f"{name} most"] <= high * (1 + 1e-4)
                 # and the bounds are reached: on a sample, and between samples
@@ -121,9 +121,7 @@ def test_the_document_has_every_table(name: str):
 
 def test_the_command_writes_a_table_between_its_markers(tmp_path: Path, capsys):
     document = tmp_path / "numerics.md"
-    document.write_text(
-        "before\n<!-- numerics-distance:begin -->\nold\n<!-- numerics-distance:end -->\nafter\n"
-    )
+    document.write_text("before\n<!-- numerics-distance:begin -->\nold\n<!-- numerics-distance:end -->\nafter\n")
     options = ["--only", "distance", "--docs", str(document), "--output", str(tmp_path / "out")]
     assert numerics.main(options) == 0
     text = document.read_text()

@@ -51,11 +51,15 @@ def test_poses_under_autocast_are_those_without(tally):
     network.set_template(torch.rand(2, 6, 6, 6))
     n = 6
     batch = {
-        "image": torch.rand(n, 1, 40, 40), "stack": torch.tensor([0, 0, 1, 1, 2, 2]),
-        "set_of_stack": torch.tensor([0, 0, 0]), "header_rotation": torch.eye(3).expand(n, 3, 3),
-        "position_mm": torch.arange(n) * 2.0, "thickness_mm": torch.full((n,), 2.0),
-        "area_mm2": torch.full((n,), 900.0), "time_rank": torch.linspace(0, 1, n),
-    }  # fmt: skip
+        "image": torch.rand(n, 1, 40, 40),
+        "stack": torch.tensor([0, 0, 1, 1, 2, 2]),
+        "set_of_stack": torch.tensor([0, 0, 0]),
+        "header_rotation": torch.eye(3).expand(n, 3, 3),
+        "position_mm": torch.arange(n) * 2.0,
+        "thickness_mm": torch.full((n,), 2.0),
+        "area_mm2": torch.full((n,), 900.0),
+        "time_rank": torch.linspace(0, 1, n),
+    }
     with torch.no_grad():
         plain = network(batch)
         with tally.case():
@@ -72,9 +76,7 @@ def test_points_and_rotations_of_training_keep_float32(tally):
     matrix, points = torch.randn(5, 3, 3, generator=rng), 25 * torch.randn(4, 3, generator=rng)
     rotation, shift = nearest_rotation(matrix), torch.randn(5, 3, generator=rng)
     with tally.case(), torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(
-            moved_points(rotation, shift, points), moved_points_plainly(rotation, shift, points)
-        )
+        assert torch.equal(moved_points(rotation, shift, points), moved_points_plainly(rotation, shift, points))
         again = nearest_rotation(matrix)
         assert again.dtype == torch.float32
         assert (again - rotation).abs().max() < 1e-6

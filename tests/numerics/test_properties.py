@@ -11,16 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import find_pairs, render, solve_peaks
+from g3r.gaussians import find_overlaps, render, solve_amplitudes
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
 from studies.numerics.errors import shape_tolerance
 from studies.numerics.scenes import Scene, cloud_of, single
 
 QUICK = settings(
-    max_examples=40, deadline=None, derandomize=True,
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)  # fmt: skip
+)
 
 
 @st.composite
@@ -34,36 +36,37 @@ def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
     origin = rng.normal(size=3) * far
     spread = np.exp(draw(st.floats(-2, 4)))
     sigma = np.exp(rng.uniform(low, high, (n, 3)))
-    cloud = cloud_of(
-        rng.normal(0, spread, (n, 3)), sigma, rng.normal(size=(n, 4)), rng.normal(size=n), origin
-    )
+    cloud = cloud_of(rng.normal(0, spread, (n, 3)), sigma, rng.normal(size=(n, 4)), rng.normal(size=n), origin)
     spacing = np.exp(rng.uniform(np.log(0.3), np.log(3), (n_planes, 2)))
     thickness = np.exp(rng.uniform(np.log(0.1), np.log(20), n_planes))
     psf = psf_variance_mm2(spacing, thickness) * draw(st.sampled_from([0.0, 1.0]))
     planes = Planes(
-        Rotation.random(n_planes, rng=rng).as_matrix(), origin + rng.normal(0, spread, (n_planes, 3)),
-        spacing, rng.integers(1, 40, (n_planes, 2)), psf,
-    )  # fmt: skip
+        Rotation.random(n_planes, rng=rng).as_matrix(),
+        origin + rng.normal(0, spread, (n_planes, 3)),
+        spacing,
+        rng.integers(1, 40, (n_planes, 2)),
+        psf,
+    )
     ratio = float((sigma.max(1) / sigma.min(1)).max()) if n else 1.0
     return Scene(cloud, planes), ratio
 
 
-@given(scenes(), st.sampled_from(["numba", "objective", "peaks", "reference32"]))
+@given(scenes(), st.sampled_from(["numba", "objective", "amplitudes", "reference32"]))
 @QUICK
 def test_random_scenes_agree_with_the_reference(tally, scene_and_ratio, backend: str):
     scene, ratio = scene_and_ratio
     weight = torch.tensor(np.random.default_rng(0).normal(size=scene.planes.n_pixels))
     expected, exact_gradient = BACKENDS["reference64"](scene.cloud, scene.planes, weight)
-    height = float(scene.cloud.peak.abs().sum())
+    height = float(scene.cloud.amplitude.abs().sum())
     with tally.case():
         found, gradient = BACKENDS[backend](scene.cloud, scene.planes, weight)
         if len(found):
             assert float((found - expected).abs().max()) <= shape_tolerance(ratio) * height + 2e-8 * height
         for name, g in gradient.items():
             assert torch.isfinite(g).all(), name
-        # the gradient in peaks is the image of one Gaussian against the weights: bounded by their sum
+        # the gradient in amplitudes is the image of one Gaussian against the weights: bounded by their sum
         total = float(weight.abs().sum())
-        error = (gradient["peak"] - exact_gradient["peak"]).abs().max() if len(scene.cloud) else 0.0
+        error = (gradient["amplitude"] - exact_gradient["amplitude"]).abs().max() if len(scene.cloud) else 0.0
         assert float(error) <= (shape_tolerance(ratio) + 2e-8) * total
 
 
@@ -72,14 +75,14 @@ def test_random_scenes_agree_with_the_reference(tally, scene_and_ratio, backend:
 def test_images_are_linear_in_the_peaks(tally, scene_and_ratio, factor: float, seed: int):
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
-    other = cloud.with_peak(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
-    pairs = find_pairs(cloud, scene.planes, 3.2)
+    other = cloud.with_amplitude(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
+    pairs = find_overlaps(cloud, scene.planes, 3.2)
     with tally.case():
         first, second, both = (
             render(c, scene.planes, pairs=pairs)
-            for c in (cloud, other, cloud.with_peak(cloud.peak + factor * other.peak))
+            for c in (cloud, other, cloud.with_amplitude(cloud.amplitude + factor * other.amplitude))
         )
-        size = float(cloud.peak.abs().sum() + abs(factor) * other.peak.abs().sum())
+        size = float(cloud.amplitude.abs().sum() + abs(factor) * other.amplitude.abs().sum())
         assert float((first + factor * second - both).abs().max()) <= 2e-6 * size
 
 
@@ -91,8 +94,8 @@ def test_least_squares_never_leaves_the_numbers_nor_fits_worse(tally, scene_and_
     target = np.random.default_rng(1).normal(size=scene.planes.n_pixels).astype(np.float32)
     weight = np.ones_like(target)
     with tally.case():
-        found = solve_peaks(cloud, scene.planes, target, weight, n_iterations=6)
-        assert torch.isfinite(found.peak).all()
+        found = solve_amplitudes(cloud, scene.planes, target, weight, n_iterations=6)
+        assert torch.isfinite(found.amplitude).all()
         errors = [float(((render(c, scene.planes).numpy() - target) ** 2).sum()) for c in (cloud, found)]
         assert errors[1] <= errors[0] * (1 + 1e-4)
 
@@ -108,9 +111,7 @@ def poses(draw: st.DrawFn) -> RigidPose:
     n = draw(st.integers(1, 5))
     axis = rng.normal(size=(n, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    return RigidPose.from_rotvec(
-        axis * draw(ANGLES), rng.normal(size=(n, 3)) * draw(st.sampled_from([0, 1, 1e4]))
-    )
+    return RigidPose.from_rotvec(axis * draw(ANGLES), rng.normal(size=(n, 3)) * draw(st.sampled_from([0, 1, 1e4])))
 
 
 def assert_near(a: RigidPose, b: RigidPose, scale_mm: float = 1.0) -> None:

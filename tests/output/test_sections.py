@@ -28,9 +28,7 @@ def columns(image):
     """The three panels of a one-row picture, found by thirds of equal mm scale (widths 80, 80, 100 mm)."""
     left, right = 0.06 * image.shape[1], 0.92 * image.shape[1]
     edges = left + (right - left) * np.cumsum([0, 80, 80, 100]) / 260
-    return [
-        image[int(0.15 * len(image)) : int(0.85 * len(image)), int(a) : int(b)] for a, b in pairwise(edges)
-    ]
+    return [image[int(0.15 * len(image)) : int(0.85 * len(image)), int(a) : int(b)] for a, b in pairwise(edges)]
 
 
 def side(panel):

@@ -17,10 +17,17 @@ def test_quality_with_the_default_preset(shared_data: Path, tmp_path: Path, case
     if not folder.is_dir():
         pytest.skip(f"{case} is not among the test data")
     command = [
-        sys.executable, "-m", "g3r.cli.infer", "--stacks", *sorted(map(str, folder.glob("stack-*.nii.gz"))),
-        "--masks", *sorted(map(str, folder.glob("mask-*.nii.gz"))), "--output", str(tmp_path / "out"),
+        sys.executable,
+        "-m",
+        "g3r.cli.infer",
+        "--stacks",
+        *sorted(map(str, folder.glob("stack-*.nii.gz"))),
+        "--masks",
+        *sorted(map(str, folder.glob("mask-*.nii.gz"))),
+        "--output",
+        str(tmp_path / "out"),
         "--quiet",
-    ]  # fmt: skip
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     reference = load_volume(folder / "truth.nii.gz")

@@ -6,7 +6,7 @@ import numpy as np
 
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose
-from g3r.output.record import left_out_terms
+from g3r.output.record import inactive_terms
 from g3r.planning.presets import PRESETS
 
 
@@ -21,7 +21,7 @@ def slices_of(stacks: list[int]) -> Slices:
 
 
 def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:
-    return {entry["term"]: entry["reason"] for entry in left_out_terms(slices, settings, counts or {})}
+    return {entry["term"]: entry["reason"] for entry in inactive_terms(slices, settings, counts or {})}
 
 
 def test_two_stacks_of_slices_determine_everything():
@@ -37,15 +37,12 @@ def test_a_single_slice_has_neither_gain_nor_shading():
 def test_settings_and_a_missing_prior_are_named():
     base = PRESETS["balanced"]
     still = replace(
-        base, use_prior=False,
-        slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_shading=False),
-    )  # fmt: skip
+        base, use_prior=False, slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_bias_field=False)
+    )
     found = terms(slices_of([0, 1]), still)
     assert set(found) == {"shading", "poses in the fit", "distance to the prior"}
     assert "drifts" in terms(slices_of([0, 0]), still)["poses in the fit"]
-    assert (
-        "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
-    )
+    assert "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
 
 
 def test_the_bound_says_why_there_are_no_more_gaussians():

@@ -19,7 +19,7 @@ from g3r.cli import infer
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import FitStart
 from g3r.planning.memory_estimate import estimate_memory
-from g3r.planning.memory_limit import LEAST_RECORD_BYTES, PLANNED_HALO_VOXELS, plan_memory
+from g3r.planning.memory_limit import MIN_PROJECTION_BYTES, PLANNED_HALO_VOXELS, plan_memory
 from g3r.planning.memory_size import gigabytes, parsed_size
 from g3r.planning.presets import PRESETS
 from g3r.planning.time_budget import TimeBudget
@@ -49,10 +49,18 @@ def slices(stacks: list[Stack]) -> Slices:
 
 def arguments(subject: Path, output: Path, *more: str) -> list[str]:
     return [
-        "--stacks", *[str(subject / f"stack-{n}.nii.gz") for n in range(3)],
-        "--masks", *[str(subject / f"mask-{n}.nii.gz") for n in range(3)], "--thickness", "4",
-        "--resolution", "1.5", "--output", str(output), *more,
-    ]  # fmt: skip
+        "--stacks",
+        *[str(subject / f"stack-{n}.nii.gz") for n in range(3)],
+        "--masks",
+        *[str(subject / f"mask-{n}.nii.gz") for n in range(3)],
+        "--thickness",
+        "4",
+        "--resolution",
+        "1.5",
+        "--output",
+        str(output),
+        *more,
+    ]
 
 
 QUIETLY = ("--preset", "draft", "--threads", "1", "--quiet")
@@ -70,9 +78,16 @@ def volume_in(folder: Path) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("text", "size"),
-    [("1000000", MB), ("1500M", 1500 * MB), ("2G", 2000 * MB), ("2.5GB", 2500 * MB), (" 3 g ", 3000 * MB),
-     ("750K", 750_000), ("0.5t", 500_000 * MB)],
-)  # fmt: skip
+    [
+        ("1000000", MB),
+        ("1500M", 1500 * MB),
+        ("2G", 2000 * MB),
+        ("2.5GB", 2500 * MB),
+        (" 3 g ", 3000 * MB),
+        ("750K", 750_000),
+        ("0.5t", 500_000 * MB),
+    ],
+)
 def test_sizes_as_people_write_them(text: str, size: int):
     assert parsed_size(text) == size
 
@@ -84,12 +99,7 @@ def test_what_is_no_size(text: str):
 
 
 def test_sizes_for_people_are_rounded_up():
-    assert [gigabytes(n) for n in (1, 1.1e9, 1.101e9, 2.345e10)] == [
-        "0.01 GB",
-        "1.10 GB",
-        "1.11 GB",
-        "23.45 GB",
-    ]
+    assert [gigabytes(n) for n in (1, 1.1e9, 1.101e9, 2.345e10)] == ["0.01 GB", "1.10 GB", "1.11 GB", "23.45 GB"]
     assert parsed_size(gigabytes(987_654_321)) >= 987_654_321  # what is said can be typed
 
 
@@ -144,9 +154,9 @@ def test_records_are_given_up_where_the_fit_needs_most(slices: Slices):
     free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
     assert free.stage == "fit to slices"
     plan = plan_memory(slices, many, free.peak - 60 * MB, process_bytes=PROCESS)
-    kept = plan.settings.slice_stage.record_bytes
-    assert LEAST_RECORD_BYTES <= kept < many.slice_stage.record_bytes
-    assert plan.settings.prior_stage.record_bytes == kept
+    kept = plan.settings.slice_stage.projection_bytes
+    assert MIN_PROJECTION_BYTES <= kept < many.slice_stage.projection_bytes
+    assert plan.settings.prior_stage.projection_bytes == kept
     assert any("pairs kept in" in change for change in plan.changes)
 
 
@@ -172,18 +182,14 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
     assert not (tmp_path / "out").exists()
 
 
-def test_a_small_limit_is_refused_in_one_line(
-    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_small_limit_is_refused_in_one_line(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     given = arguments(subject, tmp_path / "out")
     assert infer.main([*given, "--max-memory", "200M"]) == 3
     said = capsys.readouterr()
     assert said.out == ""
     (line,) = said.err.splitlines()
     assert line.startswith("g3r-infer: --max-memory: needs at least ")
-    assert line.endswith(
-        "the limit is 0.20 GB; choose a coarser --resolution, crop the masks, or raise --max-memory"
-    )
+    assert line.endswith("the limit is 0.20 GB; choose a coarser --resolution, crop the masks, or raise --max-memory")
     assert not (tmp_path / "out").exists()
     with pytest.raises(SystemExit, match="2"):
         infer.main([*given, "--max-memory", "plenty"])
@@ -228,15 +234,18 @@ def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun,
 
 def test_a_time_budget_keeps_what_was_planned(slices: Slices):
     planned = replace(
-        PRESETS["accurate"], use_prior=False, prior_whole_voxels=0, prior_tile_voxels=32,
-        prior_stage=replace(DRAFT.prior_stage, record_bytes=30 * MB),
-        slice_stage=replace(DRAFT.slice_stage, record_bytes=30 * MB),
-    )  # fmt: skip
+        PRESETS["accurate"],
+        use_prior=False,
+        prior_whole_voxels=0,
+        prior_tile_voxels=32,
+        prior_stage=replace(DRAFT.prior_stage, projection_bytes=30 * MB),
+        slice_stage=replace(DRAFT.slice_stage, projection_bytes=30 * MB),
+    )
     ones = np.ones(len(slices))
     start = FitStart.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
     budget = TimeBudget.of(30.0)
-    settings, _ = budget.for_motion(planned)
+    settings, _ = budget.for_registration(planned)
     settings = budget.for_prior(settings, 0.1)
     settings, _, _ = budget.for_fit(settings, start, start.sharp, 0.1, 1000, np.random.default_rng(0))
-    assert settings.prior_stage.record_bytes == settings.slice_stage.record_bytes == 30 * MB
+    assert settings.prior_stage.projection_bytes == settings.slice_stage.projection_bytes == 30 * MB
     assert (settings.prior_whole_voxels, settings.prior_tile_voxels) == (0, 32)

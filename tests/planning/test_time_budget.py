@@ -10,7 +10,7 @@ import pytest
 from data_synth.cli import main as simulate
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.planning.presets import PRESETS
-from g3r.planning.time_budget import MOTION_FROM_S, TimeBudget, fit_seconds
+from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
 from g3r.run.deadline import Deadline
 
@@ -57,11 +57,11 @@ def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool):
 
 
 def test_more_time_never_means_a_shorter_registration():
-    order = list(MOTION_FROM_S)
+    order = list(REGISTRATION_FROM_S)
     chosen = []
     for seconds in (1, 10, 21, 22, 39, 40, 100, 120, 1000):
         one = budget(seconds)
-        one.for_motion(SETTINGS)
+        one.for_registration(SETTINGS)
         chosen.append(order.index(one.choices["motion"]))
     assert chosen == sorted(chosen)
     assert chosen[0] == 0
@@ -70,9 +70,9 @@ def test_more_time_never_means_a_shorter_registration():
 
 def test_registration_keeps_the_space_and_the_seed_that_were_asked_for():
     motion = replace(SETTINGS.motion, standard_orientation=False, seed=7)
-    settings, deadline = budget(60.0).for_motion(replace(SETTINGS, motion=motion))
-    assert settings.motion.seed == 7
-    assert not settings.motion.standard_orientation
+    settings, deadline = budget(60.0).for_registration(replace(SETTINGS, motion=motion))
+    assert settings.registration.seed == 7
+    assert not settings.registration.standard_orientation
     assert 0 < deadline.remaining_s < 60
 
 

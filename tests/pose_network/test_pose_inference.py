@@ -42,9 +42,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def meta(network):
-    template = AtlasTemplate(
-        np.zeros(SHAPE, np.float32), centred_grid(SHAPE, 3.0).affine, np.array([25.0, 31])
-    )
+    template = AtlasTemplate(np.zeros(SHAPE, np.float32), centred_grid(SHAPE, 3.0).affine, np.array([25.0, 31]))
     return PoseCheckpoint(network.arguments(), template, "nothing")
 
 
@@ -71,9 +69,14 @@ def slices() -> Slices:
 def moved_headers(slices: Slices, motion: RigidPose) -> Slices:
     header = motion @ slices.header_pose
     return Slices(
-        slices.planes.with_pose(header), slices.value, slices.mask, slices.stack_id, slices.slice_index,
-        slices.thickness_mm, header,
-    )  # fmt: skip
+        slices.planes.with_pose(header),
+        slices.value,
+        slices.mask,
+        slices.stack_id,
+        slices.slice_index,
+        slices.thickness_mm,
+        header,
+    )
 
 
 def assert_same(one: RigidPose, other: RigidPose, tolerance_mm: float) -> None:
@@ -102,9 +105,14 @@ def test_the_order_does_not_matter(network, meta, slices):
 
 def test_numbers_of_stacks_do_not_matter(network, meta, slices):
     renamed = Slices(
-        slices.planes, slices.value, slices.mask, 7 - 2 * slices.stack_id, slices.slice_index,
-        slices.thickness_mm, slices.header_pose,
-    )  # fmt: skip
+        slices.planes,
+        slices.value,
+        slices.mask,
+        7 - 2 * slices.stack_id,
+        slices.slice_index,
+        slices.thickness_mm,
+        slices.header_pose,
+    )
     assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, renamed), 1e-3)
 
 
@@ -118,8 +126,8 @@ def test_cropping_does_not_matter(network, meta, slices):
         blank = [np.zeros(2 * n, values.dtype) for n in width]  # two rows more on one side, not in the mask
         return np.concatenate([np.concatenate([values[at], b]) for at, b in zip(parts, blank, strict=True)])
 
-    shift_mm = np.stack([planes.spacing_mm[:, 0], 0 * width, 0 * width], 1)
-    frame = RigidPose.from_rotvec(np.zeros((len(slices), 3)), shift_mm)
+    translation_mm = np.stack([planes.spacing_mm[:, 0], 0 * width, 0 * width], 1)
+    frame = RigidPose.from_rotvec(np.zeros((len(slices), 3)), translation_mm)
     header = slices.header_pose @ frame
     wider = dataclasses.replace(planes, shape=planes.shape + np.array([2, 0])).with_pose(header)
     other = dataclasses.replace(
@@ -146,10 +154,7 @@ def test_a_slice_turned_over_is_the_same_slice(network, slices, view):
 
 def test_mean_pose_leaves_one_wrong_view_aside(rng):
     true = RigidPose(Rotation.random(7, random_state=0).as_matrix(), rng.normal(0, 20, (7, 3)))
-    views = [
-        RigidPose.from_rotvec(rng.normal(0, 0.02, (7, 3)), rng.normal(0, 0.5, (7, 3))) @ true
-        for _ in range(3)
-    ]
+    views = [RigidPose.from_rotvec(rng.normal(0, 0.02, (7, 3)), rng.normal(0, 0.5, (7, 3))) @ true for _ in range(3)]
     wrong = RigidPose.from_rotvec(np.full((7, 3), [0, 0, 2.5]), np.full((7, 3), 9.0)) @ true
     mean = mean_pose(
         np.stack([p.rotation for p in (*views, wrong)]), np.stack([p.translation_mm for p in (*views, wrong)])
@@ -159,9 +164,7 @@ def test_mean_pose_leaves_one_wrong_view_aside(rng):
 
 
 def test_scale_of_intensities_does_not_matter(network, meta, slices):
-    assert_same(
-        predict_poses(network, meta, slices), predict_poses(network, meta, slices.scaled(1000.0)), 0.01
-    )
+    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, slices.scaled(1000.0)), 0.01)
 
 
 def test_a_single_slice(network, meta, slices):
@@ -181,8 +184,7 @@ def test_quick_enough():
     )
     meta = PoseCheckpoint(network.arguments(), template, "nothing")
     stacks = [
-        blob_stack(turn, seed, (70, 70, 44))
-        for seed, turn in enumerate(Rotation.random(6, random_state=1).as_matrix())
+        blob_stack(turn, seed, (70, 70, 44)) for seed, turn in enumerate(Rotation.random(6, random_state=1).as_matrix())
     ]
     slices = slices_from_stacks(stacks)
     start = time.process_time()

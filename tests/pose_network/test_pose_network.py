@@ -56,9 +56,7 @@ def lively_network(**changes):
 
 def test_nearest_rotation_and_its_gradient():
     matrix = rotations(6) + 0.3 * torch.randn(6, 3, 3, dtype=torch.float64)
-    matrix[0] = rotations(1)[0] @ torch.diag(
-        torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
-    )  # a triple value
+    matrix[0] = rotations(1)[0] @ torch.diag(torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64))  # a triple value
     matrix.requires_grad_()
     nearest = nearest_rotation(matrix)
     torch.testing.assert_close(nearest @ nearest.transpose(1, 2), torch.eye(3).double().expand(6, 3, 3))

@@ -121,9 +121,7 @@ def test_receptive_radius_is_an_upper_bound():
     assert refiner.receptive_radius_voxels // 2 < reach <= refiner.receptive_radius_voxels
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"channels": ()}, {"units": (1, 1)}, {"channels": (8, 0, 8)}, {"tail_channels": 0}]
-)
+@pytest.mark.parametrize("wrong", [{"channels": ()}, {"units": (1, 1)}, {"channels": (8, 0, 8)}, {"tail_channels": 0}])
 def test_networks_without_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="one positive entry per level"):
         ResidualRefiner(**{**SMALL, **wrong})

@@ -75,10 +75,7 @@ REFUSALS = {
     ),
     "another format version": (change(format_version=2), "format version is 2"),
     "density per millimetre": (change(density_convention="per-mm"), "density convention is 'per-mm'"),
-    "no density convention": (
-        lambda content: content.pop("density_convention"),
-        "density convention is None",
-    ),
+    "no density convention": (lambda content: content.pop("density_convention"), "density convention is None"),
     "another intensity": (change(intensity_convention="max"), "intensity convention is 'max'"),
     "a missing entry": (lambda content: content.pop("training_data"), "'training_data' is missing"),
     "voxels of 0 mm": (change(voxel_mm=0.0), "voxel size is 0.0 mm"),
@@ -90,10 +87,7 @@ REFUSALS = {
         lambda content: content["network_arguments"].update(channels=[8, 16]),
         "do not fit together",
     ),
-    "an unknown argument": (
-        lambda content: content["network_arguments"].update(depth=3),
-        "do not fit together",
-    ),
+    "an unknown argument": (lambda content: content["network_arguments"].update(depth=3), "do not fit together"),
     "an absurd gate": (
         lambda content: (content["network_arguments"].update(alpha=7.0), content.update(alpha=7.0)),
         "do not fit together",
@@ -118,9 +112,7 @@ def test_refusal_of_an_altered_file(saved, tmp_path, case):
 
 def test_refusal_of_another_voxel_size_than_wanted(saved):
     assert load_prior(saved, 0.8)[1].voxel_mm == 0.8
-    with pytest.raises(
-        InputError, match=r"voxels of 0\.8 mm, expected 1 mm; pass another .* --prior-voxel 0\.8"
-    ):
+    with pytest.raises(InputError, match=r"voxels of 0\.8 mm, expected 1 mm; pass another .* --prior-voxel 0\.8"):
         load_prior(saved, 1.0)
 
 
@@ -161,9 +153,7 @@ def test_refusal_of_a_bare_tensor(tmp_path):
 
 
 def test_refusal_of_an_object_that_would_run_code(tmp_path):
-    torch.save(
-        {"format": "g3r-prior", "network": DensityGatedPriorNetwork((8,), (1,), 4)}, tmp_path / "object.pt"
-    )
+    torch.save({"format": "g3r-prior", "network": DensityGatedPriorNetwork((8,), (1,), 4)}, tmp_path / "object.pt")
     assert_refused(tmp_path / "object.pt", "is damaged or not written by g3r-export")
 
 

@@ -67,13 +67,7 @@ def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: Residua
 
 @pytest.mark.parametrize(
     ("shape", "edge", "halo"),
-    [
-        ((50, 64, 40), 16, 8),
-        ((50, 64, 40), 16, 0),
-        ((37, 20, 90), 24, 8),
-        ((16, 16, 16), 16, 8),
-        ((9, 9, 9), 4, 40),
-    ],
+    [((50, 64, 40), 16, 8), ((50, 64, 40), 16, 0), ((37, 20, 90), 24, 8), ((16, 16, 16), 16, 8), ((9, 9, 9), 4, 40)],
 )
 def test_tiles_have_one_shape_and_cover_everything_once(shape: tuple[int, ...], edge: int, halo: int):
     covered = torch.zeros(shape, dtype=torch.int64)

@@ -7,11 +7,11 @@ from data_synth.heads import PhantomSubject
 from data_synth.motion import LEVELS
 from data_synth.phantom import Phantom, fetal_brain_phantom
 from data_synth.simulator import SimulatedStack
-from data_synth.template import mean_heads
+from data_synth.template import atlas_templates
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration import MotionSettings, estimate_motion
+from g3r.registration import RegistrationSettings, register
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +35,7 @@ def still_slices(still: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
 def template() -> AtlasTemplate:
     """Mean heads of other phantoms, about as old and older."""
     subjects = [PhantomSubject(f"week-{w}-{seed}", w, seed) for w in (24.0, 31.0) for seed in (1, 2, 3)]
-    return mean_heads(subjects, 3.0, weeks=(24, 31))
+    return atlas_templates(subjects, 3.0, weeks=(24, 31))
 
 
 @pytest.fixture(scope="session")
@@ -44,8 +44,10 @@ def moving(head: Phantom, template: AtlasTemplate) -> Moving:
     stacks = simulated(head, LEVELS["severe"], seed=2)
     slices, truth = as_slices(stacks)
     calls: list[tuple[int, int]] = []
-    estimate = estimate_motion(
-        slices, MotionSettings(n_rounds=4, finest_voxel_mm=1.8),
-        lambda done, total: calls.append((done, total)), template=template,
-    )  # fmt: skip
+    estimate = register(
+        slices,
+        RegistrationSettings(n_rounds=4, finest_voxel_mm=1.8),
+        lambda done, total: calls.append((done, total)),
+        template=template,
+    )
     return Moving(stacks, slices, truth, estimate, calls)

@@ -11,7 +11,7 @@ from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_s
 from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
-from g3r.registration import MotionEstimate
+from g3r.registration import Registration
 
 STILL = MotionLevel()
 
@@ -23,7 +23,7 @@ class Moving:
     stacks: list[SimulatedStack]
     slices: Slices
     truth: RigidPose
-    estimate: MotionEstimate
+    estimate: Registration
     progress: list[tuple[int, int]]
 
 
@@ -41,8 +41,7 @@ def simulated(
     )
     levels = [level] * n_stacks if isinstance(level, MotionLevel) else level
     settings = [
-        replace(one, motion=of_stack, interleave=interleave)
-        for one, of_stack in zip(settings, levels, strict=True)
+        replace(one, motion=of_stack, interleave=interleave) for one, of_stack in zip(settings, levels, strict=True)
     ]
     return simulate_stacks(head.t2, head.mask, head.affine, settings, np.random.default_rng(seed))
 
@@ -82,13 +81,9 @@ def true_places_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
 def slices_disturbed(slices: Slices, degrees: float, mm: float, seed: int = 0) -> Slices:
     """Every slice turned and shifted at random about its own middle."""
     rng = np.random.default_rng(seed)
-    turn = RigidPose.from_rotvec(
-        np.deg2rad(rng.normal(0, degrees, (len(slices), 3))), np.zeros((len(slices), 3))
-    )
+    turn = RigidPose.from_rotvec(np.deg2rad(rng.normal(0, degrees, (len(slices), 3))), np.zeros((len(slices), 3)))
     pose = slices.planes.pose @ turn
-    return slices.with_pose(
-        RigidPose(pose.rotation, pose.translation_mm + rng.normal(0, mm, (len(slices), 3)))
-    )
+    return slices.with_pose(RigidPose(pose.rotation, pose.translation_mm + rng.normal(0, mm, (len(slices), 3))))
 
 
 def stack_moved(motion: RigidPose, slices: Slices, stack: int, by: RigidPose) -> RigidPose:
@@ -101,12 +96,12 @@ def stack_moved(motion: RigidPose, slices: Slices, stack: int, by: RigidPose) ->
     )
 
 
-def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, shift_mm: np.ndarray) -> RigidPose:
+def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, translation_mm: np.ndarray) -> RigidPose:
     """One motion: a turn about a point, then a shift."""
     turn = RigidPose.from_rotvec([rotvec_rad], np.zeros((1, 3)))
-    return RigidPose(turn.rotation, (center_mm - turn.rotation[0] @ center_mm + shift_mm)[None])
+    return RigidPose(turn.rotation, (center_mm - turn.rotation[0] @ center_mm + translation_mm)[None])
 
 
-def turn_angle_deg(rotation: np.ndarray) -> float:
+def rotation_angle_deg(rotation: np.ndarray) -> float:
     """Angle of a rotation [3, 3]."""
     return float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

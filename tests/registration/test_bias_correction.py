@@ -13,7 +13,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.bias_correction import LENGTH_MM, flattened
+from g3r.registration.bias_correction import LENGTH_MM, bias_corrected
 from g3r.registration.prior_registration import register_to_prior
 
 
@@ -41,7 +41,7 @@ def log_ratio_spread(a: Slices, b: Slices) -> float:
 def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, RigidPose]):
     slices, _ = still_slices
     dark = shaded(slices, 1.0)
-    before, after = log_ratio_spread(dark, slices), log_ratio_spread(flattened(dark), flattened(slices))
+    before, after = (log_ratio_spread(dark, slices), log_ratio_spread(bias_corrected(dark), bias_corrected(slices)))
     assert before > 0.1
     assert after < 0.15 * before
 
@@ -49,8 +49,8 @@ def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, R
 def test_slices_keep_their_gains_and_everything_else(still_slices: tuple[Slices, RigidPose]):
     slices, _ = still_slices
     gain = np.exp(np.random.default_rng(0).normal(0, 0.1, len(slices)))[slices.planes.plane_id()]
-    flat = flattened(slices)
-    gained = flattened(replace(slices, value=(slices.value * gain).astype(np.float32)))
+    flat = bias_corrected(slices)
+    gained = bias_corrected(replace(slices, value=(slices.value * gain).astype(np.float32)))
     ratio = np.log(gained.masked_value / flat.masked_value)
     plane = slices.pixel_plane
     within = np.mean([ratio[plane == k].std() for k in range(len(slices))])
@@ -64,13 +64,13 @@ def test_the_scanners_frame_and_the_present_poses_do_not_matter(still_slices: tu
     slices, _ = still_slices
     turn = turned_about(np.zeros(3), np.array([1.0, -2.0, 0.5]), np.array([30.0, 0, -60]))
     turned = replace(slices, header_pose=turn @ slices.header_pose)
-    np.testing.assert_allclose(flattened(turned).value, flattened(slices).value, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(bias_corrected(turned).value, bias_corrected(slices).value, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("constant", [0.0, -1.0, 2.0])
 def test_stacks_without_contrast_stay_as_they_are(still_slices: tuple[Slices, RigidPose], constant: float):
     slices, _ = still_slices
-    flat = flattened(replace(slices, value=np.full_like(slices.value, constant)))
+    flat = bias_corrected(replace(slices, value=np.full_like(slices.value, constant)))
     np.testing.assert_allclose(flat.value, constant, rtol=1e-3)
 
 
@@ -82,8 +82,8 @@ def test_slices_that_moved_come_nearer_to_a_good_prior(head: Phantom):
     bright = np.percentile(head.t2[head.mask], 99)
     prior = (gaussian_filter(head.t2 * head.mask, 0.8) / bright).astype(np.float32)
     grid = VolumeGrid(head.t2.shape, head.affine)
-    found, gain, believed = register_to_prior(slices, np.ones(len(slices)), prior, grid)
-    assert believed
+    found, gain, accepted = register_to_prior(slices, np.ones(len(slices)), prior, grid)
+    assert accepted
     assert np.median(pixel_errors_mm(found, truth)) < 0.4 * np.median(pixel_errors_mm(slices, truth))
     assert gain.shape == (len(slices),)
 
@@ -93,7 +93,7 @@ def test_slices_in_line_stay_there_against_a_prior_that_says_nothing_new(head: P
     grid = grid_around(slices, 1.5)
     coarse, _ = coarse_and_density(slices, grid)
     gain = np.full(len(slices), 1.05)
-    found, same, believed = register_to_prior(slices, gain, coarse, grid)
-    assert not believed
+    found, same, accepted = register_to_prior(slices, gain, coarse, grid)
+    assert not accepted
     assert found is slices
     assert same is gain

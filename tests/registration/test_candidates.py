@@ -20,21 +20,21 @@ from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.candidates import (
-    calmest_interleave,
-    choose,
-    in_frame_of,
-    judge,
+    aligned_to,
+    best_initialisation,
+    collapse_to_rigid,
+    estimate_interleave,
+    held_out_score,
     moved,
-    settle,
-    simplify,
+    refine_segments,
 )
-from g3r.registration.placement import StackPixels, place_again, volume_without
+from g3r.registration.placement import StackSamples, refine_placement, volume_without
 from g3r.registration.segments import head_distance_mm
 
 
 @pytest.fixture(scope="module")
-def parts(still_slices: tuple[Slices, RigidPose]) -> list[StackPixels]:
-    return StackPixels.of_all(still_slices[0])
+def samples(still_slices: tuple[Slices, RigidPose]) -> list[StackSamples]:
+    return StackSamples.of_all(still_slices[0])
 
 
 def upside_down(slices: Slices, stack: int) -> RigidPose:
@@ -58,51 +58,49 @@ def jerked(slices: Slices, stack: int, by: RigidPose) -> tuple[RigidPose, np.nda
 # -- judging ---------------------------------------------------------------------------------------
 
 
-def test_true_poses_predict_better_than_wrong_ones(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
-):
+def test_true_poses_predict_better_than_wrong_ones(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
     """The further off, the dearer; the wrong stack shows most."""
     slices, truth = still_slices
-    right = judge(slices, parts, truth)
+    right = held_out_score(slices, samples, truth)
     assert min(p.correlation for p in right.prediction) > 0.75
     previous = right.cost
     for degrees, mm in ((3.0, 1.5), (8.0, 5.0), (25.0, 10.0)):
         by = turned_about(np.zeros(3), np.deg2rad([degrees, 0, 0]), np.array([0, mm, 0]))
-        wrong = judge(slices, parts, stack_moved(truth, slices, 1, by))
+        wrong = held_out_score(slices, samples, stack_moved(truth, slices, 1, by))
         assert wrong.cost > previous + 20
         assert np.argmin([p.correlation for p in wrong.prediction]) == 1
         previous = wrong.cost
 
 
 def test_a_judgement_has_a_line_for_every_stack_and_slice(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ):
     slices, truth = still_slices
-    judged = judge(slices, parts, truth)
+    judged = held_out_score(slices, samples, truth)
     assert len(judged.prediction) == 3
     for stack, one in enumerate(judged.prediction):
         assert one.slice_correlation.shape == ((slices.stack_id == stack).sum(),)
     assert judged.cost == pytest.approx(sum(p.cost for p in judged.prediction))
 
 
-def test_restless_poses_pay_for_their_movements(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
-):
+def test_restless_poses_pay_for_their_movements(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
     slices, truth = still_slices
     restless = slices_disturbed(slices, 0.1, 0.05).world_from_header()
-    assert judge(slices, parts, restless).cost > judge(slices, parts, truth).cost + 5 * len(slices)
+    assert held_out_score(slices, samples, restless).cost > held_out_score(slices, samples, truth).cost + 5 * len(
+        slices
+    )
 
 
 def test_the_true_hypothesis_is_chosen_by_its_name(moving: Moving):
     slices, truth = moving.slices, moving.truth
-    hypotheses = {
+    initialisations = {
         "headers": RigidPose.identity(len(slices)),
         "truth": truth,
         "nearly": slices_disturbed(moved(slices, truth), 4.0, 3.0).world_from_header(),
     }
-    name, judged = choose(slices, StackPixels.of_all(slices), hypotheses)
+    name, judged = best_initialisation(slices, StackSamples.of_all(slices), initialisations)
     assert name == "truth"
-    assert set(judged) == set(hypotheses)
+    assert set(judged) == set(initialisations)
     assert judged["truth"].cost < judged["nearly"].cost
     assert judged["truth"].cost < judged["headers"].cost
 
@@ -125,8 +123,8 @@ def test_the_calmest_interleave_is_the_true_one(head: Phantom):
     for interleave in (1, 2, 3):
         level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
         slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
-        (part,) = StackPixels.of_all(slices)
-        assert calmest_interleave(part, truth) == interleave
+        (sample,) = StackSamples.of_all(slices)
+        assert estimate_interleave(sample, truth) == interleave
 
 
 # -- frames ----------------------------------------------------------------------------------------
@@ -141,7 +139,7 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
         np.where(few[:, None, None], stray.rotation, elsewhere.rotation),
         np.where(few[:, None], stray.translation_mm, elsewhere.translation_mm),
     )
-    back = in_frame_of(slices, truth, other)
+    back = aligned_to(slices, truth, other)
     distance = np.array(
         [head_distance_mm(back.take([k]), truth.take([k]), np.zeros(3))[0, 0] for k in range(len(slices))]
     )
@@ -149,37 +147,39 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
     # relative motions are those of the other
     np.testing.assert_allclose(
         (back.inverse().take([0]) @ back.take([7])).rotation,
-        (other.inverse().take([0]) @ other.take([7])).rotation, atol=1e-9,
-    )  # fmt: skip
+        (other.inverse().take([0]) @ other.take([7])).rotation,
+        atol=1e-9,
+    )
 
 
 # -- runs ------------------------------------------------------------------------------------------
 
 
-def test_half_a_stack_after_a_jerk_finds_back(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
-):
+def test_half_a_stack_after_a_jerk_finds_back(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
     """Wrong motions of a run are taken back, with nothing known about which run lies wrongly."""
     slices, _ = still_slices
     by = turned_about(np.zeros(3), np.deg2rad([0, 12, 8]), np.array([4.0, 3, -5]))
     motion, late = jerked(slices, 1, by)
     volume, grid = volume_without(moved(slices, motion), 1, 2.4)
-    own = motion.take(parts[1].rows)
-    placed = place_again(
-        parts[1], own, volume, grid, turn_deg=2.0, shift_mm=1.0, rng=np.random.default_rng(0)
-    )  # fmt: skip
+    own = motion.take(samples[1].rows)
+    placed = refine_placement(
+        samples[1], own, volume, grid, rotation_deg=2.0, translation_mm=1.0, rng=np.random.default_rng(0)
+    )
     away = np.array(
-        [
-            head_distance_mm(placed.motion.take([k]), RigidPose.identity(1), np.zeros(3))[0, 0]
-            for k in range(len(own))
-        ]
+        [head_distance_mm(placed.motion.take([k]), RigidPose.identity(1), np.zeros(3))[0, 0] for k in range(len(own))]
     )
     assert np.median(away) < 2
-    assert away[late[parts[1].rows]].mean() < 3
-    proposed = place_again(
-        parts[1], own, volume, grid, turn_deg=40.0, shift_mm=30.0, rng=np.random.default_rng(0),
+    assert away[late[samples[1].rows]].mean() < 3
+    proposed = refine_placement(
+        samples[1],
+        own,
+        volume,
+        grid,
+        rotation_deg=40.0,
+        translation_mm=30.0,
+        rng=np.random.default_rng(0),
         proposals=RigidPose.identity(1),
-    )  # fmt: skip
+    )
     assert (proposed.motion.translation_mm == 0).all(1).mean() > 0.8
 
 
@@ -189,43 +189,40 @@ def test_a_still_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phant
     _, sizes = np.unique(truth.take(slices.stack_id == 1).translation_mm.round(6), axis=0, return_counts=True)
     assert len(sizes) == 2
     assert sizes.min() >= 4
-    parts = StackPixels.of_all(slices)
-    found, shared = simplify(slices, parts, truth, [2, 2, 2])
+    samples = StackSamples.of_all(slices)
+    found, shared = collapse_to_rigid(slices, samples, truth, [2, 2, 2])
     assert shared == [True, False, True]
-    np.testing.assert_array_equal(found.rotation[parts[1].rows], truth.rotation[parts[1].rows])
+    np.testing.assert_array_equal(found.rotation[samples[1].rows], truth.rotation[samples[1].rows])
     for stack in (0, 2):
-        own = found.take(parts[stack].rows)
+        own = found.take(samples[stack].rows)
         np.testing.assert_allclose(own.rotation, own.rotation[:1].repeat(len(own), 0), atol=1e-9)
         np.testing.assert_allclose(own.translation_mm, own.translation_mm[:1].repeat(len(own), 0), atol=1e-6)
     assert np.median(pixel_errors_mm(moved(slices, found), truth)) < 0.5
 
 
 def test_runs_that_fit_noise_are_put_together_again(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ):
     slices, truth = still_slices
     motion = slices_disturbed(slices, 0.7, 0.4).world_from_header()
-    found, shared = simplify(slices, parts, motion, [1, 1, 1])
+    found, shared = collapse_to_rigid(slices, samples, motion, [1, 1, 1])
     assert shared == [True, True, True]
     before, after = (pixel_errors_mm(moved(slices, m), truth) for m in (motion, found))
     assert after.mean() < 0.7 * before.mean()
 
 
 def test_a_stack_that_starts_upside_down_comes_back(
-    still_slices: tuple[Slices, RigidPose], parts: list[StackPixels]
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ):
     slices, truth = still_slices
     start = upside_down(slices, 1)
-    assert (
-        np.median(pixel_errors_mm(moved(slices, start), truth)[(slices.stack_id == 1)[slices.pixel_plane]])
-        > 20
-    )
-    found, placements = settle(slices, parts, start, [], np.random.default_rng(0))
+    assert np.median(pixel_errors_mm(moved(slices, start), truth)[(slices.stack_id == 1)[slices.pixel_plane]]) > 20
+    found, placements = refine_segments(slices, samples, start, [], np.random.default_rng(0))
     error = pixel_errors_mm(moved(slices, found), truth)
     assert np.median(error) < 1.5
     assert np.quantile(error, 0.9) < 4
     assert len(placements) == 3
-    assert judge(slices, parts, found).cost < judge(slices, parts, start).cost - 100
+    assert held_out_score(slices, samples, found).cost < held_out_score(slices, samples, start).cost - 100
 
 
 def test_severe_motion_is_undone(moving: Moving):

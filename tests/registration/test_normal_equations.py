@@ -29,9 +29,12 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
     rng = np.random.default_rng(seed)
     spacing = np.full((n, 2), 1.3)
     planes = Planes(
-        Rotation.random(n, rng=rng).as_matrix(), GRID.center_mm + rng.normal(0, 1.5, (n, 3)), spacing,
-        np.full((n, 2), 9), psf_variance_mm2(spacing, np.full(n, 3.0)),
-    )  # fmt: skip
+        Rotation.random(n, rng=rng).as_matrix(),
+        GRID.center_mm + rng.normal(0, 1.5, (n, 3)),
+        spacing,
+        np.full((n, 2), 9),
+        psf_variance_mm2(spacing, np.full(n, 3.0)),
+    )
     volume = smooth_volume()
     gain = rng.uniform(0.7, 1.4, n)
     value = VoxelOperator(planes, GRID).forward(volume) * gain[planes.plane_id()]
@@ -41,8 +44,7 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
     slices = Slices(planes, value.astype(np.float32), mask, stack, np.arange(n), np.full(n, 3.0), planes.pose)
     # not at the optimum, where the gradient would vanish
     start = RigidPose(
-        planes.rotation @ rotation_matrix(rng.normal(0, 0.05, (n, 3))),
-        planes.center_mm + rng.normal(0, 0.5, (n, 3)),
+        planes.rotation @ rotation_matrix(rng.normal(0, 0.05, (n, 3))), planes.center_mm + rng.normal(0, 0.5, (n, 3))
     )
     return slices.with_pose(start), rng.uniform(0.8, 1.2, n)
 
@@ -144,10 +146,12 @@ def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero():
 
 def test_correlation_of_constants_is_zero():
     n = 10.0
-    moments = np.array([
-        [n, n, 2 * n, n, 4 * n, 2 * n],  # both constant
-        [0, 0, 0, 0, 0, 0],
-        [2, 3, 3, 5, 5, 5],  # (1, 2) with itself
-        [2, 3, 3, 5, 5, 4],  # (1, 2) with (2, 1)
-    ])  # fmt: skip
+    moments = np.array(
+        [
+            [n, n, 2 * n, n, 4 * n, 2 * n],  # both constant
+            [0, 0, 0, 0, 0, 0],
+            [2, 3, 3, 5, 5, 5],  # (1, 2) with itself
+            [2, 3, 3, 5, 5, 4],  # (1, 2) with (2, 1)
+        ]
+    )
     np.testing.assert_allclose(correlation(moments), [0, 0, 1, -1])

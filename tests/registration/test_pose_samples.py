@@ -30,9 +30,12 @@ def few_slices(n: int = 7) -> Slices:
     rng = np.random.default_rng(5)
     shape = rng.integers(3, 40, (n, 2))
     planes = Planes(
-        Rotation.random(n, rng=rng).as_matrix(), rng.normal(0, 8, (n, 3)) + CENTER_MM,
-        rng.uniform(0.7, 1.5, (n, 2)), shape, np.zeros((n, 3)),
-    )  # fmt: skip
+        Rotation.random(n, rng=rng).as_matrix(),
+        rng.normal(0, 8, (n, 3)) + CENTER_MM,
+        rng.uniform(0.7, 1.5, (n, 2)),
+        shape,
+        np.zeros((n, 3)),
+    )
     value = rng.random(planes.n_pixels).astype(np.float32)
     mask = rng.random(planes.n_pixels) < 0.7
     return Slices(planes, value, mask, np.arange(n) % 2, np.arange(n), np.full(n, 3.0), planes.pose)
@@ -40,9 +43,7 @@ def few_slices(n: int = 7) -> Slices:
 
 def test_uniform_rotations_are_rotations_that_cover_the_sphere(rng: np.random.Generator):
     rotation = uniform_rotations(4000)
-    np.testing.assert_allclose(
-        rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12
-    )
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotation), 1)
     asked = Rotation.random(400, rng=rng).as_matrix()
     nearest = np.array([angle_deg(rotation, one).min() for one in asked])
@@ -69,9 +70,7 @@ def test_angles_between_rotations():
 @pytest.mark.parametrize("target", [np.array([1.0, 2, 3]), np.arange(12.0).reshape(4, 3)])
 def test_turns_about_a_point_take_it_to_the_target(target: np.ndarray):
     motion = turns_about(uniform_rotations(4), CENTER_MM, target)
-    np.testing.assert_allclose(
-        motion.apply(np.tile(CENTER_MM, (4, 1))), np.broadcast_to(target, (4, 3)), atol=1e-12
-    )
+    np.testing.assert_allclose(motion.apply(np.tile(CENTER_MM, (4, 1))), np.broadcast_to(target, (4, 3)), atol=1e-12)
 
 
 def test_perturbed_keeps_what_it_was_given_and_spreads_as_stated(rng: np.random.Generator):
@@ -128,27 +127,18 @@ def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
 
 def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too():
     planes = Planes(
-        np.tile(np.eye(3), (2, 1, 1)),
-        np.zeros((2, 3)),
-        np.ones((2, 2)),
-        [[1, 50], [20, 20]],
-        np.zeros((2, 3)),
+        np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones((2, 2)), [[1, 50], [20, 20]], np.zeros((2, 3))
     )
     mask = np.zeros(450, bool)
     pixels = SearchPixels.of(
-        Slices(
-            planes, np.ones(450, np.float32), mask, np.zeros(2, int), np.arange(2), np.ones(2), planes.pose
-        ),
-        16,
+        Slices(planes, np.ones(450, np.float32), mask, np.zeros(2, int), np.arange(2), np.ones(2), planes.pose), 16
     )
     assert (np.diff(pixels.start) >= 10).all()
     assert (pixels.value == 0).all()
     assert np.isfinite(pixels.center_mm).all()
 
 
-def plain_moments(
-    pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose
-) -> np.ndarray:
+def plain_moments(pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose) -> np.ndarray:
     """The six sums by scipy; outside of the voxels' centres the volume is 0."""
     out = np.zeros((len(motion), len(pixels), 6))
     for j in range(len(motion)):
@@ -199,22 +189,16 @@ def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generato
     motion = disturbed.world_from_header()
     every = pixels.moments(volume, grid, motion)
     own = own_moments(pixels, volume, grid, motion)
-    np.testing.assert_allclose(
-        own, every[np.arange(len(slices)), np.arange(len(slices))], rtol=1e-6, atol=1e-6
-    )
+    np.testing.assert_allclose(own, every[np.arange(len(slices)), np.arange(len(slices))], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.6, 0.97, 1.6, 5.0])
 def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.random.Generator):
     m = rng.random((4, 50))
     y = gain * m + 0.1 * rng.normal(size=m.shape)
-    moments = np.stack(
-        [np.full(4, 50.0), y.sum(1), m.sum(1), (y * y).sum(1), (m * m).sum(1), (y * m).sum(1)], axis=1
-    )
+    moments = np.stack([np.full(4, 50.0), y.sum(1), m.sum(1), (y * y).sum(1), (m * m).sum(1), (y * m).sum(1)], axis=1)
     expected = [
-        minimize_scalar(
-            lambda g, a=a, b=b: ((a - g * b) ** 2).mean(), bounds=GAIN_RANGE, method="bounded"
-        ).fun
+        minimize_scalar(lambda g, a=a, b=b: ((a - g * b) ** 2).mean(), bounds=GAIN_RANGE, method="bounded").fun
         for a, b in zip(y, m, strict=True)
     ]
     np.testing.assert_allclose(mean_square_residual(moments), expected, rtol=1e-4)

@@ -9,23 +9,23 @@ from moving_heads import STILL, Moving, as_slices, simulated
 
 from data_synth.phantom import Phantom, fetal_brain_phantom
 from data_synth.simulator import SimulatedStack
-from g3r.registration import MotionEstimate, MotionSettings, estimate_motion
+from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.quality import (
-    UNSURE_HELD_OUT,
-    UNSURE_NCC,
-    StackConfidence,
+    MIN_HELD_OUT,
+    MIN_NCC,
+    StackQuality,
     pose_warnings,
     registration_summary,
-    stack_confidences,
+    stack_qualities,
 )
-from g3r.registration.slice_rounds import DROPPED_WEIGHT, LARGEST_DROPPED_SHARE, slice_weights
+from g3r.registration.slice_rounds import DROPPED_WEIGHT, MAX_DROPPED_SHARE, slice_weights
 
-QUICK = MotionSettings(network=False, stacks=False, runs=False, n_rounds=2, finest_voxel_mm=1.8)
+QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)
 
 
-def confidences(stacks: list[SimulatedStack]) -> list[StackConfidence]:
+def qualities(stacks: list[SimulatedStack]) -> list[StackQuality]:
     slices, _ = as_slices(stacks)
-    return stack_confidences(estimate_motion(slices, QUICK), len(stacks))
+    return stack_qualities(register(slices, QUICK), len(stacks))
 
 
 def noise_instead(one: SimulatedStack) -> SimulatedStack:
@@ -37,9 +37,9 @@ def noise_instead(one: SimulatedStack) -> SimulatedStack:
 
 
 def test_stacks_that_are_registered_are_sure(still: list[SimulatedStack], moving: Moving):
-    assert all(one.sure for one in confidences(still))
-    found = stack_confidences(moving.estimate, 3)
-    assert all(one.sure for one in found)
+    assert all(one.reliable for one in qualities(still))
+    found = stack_qualities(moving.estimate, 3)
+    assert all(one.reliable for one in found)
     assert [one.held_out_correlation for one in found] == moving.estimate.held_out
     stacks = [one.stack for one in moving.stacks]
     assert pose_warnings(moving.estimate, found, stacks) == []
@@ -47,23 +47,23 @@ def test_stacks_that_are_registered_are_sure(still: list[SimulatedStack], moving
 
 
 def test_a_stack_of_noise_is_unsure(still: list[SimulatedStack]):
-    found = confidences([still[0], noise_instead(still[1]), still[2]])
-    assert [one.sure for one in found] == [True, False, True]
+    found = qualities([still[0], noise_instead(still[1]), still[2]])
+    assert [one.reliable for one in found] == [True, False, True]
     assert found[1].median_slice_ncc < 0.5
 
 
 def test_a_stack_of_another_head_is_unsure(still: list[SimulatedStack]):
     other = simulated(fetal_brain_phantom(33, 1.2, 9), STILL, seed=4)
-    found = confidences([still[0], other[1], still[2]])
-    assert not found[1].sure
-    assert found[1].held_out_correlation < min(one.held_out_correlation for one in confidences(still)) - 0.15
+    found = qualities([still[0], other[1], still[2]])
+    assert not found[1].reliable
+    assert found[1].held_out_correlation < min(one.held_out_correlation for one in qualities(still)) - 0.15
 
 
 def test_stacks_left_far_apart_are_unsure(head: Phantom, moving: Moving):
     """Severe motion that nobody undoes: that is said, stack by stack, with names and figures."""
-    estimate = estimate_motion(moving.slices, replace(QUICK, n_rounds=0))
-    found = stack_confidences(estimate, 3)
-    assert not any(one.sure for one in found)
+    estimate = register(moving.slices, replace(QUICK, n_rounds=0))
+    found = stack_qualities(estimate, 3)
+    assert not any(one.reliable for one in found)
     stacks = [one.stack for one in moving.stacks]
     lines = pose_warnings(estimate, found, stacks)
     assert len(lines) == 3
@@ -76,39 +76,38 @@ def test_stacks_left_far_apart_are_unsure(head: Phantom, moving: Moving):
 
 def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[float], ids: list[int]):
     return SimpleNamespace(
-        slices=SimpleNamespace(stack_id=np.array(ids)), held_out=held_out, ncc=np.array(ncc),
-        weight=np.array(weight),
-    )  # fmt: skip
+        slices=SimpleNamespace(stack_id=np.array(ids)), held_out=held_out, ncc=np.array(ncc), weight=np.array(weight)
+    )
 
 
 @pytest.mark.parametrize(
     ("held_out", "ncc", "weight", "sure"),
     [
         (0.8, 0.95, 1.0, True),
-        (UNSURE_HELD_OUT - 0.01, 0.95, 1.0, False),
-        (0.8, UNSURE_NCC - 0.01, 1.0, False),
+        (MIN_HELD_OUT - 0.01, 0.95, 1.0, False),
+        (0.8, MIN_NCC - 0.01, 1.0, False),
         (0.8, 0.95, 0.4, False),
     ],
 )
-def test_every_figure_can_call_a_stack_unsure(held_out: float, ncc: float, weight: float, sure: bool):
+def test_every_figure_can_call_a_stack_unsure(held_out: float, ncc: float, weight: float, reliable: bool):
     ids = [0] * 4 + [1] * 4
-    estimate = estimate_with(
-        [0.8, held_out], [0.95] * 4 + [ncc] * 4, [1.0] * 4 + [weight, weight, weight, 1], ids
-    )  # fmt: skip
-    found = stack_confidences(estimate, 2)
-    assert [one.sure for one in found] == [True, sure]
+    estimate = estimate_with([0.8, held_out], [0.95] * 4 + [ncc] * 4, [1.0] * 4 + [weight, weight, weight, 1], ids)
+    found = stack_qualities(estimate, 2)
+    assert [one.reliable for one in found] == [True, reliable]
     assert found[1].record() == {
-        "sure": sure, "held_out_correlation": held_out, "median_slice_ncc": ncc,
-        "doubted_share": 0.75 if weight < 0.5 else 0.0,
-    }  # fmt: skip
+        "sure": reliable,
+        "held_out_correlation": held_out,
+        "median_slice_ncc": ncc,
+        "downweighted_share": 0.75 if weight < 0.5 else 0.0,
+    }
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]):
     """The figures are those of the stacks that have slices, whatever their numbers."""
     estimate = estimate_with([0.7, 0.9], [0.95] * 4, [1.0] * 4, [0, 0, 2, 2])
-    found = stack_confidences(estimate, 3)
+    found = stack_qualities(estimate, 3)
     assert [one.held_out_correlation for one in found] == [0.7, None, 0.9]
-    assert [one.sure for one in found] == [True, False, True]
+    assert [one.reliable for one in found] == [True, False, True]
     lines = pose_warnings(estimate, found, [one.stack for one in still])
     assert len(lines) == 1
     assert lines[0].startswith(f"{still[1].stack.name}: no slice")
@@ -128,8 +127,8 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float):
     bad = rng.permutation(n)[: int(bad_share * n)]
     loss[bad] += rng.uniform(5, 50, len(bad))
     weight = slice_weights(loss)
-    assert (weight < DROPPED_WEIGHT).sum() <= LARGEST_DROPPED_SHARE * n
-    assert (weight < DROPPED_WEIGHT).sum() == min(len(bad), int(LARGEST_DROPPED_SHARE * n))
+    assert (weight < DROPPED_WEIGHT).sum() <= MAX_DROPPED_SHARE * n
+    assert (weight < DROPPED_WEIGHT).sum() == min(len(bad), int(MAX_DROPPED_SHARE * n))
     assert weight.min() > 0
     # those dropped are the worst, and all that are bad count less than all that are good
     dropped = np.flatnonzero(weight < DROPPED_WEIGHT)
@@ -139,6 +138,6 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float):
 
 def test_the_estimates_own_weights_keep_to_it(moving: Moving):
     weight = moving.estimate.weight
-    assert isinstance(moving.estimate, MotionEstimate)
-    assert (weight < DROPPED_WEIGHT).mean() <= LARGEST_DROPPED_SHARE
+    assert isinstance(moving.estimate, Registration)
+    assert (weight < DROPPED_WEIGHT).mean() <= MAX_DROPPED_SHARE
     assert weight.max() == 1.0

@@ -16,14 +16,14 @@ from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration import MotionSettings, estimate_motion
+from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import centred_on_headers
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.registration.slice_rounds import slice_weights
 from g3r.registration.stack_registration import register_stacks, self_consistency
 
-OFF = MotionSettings(template=False, network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=1.8)
+OFF = RegistrationSettings(template=False, network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=1.8)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -95,9 +95,7 @@ def test_slices_find_back_to_a_volume(still: list[SimulatedStack]):
     volume, grid = true_volume(slices)
     start = slices_disturbed(slices, 2.0, 1.2)
     gain = np.exp(np.random.default_rng(1).normal(0, 0.1, len(slices)))
-    dark = replace(
-        start, value=(start.value * np.repeat(gain, np.diff(start.planes.offset))).astype(np.float32)
-    )
+    dark = replace(start, value=(start.value * np.repeat(gain, np.diff(start.planes.offset))).astype(np.float32))
     model = SliceModel(dark, volume, grid)
     found, found_gain, fit = register_slices(model, dark, np.ones(len(slices)), n_steps=15, width=0.08)
     before, after = pixel_errors_mm(start, truth), pixel_errors_mm(found, truth)
@@ -150,68 +148,66 @@ def test_the_whole_estimate_on_a_moving_head(moving: Moving):
     assert np.median(estimate.ncc) > 0.9
     # at the poles the volume's blur looks like a gain
     assert np.quantile(np.abs(np.log(estimate.gain)), 0.8) < 0.1
-    np.testing.assert_array_equal(estimate.slices.value, slices.value)  # flattened for registration alone
+    np.testing.assert_array_equal(estimate.slices.value, slices.value)  # bias_corrected for registration alone
 
 
 def test_the_whole_estimate_says_how_it_was_found(moving: Moving):
     estimate = moving.estimate
-    assert set(estimate.hypotheses) == {"headers", "template", "stacks"}
-    sums = {name: sum(values) for name, values in estimate.hypotheses.items()}
-    assert sums[estimate.hypothesis] > sums["headers"]
-    assert len(estimate.held_out) == len(estimate.interleave) == len(estimate.n_runs) == 3
-    assert min(estimate.held_out) > max(estimate.hypotheses["headers"])
+    assert set(estimate.initialisations) == {"headers", "template", "stacks"}
+    sums = {name: sum(values) for name, values in estimate.initialisations.items()}
+    assert sums[estimate.initialisation] > sums["headers"]
+    assert len(estimate.held_out) == len(estimate.interleave) == len(estimate.n_segments) == 3
+    assert min(estimate.held_out) > max(estimate.initialisations["headers"])
     assert estimate.interleave == [2, 2, 2]
-    assert all(1 <= n <= 6 for n in estimate.n_runs)
+    assert all(1 <= n <= 6 for n in estimate.n_segments)
     assert estimate.orientation is not None
     assert estimate.orientation.weeks in (24, 31)
 
 
 def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedStack]):
     slices, _ = as_slices(still)
-    estimate = estimate_motion(slices, OFF)
+    estimate = register(slices, OFF)
     np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
     assert (estimate.gain == 1).all()
     assert np.median(estimate.ncc) > 0.9
-    assert estimate.hypothesis == "headers"
-    assert set(estimate.hypotheses) == {"headers"}
+    assert estimate.initialisation == "headers"
+    assert set(estimate.initialisations) == {"headers"}
     assert estimate.orientation is None
-    assert estimate.n_runs == [1, 1, 1]
+    assert estimate.n_segments == [1, 1, 1]
 
 
 def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]):
     slices, _ = as_slices(still[:1])
-    estimate = estimate_motion(slices, MotionSettings())
+    estimate = register(slices, RegistrationSettings())
     np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
     assert estimate.held_out is None
-    assert estimate.hypotheses == {}
+    assert estimate.initialisations == {}
     assert estimate.history == []
 
 
 @pytest.mark.parametrize(("n_slices", "layer"), [(1, "template"), (2, "runs")])
-def test_stacks_of_one_or_two_slices(
-    still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str
-):
+def test_stacks_of_one_or_two_slices(still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str):
     """Too few to register well, but no reason to break down."""
     slices, _ = as_slices(still)
     rows = np.concatenate([np.flatnonzero(slices.stack_id == s)[6 : 6 + n_slices] for s in (1, 2)])
     mixed = slices.take(np.concatenate([np.flatnonzero(slices.stack_id == 0), rows]))
     for subject in (mixed, slices.take(rows), slices.take(rows[:n_slices])):
         settings = replace(OFF, n_rounds=1, **{layer: True})
-        estimate = estimate_motion(subject, settings, template=template)
+        estimate = register(subject, settings, template=template)
         assert np.isfinite(estimate.slices.planes.center_mm).all()
         assert np.isfinite(estimate.ncc).all()
-        assert len(estimate.n_runs) == len(np.unique(subject.stack_id))
+        assert len(estimate.n_segments) == len(np.unique(subject.stack_id))
 
 
 def test_proposals_are_rivals_like_the_others(moving: Moving):
     """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
     proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
     settings = replace(OFF, network=True)
-    estimate = estimate_motion(moving.slices, settings, proposals=proposals)
-    assert estimate.hypothesis == "oracle"
+    estimate = register(moving.slices, settings, proposals=proposals)
+    assert estimate.initialisation == "oracle"
     assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 1e-6
-    deaf = estimate_motion(moving.slices, replace(settings, network=False), proposals=proposals)
-    assert set(deaf.hypotheses) == {"headers"}
+    deaf = register(moving.slices, replace(settings, network=False), proposals=proposals)
+    assert set(deaf.initialisations) == {"headers"}
 
 
 def test_the_motion_that_all_slices_share_is_taken_out(still: list[SimulatedStack]):

@@ -4,22 +4,22 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from initialisation import given, settings
+from initialisation import strategies as st
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 from g3r.registration.segments import (
-    CHANGE_PRICE,
+    CHANGE_PENALTY,
     HEAD_RADIUS_MM,
-    best_runs,
+    best_segments,
     changes_in_time,
     cheapest_path,
     head_distance_mm,
-    price_of_changes,
     promising,
     time_orders,
+    transition_penalty,
 )
 
 CENTER_MM = np.array([12.0, -7.0, 40.0])
@@ -29,11 +29,11 @@ CENTER_MM = np.array([12.0, -7.0, 40.0])
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 10_000))
 def test_the_cheapest_path_is_that_of_brute_force(n: int, n_states: int, seed: int):
     rng = np.random.default_rng(seed)
-    cost, price = rng.normal(size=(n, n_states)), rng.random((n_states, n_states)) * rng.choice([0.1, 1, 10])
-    path, total = cheapest_path(cost, price)
+    cost, penalty = (rng.normal(size=(n, n_states)), rng.random((n_states, n_states)) * rng.choice([0.1, 1, 10]))
+    path, total = cheapest_path(cost, penalty)
 
     def sum_of(states: tuple[int, ...]) -> float:
-        changes = sum(price[a, b] for a, b in itertools.pairwise(states))
+        changes = sum(penalty[a, b] for a, b in itertools.pairwise(states))
         return sum(cost[t, s] for t, s in enumerate(states)) + changes
 
     best = min(itertools.product(range(n_states), repeat=n), key=sum_of)
@@ -68,9 +68,7 @@ def test_the_distance_does_not_depend_on_where_the_head_is():
 
 def test_time_orders_know_that_slices_are_missing():
     orders = time_orders(np.array([2, 3, 4, 6, 9]))
-    assert {k: v.tolist() for k, v in orders.items()} == {
-        1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]
-    }  # fmt: skip
+    assert {k: v.tolist() for k, v in orders.items()} == {1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]}
 
 
 def lattice(n: int) -> RigidPose:
@@ -94,37 +92,37 @@ def planted(
 @pytest.mark.parametrize("interleave", [1, 2, 3])
 def test_planted_jerks_and_interleave_are_found(interleave: int):
     cost, truth = planted(interleave, np.repeat([1, 4, 2], [9, 7, 8]))
-    runs = best_runs(cost, lattice(5), np.arange(24), CENTER_MM)
-    np.testing.assert_array_equal(runs.choice, truth)
-    assert runs.interleave == interleave
-    assert runs.n_runs == 3
+    segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
+    np.testing.assert_array_equal(segments.choice, truth)
+    assert segments.interleave == interleave
+    assert segments.n_segments == 3
 
 
 def test_the_cost_is_that_of_the_slices_and_of_the_changes():
     cost, truth = planted(2, np.repeat([1, 4], [12, 12]))
-    runs = best_runs(cost, lattice(5), np.arange(24), CENTER_MM)
+    segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
     moves = changes_in_time(lattice(5).take(truth), np.arange(24), CENTER_MM, 2)
     assert (moves > 1).sum() == 1
     assert moves.max() == pytest.approx(30)
-    assert runs.cost == pytest.approx(cost[np.arange(24), truth].sum() + price_of_changes(moves))
+    assert segments.cost == pytest.approx(cost[np.arange(24), truth].sum() + transition_penalty(moves))
 
 
 def test_one_slice_that_says_little_does_not_leave_its_run():
     cost, _ = planted(1, np.full(24, 2))
     cost[7] = 3.0
     cost[7, 0] = 0.0  # a spoilt slice: slightly better elsewhere
-    runs = best_runs(cost, lattice(5), np.arange(24), CENTER_MM)
-    assert (runs.choice == 2).all()
-    assert runs.n_runs == 1
-    assert runs.interleave == 1  # the first of equals
+    segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
+    assert (segments.choice == 2).all()
+    assert segments.n_segments == 1
+    assert segments.interleave == 1  # the first of equals
 
 
 def test_missing_slices_do_not_break_the_interleave():
     cost, truth = planted(2, np.repeat([0, 3], [12, 12]))
     there = np.setdiff1d(np.arange(24), [0, 5, 6, 13])
-    runs = best_runs(cost[there], lattice(5), there, CENTER_MM)
-    np.testing.assert_array_equal(runs.choice, truth[there])
-    assert runs.interleave == 2
+    segments = best_segments(cost[there], lattice(5), there, CENTER_MM)
+    np.testing.assert_array_equal(segments.choice, truth[there])
+    assert segments.interleave == 2
 
 
 def test_kept_candidates_are_considered_and_others_only_where_promising():
@@ -137,11 +135,11 @@ def test_kept_candidates_are_considered_and_others_only_where_promising():
     cost[:, -1] = 1.0
     motion, last = lattice(cost.shape[1]), cost.shape[1] - 1
     assert last not in promising(cost, orders)
-    kept = best_runs(cost, motion, np.arange(24), CENTER_MM, keep=np.array([last]))
+    kept = best_segments(cost, motion, np.arange(24), CENTER_MM, keep=np.array([last]))
     assert (kept.choice == last).all()
     assert kept.cost == pytest.approx(24)
-    free = best_runs(cost, motion, np.arange(24), CENTER_MM)
-    assert free.n_runs > 1
+    free = best_segments(cost, motion, np.arange(24), CENTER_MM)
+    assert free.n_segments > 1
     assert free.cost > kept.cost
 
 
@@ -149,19 +147,19 @@ def test_kept_candidates_are_considered_and_others_only_where_promising():
 @pytest.mark.parametrize("n_candidates", [1, 3])
 def test_very_few_slices_and_candidates(n_slices: int, n_candidates: int):
     cost = np.arange(n_slices * n_candidates, dtype=float).reshape(n_slices, n_candidates)
-    runs = best_runs(cost, lattice(n_candidates), np.arange(n_slices) + 4, CENTER_MM)
-    assert (runs.choice == 0).all()
-    assert runs.n_runs == 1
+    segments = best_segments(cost, lattice(n_candidates), np.arange(n_slices) + 4, CENTER_MM)
+    assert (segments.choice == 0).all()
+    assert segments.n_segments == 1
     moves = changes_in_time(lattice(n_slices), np.arange(n_slices), CENTER_MM, 2)
     assert moves.shape == (n_slices - 1,)
 
 
 def test_changes_cost_more_the_further_they_go_and_none_costs_nothing():
-    assert price_of_changes(np.zeros(30)) == 0
-    assert price_of_changes(np.zeros(0)) == 0
-    prices = [price_of_changes(np.array([0.0, d, 0])) for d in (0.01, 1.0, 4.0, 20.0, 80.0)]
-    assert prices == sorted(prices)
-    assert prices[0] == pytest.approx(CHANGE_PRICE, abs=0.01)
-    assert prices[-1] < 2 * prices[-2]  # heavy-tailed: a jerk is possible
-    two, one = price_of_changes(np.array([10.0, 10])), price_of_changes(np.array([20.0]))
+    assert transition_penalty(np.zeros(30)) == 0
+    assert transition_penalty(np.zeros(0)) == 0
+    penalties = [transition_penalty(np.array([0.0, d, 0])) for d in (0.01, 1.0, 4.0, 20.0, 80.0)]
+    assert penalties == sorted(penalties)
+    assert penalties[0] == pytest.approx(CHANGE_PENALTY, abs=0.01)
+    assert penalties[-1] < 2 * penalties[-2]  # heavy-tailed: a jerk is possible
+    two, one = transition_penalty(np.array([10.0, 10])), transition_penalty(np.array([20.0]))
     assert two > one

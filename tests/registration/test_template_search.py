@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_heads import Moving, as_slices, pixel_errors_mm, simulated, turn_angle_deg, turned_about
+from moving_heads import Moving, as_slices, pixel_errors_mm, rotation_angle_deg, simulated, turned_about
 from scipy.spatial.transform import Rotation
 
 from data_synth.phantom import Phantom
@@ -12,19 +12,19 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration import MotionSettings, estimate_motion
+from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import standard_orientation
 from g3r.registration.candidates import moved
-from g3r.registration.placement import StackPixels
+from g3r.registration.placement import StackSamples
 from g3r.registration.pose_samples import angle_deg, turns_about, uniform_rotations
 from g3r.registration.so3_search import PEAK_MARGIN, peaks, place_around, stack_orientations
 from g3r.registration.template_search import (
-    fitted_head,
-    head_orientations,
+    fitted_template,
     head_volume_mm3,
-    near_heads,
+    nearest_templates,
     place_in_template,
     template_fits,
+    template_orientations,
 )
 
 TURNS = {"180 x": [np.pi, 0, 0], "180 z": [0, 0, np.pi], "oblique": [2.0, -1.2, 1.5]}
@@ -45,19 +45,17 @@ def headers_turned(slices: Slices, rotvec: list[float]) -> Slices:
     return replace(slices.with_pose(turned), header_pose=turned)
 
 
-@pytest.mark.parametrize(
-    ("turn", "order"), [("180 x", (2, 0, 1)), ("180 z", (0, 1, 2)), ("oblique", (1, 2, 0))]
-)
+@pytest.mark.parametrize(("turn", "order"), [("180 x", (2, 0, 1)), ("180 z", (0, 1, 2)), ("oblique", (1, 2, 0))])
 def test_a_head_in_any_orientation_is_found_and_set_upright(
     head: Phantom, template: AtlasTemplate, turn: str, order: tuple[int, ...]
 ):
     rotation = Rotation.from_rotvec(TURNS[turn]).as_matrix()
     stacks = simulated(turned_phantom(head, rotation))
     slices, truth = as_slices([stacks[k] for k in order])
-    parts = StackPixels.of_all(slices)
+    samples = StackSamples.of_all(slices)
     rng = np.random.default_rng(0)
-    placed = place_in_template(slices, parts, template, rng)
-    motion = placed.motion(len(slices), parts)
+    placed = place_in_template(slices, samples, template, rng)
+    motion = placed.motion(len(slices), samples)
     error = pixel_errors_mm(moved(slices, motion), truth)
     assert np.median(error) < 2
     assert error.max() < 5
@@ -68,7 +66,7 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     assert upright is not None
     back = upright.pose @ slices.planes.pose.inverse()
     np.testing.assert_allclose(back.rotation, back.rotation[:1].repeat(len(back), 0), atol=1e-9)
-    assert turn_angle_deg(back.rotation[0] @ rotation) < 5
+    assert rotation_angle_deg(back.rotation[0] @ rotation) < 5
     middle = back.apply(np.tile(PLACE_MM, (len(back), 1)))[0]
     assert abs(middle[0]) < 1.5  # the mid-sagittal plane is at x = 0
     assert upright.correlation > 0.7
@@ -76,15 +74,15 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
 
 def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], template: AtlasTemplate):
     slices, _ = as_slices(still)
-    settings = MotionSettings(network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=3.0)
-    plain = estimate_motion(slices, settings, template=template)
+    settings = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=3.0)
+    plain = register(slices, settings, template=template)
     assert plain.orientation is not None
     # the phantom stands as the atlas does
-    assert max(turn_angle_deg(r) for r in plain.slices.world_from_header().rotation) < 5
-    turned = estimate_motion(headers_turned(slices, [0, 0, np.pi / 2]), settings, template=template)
+    assert max(rotation_angle_deg(r) for r in plain.slices.world_from_header().rotation) < 5
+    turned = register(headers_turned(slices, [0, 0, np.pi / 2]), settings, template=template)
     assert turned.orientation is not None
     apart = plain.slices.planes.pose.inverse() @ turned.slices.planes.pose
-    assert max(turn_angle_deg(r) for r in apart.rotation) < 5
+    assert max(rotation_angle_deg(r) for r in apart.rotation) < 5
     away = plain.slices.planes.pixel_world_mm() - turned.slices.planes.pixel_world_mm()
     assert np.linalg.norm(away, axis=1).mean() < 2
 
@@ -94,7 +92,7 @@ def test_the_result_of_a_moving_head_stands_upright(moving: Moving):
     found = moving.estimate.slices.world_from_header()
     common = found @ moving.truth.inverse()
     middle = len(found) // 2
-    angles = sorted(turn_angle_deg(r) for r in common.rotation)
+    angles = sorted(rotation_angle_deg(r) for r in common.rotation)
     assert angles[middle] < 5
     centers = moving.slices.header_pose.translation_mm[:, None]
     away = np.linalg.norm((found.apply(centers) - moving.truth.apply(centers))[:, 0], axis=1)
@@ -103,13 +101,13 @@ def test_the_result_of_a_moving_head_stands_upright(moving: Moving):
 
 def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTemplate):
     slices = headers_turned(as_slices(still[:1])[0], [0, np.pi, 0])
-    settings = MotionSettings(runs=False, finest_voxel_mm=3.0, standard_orientation=False)
-    estimate = estimate_motion(slices, settings, template=template)
+    settings = RegistrationSettings(segments=False, finest_voxel_mm=3.0, standard_orientation=False)
+    estimate = register(slices, settings, template=template)
     assert estimate.orientation is None
     np.testing.assert_allclose(estimate.slices.world_from_header().rotvec_rad(), 0, atol=1e-6)
-    upright = estimate_motion(slices, replace(settings, standard_orientation=True), template=template)
+    upright = register(slices, replace(settings, standard_orientation=True), template=template)
     assert upright.orientation is not None
-    assert min(turn_angle_deg(r) for r in upright.slices.world_from_header().rotation) > 160
+    assert min(rotation_angle_deg(r) for r in upright.slices.world_from_header().rotation) > 160
 
 
 def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
@@ -119,11 +117,10 @@ def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
     noise = np.random.default_rng(0).random(len(slices.value)).astype(np.float32)
     scattered = slices.with_pose(
         RigidPose(
-            slices.planes.rotation,
-            slices.planes.center_mm + np.random.default_rng(1).normal(0, 20, (len(slices), 3)),
+            slices.planes.rotation, slices.planes.center_mm + np.random.default_rng(1).normal(0, 20, (len(slices), 3))
         )
     )
-    heads = near_heads(slices, template)
+    heads = nearest_templates(slices, template)
     still = RigidPose.identity(len(slices))
     rng = np.random.default_rng(0)
     assert standard_orientation(replace(scattered, value=noise), heads, still, rng) is None
@@ -159,28 +156,24 @@ def test_masks_of_another_size_than_any_head_are_refused(
     assert not template_fits(enlarged(3.0), template)
     assert not template_fits(enlarged(0.5), template)
     # the estimate goes on without it
-    settings = MotionSettings(network=False, stacks=False, runs=False, n_rounds=0, finest_voxel_mm=3.0)
-    estimate = estimate_motion(enlarged(3.0), settings, template=template)
+    settings = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=3.0)
+    estimate = register(enlarged(3.0), settings, template=template)
     assert estimate.orientation is None
-    assert set(estimate.hypotheses) == {"headers"}
+    assert set(estimate.initialisations) == {"headers"}
 
 
 def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate):
     for volume_mm3 in (1e5, 4e5):
         for number in range(len(template)):
-            head = fitted_head(template, number, volume_mm3)
+            head = fitted_template(template, number, volume_mm3)
             inside = template.volume[number] > 0
             assert inside.sum() * head.grid.voxel_volume_mm3 == pytest.approx(volume_mm3)
-            np.testing.assert_allclose(
-                head.grid.world(np.argwhere(inside)).mean(0), head.center_mm, atol=1e-9
-            )
+            np.testing.assert_allclose(head.grid.world(np.argwhere(inside)).mean(0), head.center_mm, atol=1e-9)
             np.testing.assert_allclose(head.grid.spacing_mm, head.scale * template.grid.spacing_mm)
             assert head.weeks == template.weeks[number]
 
 
-def test_near_heads_are_the_three_of_about_the_size(
-    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
-):
+def test_near_heads_are_the_three_of_about_the_size(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate):
     slices, _ = still_slices
     one = template.volume[0]
     inside = np.argwhere(one > 0)
@@ -192,9 +185,9 @@ def test_near_heads_are_the_three_of_about_the_size(
         smaller[tuple(index.T)] = 1.0
         sizes.append(smaller)
     several = AtlasTemplate(np.stack(sizes), template.affine, np.array([20.0, 22, 28, 24]))
-    near = near_heads(slices, several)
+    near = nearest_templates(slices, several)
     assert [head.weeks for head in near] == [28, 24, 22]
-    assert len(near_heads(slices, template)) == 2
+    assert len(nearest_templates(slices, template)) == 2
 
 
 def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate):
@@ -203,7 +196,7 @@ def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose
     inside = template.volume[0] > 0
     noise = np.where(inside, np.random.default_rng(0).random(inside.shape), 0).astype(np.float32)
     two = AtlasTemplate(np.stack([noise, template.volume[0]]), template.affine, np.array([23.0, 24.0]))
-    heads = near_heads(slices, two)
+    heads = nearest_templates(slices, two)
     still = RigidPose.identity(len(slices))
     for order in (heads, heads[::-1]):
         found = standard_orientation(slices, order, still, np.random.default_rng(0))
@@ -218,10 +211,10 @@ def test_the_whole_head_turned_is_among_the_orientations_to_follow(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
 ):
     slices, _ = still_slices
-    head = fitted_head(template, 0, head_volume_mm3(slices))
+    head = fitted_template(template, 0, head_volume_mm3(slices))
     turned = headers_turned(slices, [2.0, -1.2, 1.5])
     back = Rotation.from_rotvec([2.0, -1.2, 1.5]).as_matrix().T
-    first = head_orientations(StackPixels.of_all(turned), head)[0]
+    first = template_orientations(StackSamples.of_all(turned), head)[0]
     assert angle_deg(first, back) < 20
 
 
@@ -231,18 +224,17 @@ def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices:
     grid = VolumeGrid(head.t2.shape, head.affine)
     volume = (head.t2 * head.mask / 1000).astype(np.float32)
     stack = headers_turned(slices.take(slices.stack_id == 1), [np.pi, 0, 0])
-    (part,) = StackPixels.of_all(stack)
+    (sample,) = StackSamples.of_all(stack)
     target = grid.world(np.argwhere(head.mask)).mean(0)
-    bases = stack_orientations(part, target, volume, grid)
+    bases = stack_orientations(sample, target, volume, grid)
     away = [float(angle_deg(base, Rotation.from_rotvec([np.pi, 0, 0]).as_matrix().T)) for base in bases]
     assert min(away) < 20
-    placed = place_around(part, bases[int(np.argmin(away))], target, volume, grid)
+    placed = place_around(sample, bases[int(np.argmin(away))], target, volume, grid)
     error = np.linalg.norm(
-        moved(stack, placed.motion).planes.center_mm
-        - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
-    )  # fmt: skip
+        moved(stack, placed.motion).planes.center_mm - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
+    )
     assert np.median(error) < 6  # a lattice of 7 mm and 10 degrees
-    assert placed.runs.n_runs <= 3
+    assert placed.segments.n_segments <= 3
 
 
 def test_orientations_to_follow_are_few_apart_and_best_first():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from g3r.run.deadline import Deadline, paced
+from g3r.run.deadline import Deadline, timed_steps
 
 
 class Clock:
@@ -16,19 +16,19 @@ class Clock:
 def run(n_steps, seconds, per_step, **options):
     clock, done = Clock(), []
     deadline = Deadline.after(seconds, clock)
-    for step, fraction in paced(n_steps, deadline, **options):
+    for step, fraction in timed_steps(n_steps, deadline, **options):
         done.append((step, fraction))
         clock.now += per_step(step) if callable(per_step) else per_step
     return done, clock.now - 100.0
 
 
 def test_without_a_deadline_all_steps_are_made():
-    assert list(paced(4)) == [(0, 0.0), (1, 0.25), (2, 0.5), (3, 0.75)]
+    assert list(timed_steps(4)) == [(0, 0.0), (1, 0.25), (2, 0.5), (3, 0.75)]
 
 
 def test_with_time_enough_all_steps_are_made():
     done, _ = run(4, 100, 1.0)
-    assert done == list(paced(4))
+    assert done == list(timed_steps(4))
 
 
 @pytest.mark.parametrize("seconds", [3.0, 10.0, 33.3])

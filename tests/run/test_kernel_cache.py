@@ -54,9 +54,7 @@ def run(environment: dict[str, str], folder: Path) -> tuple[Path, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
-def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(
-    blocked: dict[str, str], tmp_path: Path
-):
+def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(blocked: dict[str, str], tmp_path: Path):
     path, hits = run(blocked, tmp_path)
     assert path.is_relative_to(tmp_path)  # the copy, not the package under test
     assert hits == "Counter()"

@@ -15,9 +15,7 @@ def test_a_curve_that_is_there_from_the_start_or_never():
 
 
 def test_the_table_names_every_way_and_says_never():
-    entries = [
-        {"steps": n, "psnr_db": 20.0 + k, "n_gaussians": 7, "cpu_s": float(n)} for k, n in enumerate(STEPS)
-    ]
+    entries = [{"steps": n, "psnr_db": 20.0 + k, "n_gaussians": 7, "cpu_s": float(n)} for k, n in enumerate(STEPS)]
     low = [entry | {"psnr_db": entry["psnr_db"] - 3} for entry in entries]
     ways = dict.fromkeys(WAYS, low) | {"few Gaussians first (as shipped)": entries}
     text = convergence_table({"preset": "balanced", "cases": {"one": ways}})

@@ -57,9 +57,7 @@ def test_a_lesion_elsewhere_is_not_kept(lesions: list[Lesion]) -> None:
     assert abs(kept(np.roll(bright.change, 12, 2), bright)) < 0.1
 
 
-def test_spheres_have_their_size_and_level(
-    head: tuple[TruthVolume, np.ndarray], lesions: list[Lesion]
-) -> None:
+def test_spheres_have_their_size_and_level(head: tuple[TruthVolume, np.ndarray], lesions: list[Lesion]) -> None:
     truth, _ = head
     changed = with_lesions(truth, lesions)
     for kind, level in (("bright", BRIGHT_LEVEL), ("dark", DARK_LEVEL)):

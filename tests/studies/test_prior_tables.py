@@ -28,9 +28,7 @@ from studies.prior.volumes import aligned_scores, slices_at_true_poses
 def ablation_rows(gain=(2.0, 1.0, 0.5)):
     """Two subjects, from 1 and 3 stacks."""
     rows = {}
-    for number, (name, volume) in enumerate(
-        {"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()
-    ):
+    for number, (name, volume) in enumerate({"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()):
         rows[name] = {}
         for n in (1, 3):
             psnr = dict.fromkeys(prior_ablation.VARIANTS, 20.0 + n + number)
@@ -56,10 +54,10 @@ def test_ablation_table_gives_mean_spread_and_paired_difference():
 
 
 def test_ablation_subjects_are_many_fresh_and_of_their_own():
-    published, looked_at = prior_ablation.recipes(), prior_ablation.recipes(development=True)
+    published, looked_at = prior_ablation.specs(), prior_ablation.specs(development=True)
     assert len(published) >= 8
     assert {one.seed for one in published}.isdisjoint(one.seed for one in looked_at)
-    sweeps = [motion_sweep.recipes(motion_sweep.LEVELS, 100, development=dev) for dev in (False, True)]
+    sweeps = [motion_sweep.specs(motion_sweep.LEVELS, 100, development=dev) for dev in (False, True)]
     assert {one.seed for one in published}.isdisjoint(one.seed for sweep in sweeps for one in sweep)
     assert all(any(one.volume.startswith(p) for p in prior_ablation.GROUPS.values()) for one in published)
 
@@ -88,18 +86,18 @@ def test_alone_table_marks_what_falls_short():
 
     rows = [row(1, 2.9, 0.81), row(3, 2.1, 0.84), row(2, 0.5, 0.5)]
     speed = {
-        "shape": [9, 8, 7], "voxel_mm": 0.8, "seconds": dict.fromkeys(prior_alone.VOLUMES, 5.5),
-        "tile_voxels": 72, "tiling_difference": 2e-4, "all_views_seconds": 4.9,
-    }  # fmt: skip
-    text = prior_alone.alone_tables(
-        {"weights": "abc", "threads": 2, "n_views": 4, "rows": rows, "speed": speed}
-    )
+        "shape": [9, 8, 7],
+        "voxel_mm": 0.8,
+        "seconds": dict.fromkeys(prior_alone.VOLUMES, 5.5),
+        "tile_voxels": 72,
+        "tiling_difference": 2e-4,
+        "all_views_seconds": 4.9,
+    }
+    text = prior_alone.alone_tables({"weights": "abc", "threads": 2, "n_views": 4, "rows": rows, "speed": speed})
     assert "| +2.90 (!) | 0.810 | 2.5 |" in text
     assert "| +2.10 | 0.840 (!) | 2.5 |" in text
     assert "| +0.50 | 0.500 | 2.5 |" in text  # nothing was asked of two stacks
-    assert (
-        "the network 5.5 s (asked: under 5 (!)), and the mean over the 4 views of the product 4.9 s." in text
-    )
+    assert "the network 5.5 s (asked: under 5 (!)), and the mean over the 4 views of the product 4.9 s." in text
     assert "2.0e-04 of the intensity scale (asked: 0.001)" in text
 
 
@@ -133,12 +131,7 @@ def test_networks_differ_from_the_configuration():
     per_epoch = prior_networks.epochs_of(10**6, config) / 10**6
     assert prior_networks.epochs_of(1, config) == 1
     assert prior_networks.epochs_of(300, config) == max(1, round(300 * per_epoch))
-    own = [
-        "--data.subjects_per_epoch=6",
-        "--data.patches_per_subject=4",
-        "--data.batch_size=2",
-        "--data.source=9",
-    ]
+    own = ["--data.subjects_per_epoch=6", "--data.patches_per_subject=4", "--data.batch_size=2", "--data.source=9"]
     assert prior_networks.epochs_of(36, config, own) == 3
 
 
@@ -151,9 +144,7 @@ def test_network_options_are_those_of_the_module():
 def test_scores_by_number_of_stacks():
     pytest.importorskip("torchmetrics", reason="the training extra is not installed")
     truth = torch.rand(1, 1, 12, 12, 12)
-    volumes = [
-        {"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)
-    ]
+    volumes = [{"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)]
     made = [truth + error for error in (0.1, 0.01, 0.03)]
     scores = prior_network_scores.scores_by_stacks(made, volumes)
     assert scores["1"]["psnr_db"] == pytest.approx(20, abs=1e-3)
@@ -181,9 +172,7 @@ def test_the_newest_checkpoint_is_gone_on_with(tmp_path):
 
 
 def test_figures(tmp_path):
-    draw_ablation(
-        ablation_rows(), prior_ablation.VARIANTS, prior_ablation.BASELINE, tmp_path / "new" / "a.png"
-    )
+    draw_ablation(ablation_rows(), prior_ablation.VARIANTS, prior_ablation.BASELINE, tmp_path / "new" / "a.png")
     draw_networks(network_record(), tmp_path / "b.png")
     assert all(path.stat().st_size > 10_000 for path in (tmp_path / "new" / "a.png", tmp_path / "b.png"))
     assert len(list(tmp_path.iterdir())) == 2  # nothing is left beside

@@ -15,12 +15,12 @@ from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose
 from studies.motion.figure import draw_slice_errors, jerk_slices, places_in_time
 from studies.motion.layers import case_folders
-from studies.motion.sweep import LEVELS, recipes
+from studies.motion.sweep import LEVELS, specs
 from studies.runs import orientation_deg
-from studies.subjects import SubjectRecipe, simulated_subject
+from studies.subjects import SubjectSpec, simulated_subject
 from studies.subjects import test_data_folder as data_folder
 
-RECIPE = SubjectRecipe(name="tiny", volume="week", motion="moderate", seed=1)
+RECIPE = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
 
 
 @pytest.fixture
@@ -38,9 +38,9 @@ def atlas(tmp_path, rng):
 
 def test_every_subject_has_a_seed_of_its_own():
     kinds = [{"turned": turned, "development": dev} for turned in (False, True) for dev in (False, True)]
-    every = [one for kind in kinds for one in recipes(LEVELS, 100, **kind)]
+    every = [one for kind in kinds for one in specs(LEVELS, 100, **kind)]
     assert len({one.seed for one in every}) == len({one.name for one in every}) == 1200
-    assert recipes(["severe"], 2)[1] == recipes(LEVELS, 10)[21]
+    assert specs(["severe"], 2)[1] == specs(LEVELS, 10)[21]
 
 
 def test_subject_is_simulated_once_and_read_back(atlas, tmp_path):

@@ -14,10 +14,18 @@ from studies.runs import preset_settings
 
 def subject(level, median, p90, *, warned, psnr=None):
     row = {
-        "level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90,
-        "bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0,
+        "level": level,
+        "seed": 1,
+        "header_mm": 9.0,
+        "median_mm": median,
+        "p90_mm": p90,
+        "worst_mm": 2 * p90,
+        "bad": median >= 1,
+        "warned": warned,
+        "seconds": 20.0,
+        "cpu_seconds": 35.0,
         "orientation_deg": 2.0 if median < 1 else None if level == "mild" else 90.0,
-    }  # fmt: skip
+    }
     return row if psnr is None else {**row, "psnr_db": psnr}
 
 
@@ -29,9 +37,7 @@ def test_sweep_counts_who_was_warned():
         "d": subject("severe", 1.0, 3.0, warned=False),  # not under a millimetre
         "e": subject("mild", 0.3, 0.5, warned=False),
     }
-    text = motion_sweep.sweep_tables(
-        {"preset": "balanced", "full": False, "jobs": 1, "threads": 2, "subjects": rows}
-    )
+    text = motion_sweep.sweep_tables({"preset": "balanced", "full": False, "jobs": 1, "threads": 2, "subjects": rows})
     assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 0 | 0 | 0 | 100% | 20 | 35 |" in text
     assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 1 | 1 | 1 | 50% | 20 | 35 |" in text
     assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | yes | 90.0 | 20 | 35 |" in text
@@ -40,9 +46,7 @@ def test_sweep_counts_who_was_warned():
 
 def test_sweep_with_volumes():
     rows = {"a": subject("mild", 0.4, 1.0, warned=False, psnr=28.04), "b": subject("mild", 9, 9, warned=True)}
-    text = motion_sweep.sweep_tables(
-        {"preset": "fast", "full": True, "jobs": 2, "threads": 1, "subjects": rows}
-    )
+    text = motion_sweep.sweep_tables({"preset": "fast", "full": True, "jobs": 2, "threads": 1, "subjects": rows})
     assert "| 35 | 28.0 |" in text
     assert "| 35 | 28.04 |" in text
     assert "| 35 | none |" in text  # refused: no volume
@@ -62,19 +66,29 @@ def test_layer_tables_leave_gaps_where_nothing_was_measured():
 
 
 def test_bias_table():
-    run = {"volume": "v", "bias": 0.15, "shading": "estimated", "seed": 7, "median_mm": 0.5,
-           "p90_mm": 1.0, "warned": False, "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}  # fmt: skip
+    run = {
+        "volume": "v",
+        "bias": 0.15,
+        "shading": "estimated",
+        "seed": 7,
+        "median_mm": 0.5,
+        "p90_mm": 1.0,
+        "warned": False,
+        "psnr_db": 28.0,
+        "ssim": 0.97,
+        "seconds": 26.4,
+    }
     text = motion_bias.table({"preset": "balanced", "threads": 2, "runs": [run]})
     assert "| v | 7 | 0.15 | estimated | 0.50 | 1.00 | 28.00 | 0.970 | - | 26 |" in text
 
 
 def test_nested_settings():
     settings = PRESETS["balanced"]
-    other = changed(settings, {"motion.n_rounds": 0, "use_prior": False})
+    other = changed(settings, {"registration.n_rounds": 0, "use_prior": False})
     assert (other.motion.n_rounds, other.use_prior) == (0, False)
     assert other.slice_stage == settings.slice_stage
     with pytest.raises(ValueError, match="no field 'n_turns'"):
-        changed(settings, {"motion.n_turns": 1})
+        changed(settings, {"registration.n_turns": 1})
     with pytest.raises(InputError, match="--preset best"):
         preset_settings("best")
 

@@ -5,9 +5,14 @@ from studies.tradeoff.time_budgets import budget_table
 
 def entry(budget_s: float, seconds: float, psnr_db: float) -> dict[str, object]:
     return {
-        "budget_s": budget_s, "seconds": seconds, "psnr_db": psnr_db, "motion": "draft", "fit": "fast",
-        "n_steps": 5, "n_gaussians": 1234,
-    }  # fmt: skip
+        "budget_s": budget_s,
+        "seconds": seconds,
+        "psnr_db": psnr_db,
+        "motion": "draft",
+        "fit": "fast",
+        "n_steps": 5,
+        "n_gaussians": 1234,
+    }
 
 
 def test_late_and_worse_are_marked_and_nothing_else():

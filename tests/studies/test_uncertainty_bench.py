@@ -73,16 +73,26 @@ def test_fit_and_check_share_no_volume_and_no_seed() -> None:
 def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
     rng = np.random.default_rng(seed)
     n = 4000
-    evidence = {
-        "unmeasured": rng.uniform(0, 1, n), "from_prior": rng.exponential(0.02, n),
-        "edge": rng.exponential(0.05, n), "texture": rng.exponential(0.03, n),
-        "residual": 0.02 + rng.exponential(0.02, n), "depth_mm": rng.uniform(1, 30, n),
-    }  # fmt: skip
+    predictors = {
+        "unmeasured": rng.uniform(0, 1, n),
+        "from_prior": rng.exponential(0.02, n),
+        "edge": rng.exponential(0.05, n),
+        "texture": rng.exponential(0.03, n),
+        "residual": 0.02 + rng.exponential(0.02, n),
+        "depth_mm": rng.uniform(1, 30, n),
+    }
     return SimpleNamespace(
-        label=name, n_stacks=n_stacks, evidence=evidence, error=rng.exponential(evidence["residual"]),
-        psnr_db=28.0, median_mm=0.1, trusted=None, seconds=1.0, map_seconds=0.5,
+        label=name,
+        n_stacks=n_stacks,
+        predictors=predictors,
+        error=rng.exponential(predictors["residual"]),
+        psnr_db=28.0,
+        median_mm=0.1,
+        reliable=None,
+        seconds=1.0,
+        map_seconds=0.5,
         registered=True,
-    )  # fmt: skip
+    )
 
 
 def test_record_table_and_figure(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader  # noqa: E402
 
 from g3r.pose_network.inference import as_pose  # noqa: E402
 from g3r.pose_network.network import PoseStep  # noqa: E402
-from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss
+from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss  # noqa: E402
 
 SMALL = {"channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2, "warmup_steps": 1, "n_ages": 2}
 CONFIG = "lightning_configs/pose.yaml"
@@ -67,10 +67,15 @@ class TinyData(lightning.LightningDataModule):
 
 def trainer(folder, **options):
     return lightning.Trainer(
-        default_root_dir=folder, logger=TensorBoardLogger(folder, name="run"), enable_model_summary=False,
-        num_sanity_val_steps=0, accelerator="cpu", enable_progress_bar=False, log_every_n_steps=1,
+        default_root_dir=folder,
+        logger=TensorBoardLogger(folder, name="run"),
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        log_every_n_steps=1,
         **{"max_epochs": 1, **options},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +121,7 @@ def test_export_gives_the_same_network(trained, tmp_path, capsys):
     batch = sample(5)
     with torch.no_grad():
         torch.testing.assert_close(
-            network(batch)[-1].translation_mm,
-            module.network.eval()(batch)[-1].translation_mm,
-            rtol=0,
-            atol=0.1,
+            network(batch)[-1].translation_mm, module.network.eval()(batch)[-1].translation_mm, rtol=0, atol=0.1
         )  # float16
     assert meta.template.weeks.tolist() == [25, 26]
     assert "TinyData(n_ages=2, pixel_mm=3.0, source=atlas)" in meta.training_data

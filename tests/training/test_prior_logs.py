@@ -23,12 +23,23 @@ from g3r.training import prior_module as training  # noqa: E402
 
 NETWORK = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4}
 TINY_TRAINING = [
-    "--config", "lightning_configs/prior.yaml", "--model.channels=[8,8]", "--model.units=[1,1]",
-    "--data.spacing_mm=3.0", "--data.patch_size=16", "--data.patches_per_subject=4", "--data.batch_size=4",
-    "--data.subjects_per_epoch=2", "--data.val_subjects=2", "--data.val_crop=16", "--data.num_workers=0",
-    "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.enable_progress_bar=false",
+    "--config",
+    "lightning_configs/prior.yaml",
+    "--model.channels=[8,8]",
+    "--model.units=[1,1]",
+    "--data.spacing_mm=3.0",
+    "--data.patch_size=16",
+    "--data.patches_per_subject=4",
+    "--data.batch_size=4",
+    "--data.subjects_per_epoch=2",
+    "--data.val_subjects=2",
+    "--data.val_crop=16",
+    "--data.num_workers=0",
+    "--trainer.accelerator=cpu",
+    "--trainer.log_every_n_steps=1",
+    "--trainer.enable_progress_bar=false",
     "--trainer.max_time=null",
-]  # fmt: skip
+]
 
 
 def volumes(n, seed=0, size=12):
@@ -60,9 +71,13 @@ def log(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
     run = lightning.Trainer(
-        accelerator="cpu", max_epochs=2, logger=training.TensorBoardLogger(folder, name="run"),
-        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
-    )  # fmt: skip
+        accelerator="cpu",
+        max_epochs=2,
+        logger=training.TensorBoardLogger(folder, name="run"),
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=1,
+    )
     run.fit(training.PriorModule(**NETWORK), ValidatedByStacks())
     found = accumulators.EventAccumulator(str(folder / "run" / "version_0"))
     found.Reload()
@@ -111,16 +126,18 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path):
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
     first = training.PriorModule(**NETWORK)
     options = {
-        "accelerator": "cpu", "max_steps": 1, "logger": False, "enable_progress_bar": False,
-        "enable_model_summary": False, "enable_checkpointing": False,
-    }  # fmt: skip
+        "accelerator": "cpu",
+        "max_steps": 1,
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+    }
     run = lightning.Trainer(**options)
     run.fit(first, ValidatedByStacks())
     run.save_checkpoint(tmp_path / "run.ckpt")
     network = first.network
-    save_prior_checkpoint(
-        tmp_path / "prior.pt", network, PriorCheckpoint(network.arguments(), first.voxel_mm, "noise")
-    )
+    save_prior_checkpoint(tmp_path / "prior.pt", network, PriorCheckpoint(network.arguments(), first.voxel_mm, "noise"))
     data = ValidatedByStacks()
     data.spacing_mm = 1.0
     again = training.PriorModule(**NETWORK, start_from=str(tmp_path / "prior.pt"))
@@ -172,10 +189,7 @@ def test_training_goes_on_after_a_kill(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "flags",
-    [
-        ["--trainer.precision=bf16-mixed"],
-        ["--trainer.devices=2", "--trainer.strategy=ddp"],
-    ],
+    [["--trainer.precision=bf16-mixed"], ["--trainer.devices=2", "--trainer.strategy=ddp"]],
     ids=["mixed precision", "two devices"],
 )
 def test_trainer_flags(tmp_path, flags):
@@ -195,9 +209,7 @@ def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
     for name in ("placenta-a", "placenta-b"):
         image = np.where(mask, 300 + 200 * gaussian_filter(generator.normal(size=mask.shape), 1.5), 0)
         (tmp_path / "atlas" / name).mkdir(parents=True)
-        save_volume(
-            tmp_path / "atlas" / name / "t2.nii.gz", image.astype(np.float32), np.diag([3.0, 3, 3, 1])
-        )
+        save_volume(tmp_path / "atlas" / name / "t2.nii.gz", image.astype(np.float32), np.diag([3.0, 3, 3, 1]))
         save_volume(tmp_path / "atlas" / name / "mask.nii.gz", mask, np.diag([3.0, 3, 3, 1]))
     process = run_training(tmp_path, "--trainer.max_epochs=1", f"--data.source={tmp_path / 'atlas'}")
     words, _ = process.communicate(timeout=400)

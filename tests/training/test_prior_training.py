@@ -233,9 +233,7 @@ def test_symmetries_turn_all_volumes_alike():
 
 def test_symmetries_keep_the_shape():
     batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
-    assert {tuple(training.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {
-        (1, 1, 4, 4, 6)
-    }
+    assert {tuple(training.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
 
 
 def test_scores_leave_out_samples_without_a_brain():

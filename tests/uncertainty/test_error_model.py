@@ -20,7 +20,7 @@ from g3r.uncertainty.error_model import (
 from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR, calibration
 
 
-def evidence(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def predictors(n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Evidence over the range that reconstructions show."""
     return {
         "unmeasured": rng.uniform(0, 1, n),
@@ -47,9 +47,7 @@ def test_known_model_is_found_again() -> None:
 def test_the_mean_is_right_whatever_the_distribution() -> None:
     rng = np.random.default_rng(1)
     x = rng.normal(size=20_000)
-    error = (
-        np.exp(-2 + 0.4 * x) * rng.choice([0.0, 4.0], 20_000, p=[0.75, 0.25]) * rng.choice([-1, 1], 20_000)
-    )
+    error = np.exp(-2 + 0.4 * x) * rng.choice([0.0, 4.0], 20_000, p=[0.75, 0.25]) * rng.choice([-1, 1], 20_000)
     found = fit_model({"x": x}, error)
     expected = np.exp(found.intercept + found.coefficients["x"] * x)
     assert expected.mean() == pytest.approx(np.abs(error).mean(), rel=0.02)
@@ -85,7 +83,7 @@ def test_too_few_voxels() -> None:
 
 @pytest.mark.parametrize("name", [WITH_PRIOR, WITHOUT_PRIOR])
 def test_shipped_calibration_grows_with_every_doubt(name: str) -> None:
-    model, known = calibration()[name], evidence(500, np.random.default_rng(4))
+    model, known = calibration()[name], predictors(500, np.random.default_rng(4))
     before = model.expected(known)
     assert np.isfinite(before).all()
     assert before.min() >= SMALLEST
@@ -98,7 +96,7 @@ def test_shipped_calibration_grows_with_every_doubt(name: str) -> None:
 
 
 def test_less_density_is_more_uncertain() -> None:
-    model, known = calibration()[WITH_PRIOR], evidence(500, np.random.default_rng(5))
+    model, known = calibration()[WITH_PRIOR], predictors(500, np.random.default_rng(5))
     sparse, dense = {**known, "unmeasured": np.full(500, 0.37)}, {**known, "unmeasured": np.full(500, 0.05)}
     more, less = model.expected(sparse), model.expected(dense)
     assert (more >= less).all()
@@ -108,7 +106,7 @@ def test_less_density_is_more_uncertain() -> None:
 
 def test_extremes_stay_finite() -> None:
     for size in (0.0, 1e-30, 1e6):
-        known = {name: np.full(3, size) for name in evidence(1, np.random.default_rng(6))}
+        known = {name: np.full(3, size) for name in predictors(1, np.random.default_rng(6))}
         for model in calibration().values():
             u = model.expected(known)
             assert np.isfinite(u).all()
@@ -116,14 +114,14 @@ def test_extremes_stay_finite() -> None:
 
 
 def test_missing_evidence_is_named() -> None:
-    known = evidence(5, np.random.default_rng(7))
+    known = predictors(5, np.random.default_rng(7))
     del known["prior_share"]
     with pytest.raises(ValueError, match="prior_share"):
         ErrorModel(0.0, {"prior_share": 1.0}).expected(known)
 
 
 def test_file_keeps_the_model(tmp_path: Path) -> None:
-    model = ErrorModel(-2.5, dict.fromkeys(terms(evidence(5, np.random.default_rng(8))), 0.25))
+    model = ErrorModel(-2.5, dict.fromkeys(terms(predictors(5, np.random.default_rng(8))), 0.25))
     save_calibration(tmp_path / "c.json", {"a": model}, {"a": {"subjects": ["x"]}})
     assert load_calibration(tmp_path / "c.json") == ({"a": model}, {"a": {"subjects": ["x"]}})
 

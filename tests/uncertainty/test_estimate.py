@@ -11,8 +11,8 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty import estimate_uncertainty
-from g3r.uncertainty.estimate import DOUBTED_NOTE, MEANING, UNCHECKED_NOTE
-from g3r.uncertainty.predictors import gather_evidence, mean_residual
+from g3r.uncertainty.estimate import MEANING, UNCHECKED_NOTE, UNRELIABLE_NOTE
+from g3r.uncertainty.predictors import gather_predictors, mean_residual
 
 SHAPE = (24, 22, 20)
 
@@ -41,16 +41,24 @@ def fit_of(noise: float) -> SliceFit:
     z = np.arange(-9.0, 9.1, 2.0)
     n = len(z)
     planes = Planes(
-        np.tile(np.eye(3), (n, 1, 1)), np.c_[np.zeros((n, 2)), z], np.ones((n, 2)), np.full((n, 2), 20),
+        np.tile(np.eye(3), (n, 1, 1)),
+        np.c_[np.zeros((n, 2)), z],
+        np.ones((n, 2)),
+        np.full((n, 2), 20),
         np.tile([0.26, 0.26, 0.72], (n, 1)),
-    )  # fmt: skip
+    )
     value = render(cloud, planes).numpy()
     upper = z[planes.plane_id()] > 0
     value = value + np.where(upper, noise * rng.standard_normal(len(value)), 0).astype(np.float32)
     slices = Slices(
-        planes, value.astype(np.float32), np.ones(len(value), bool), np.zeros(n, np.int64), np.arange(n),
-        np.full(n, 2.0), planes.pose,
-    )  # fmt: skip
+        planes,
+        value.astype(np.float32),
+        np.ones(len(value), bool),
+        np.zeros(n, np.int64),
+        np.arange(n),
+        np.full(n, 2.0),
+        planes.pose,
+    )
     return SliceFit(cloud, slices, np.ones(n), np.ones(n), [], [])
 
 
@@ -68,7 +76,7 @@ def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options:
 
 def test_residual_is_where_the_noise_is(grid: VolumeGrid) -> None:
     fit = fit_of(0.1)
-    found = mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.shading, grid)
+    found = mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.bias_field, grid)
     assert found.shape == grid.shape
     # mean absolute value of a normal deviate: 0.8 of its deviation
     assert np.median(found[6:18, 6:18, 14:17]) == pytest.approx(0.08, rel=0.15)
@@ -113,12 +121,12 @@ def test_noise_and_missing_slices_raise_it(grid: VolumeGrid, mask: np.ndarray) -
     np.testing.assert_array_equal(sparse[right], calm[right])
 
 
-@pytest.mark.parametrize(("trusted", "note"), [(False, DOUBTED_NOTE), (None, UNCHECKED_NOTE), (True, None)])
+@pytest.mark.parametrize(("trusted", "note"), [(False, UNRELIABLE_NOTE), (None, UNCHECKED_NOTE), (True, None)])
 def test_doubted_registration_is_said(
-    grid: VolumeGrid, mask: np.ndarray, trusted: bool | None, note: str | None
+    grid: VolumeGrid, mask: np.ndarray, reliable: bool | None, note: str | None
 ) -> None:
-    record = uncertainty_of(fit_of(0.02), grid, mask, trusted=trusted).record
-    assert record["registration_trusted"] is trusted
+    record = uncertainty_of(fit_of(0.02), grid, mask, reliable=reliable).record
+    assert record["registration_reliable"] is reliable
     assert record.get("note") == note
 
 
@@ -141,7 +149,7 @@ def test_evidence_in_a_corner_of_the_grid(grid: VolumeGrid) -> None:
     corner = np.zeros(grid.shape, bool)
     corner[:3, :3, :3] = True
     flat = np.full(grid.shape, 0.5, np.float32)
-    found = gather_evidence(flat, corner, grid, residual=flat, density=flat, prior=flat, prior_share=None)
+    found = gather_predictors(flat, corner, grid, residual=flat, density=flat, prior=flat, prior_share=None)
     assert {len(values) for values in found.values()} == {27}
     assert found["edge"].max() < 1e-6  # the rim of the mask is no edge of the brain
     assert found["depth_mm"].min() == 1.0

@@ -38,7 +38,7 @@ def whole_fit(prior: np.ndarray, slices: Slices) -> tuple[SliceFit, np.ndarray, 
     density = coarse_and_density(slices, GRID)[1]
     target = VolumeTarget.of(prior, (BALL * np.maximum(np.exp(-density), 1e-3)).astype(np.float32), GRID)
     ones = np.ones(len(slices))
-    settings = SliceStageSettings(n_steps=40, optimise_poses=False, optimise_shading=False)
+    settings = SliceStageSettings(n_steps=40, optimise_poses=False, optimise_bias_field=False)
     fit = fit_slices(cloud, slices, ones, ones, target, settings, rng)
     return fit, as_volume(cloud), as_volume(fit.cloud)
 
@@ -96,12 +96,10 @@ def test_the_share_is_given_on_any_grid_and_is_repeatable(volume: np.ndarray) ->
     fit, _, _ = whole_fit(volume, slices)
     density = coarse_and_density(slices, GRID)[1]
     fine = VolumeGrid.isotropic([-11] * 3, [11] * 3, 0.7)
-    mask = (
-        fine.world(np.stack(np.meshgrid(*[np.arange(n) for n in fine.shape], indexing="ij"), -1)) ** 2
-    ).sum(-1) < 9.5**2
-    one, two = (
-        estimate_prior_share(fit, density, GRID, mask, fine, np.random.default_rng(3)) for _ in range(2)
-    )
+    mask = (fine.world(np.stack(np.meshgrid(*[np.arange(n) for n in fine.shape], indexing="ij"), -1)) ** 2).sum(
+        -1
+    ) < 9.5**2
+    one, two = (estimate_prior_share(fit, density, GRID, mask, fine, np.random.default_rng(3)) for _ in range(2))
     assert one.shape == fine.shape
     np.testing.assert_array_equal(one, two)
     assert one[mask].mean() == pytest.approx(share_of(fit, slices)[BALL].mean(), abs=0.05)
