@@ -37,7 +37,7 @@ def pose_deg(rotation, translation_mm):
 
 
 @pytest.mark.parametrize(
-    ("rotation_deg", "shift_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
+    ("rotation_deg", "translation_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
 )
 def test_a_known_motion_is_found(rotation_deg, translation_mm):
     reference, mask = on_grid(GRID)

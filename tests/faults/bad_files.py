@@ -14,7 +14,8 @@ from typing import Any
 
 import nibabel as nib
 import numpy as np
-from nifti_files import AFFINE, SHAPE, ball, image, raw, write, write_raw
+
+from tests.faults.nifti_files import AFFINE, SHAPE, ball, image, raw, write, write_raw
 
 Maker = Callable[[Path], Path]
 

@@ -24,11 +24,12 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import pytest
-from nifti_files import write
-from tally import Counts, Tally, table
+
+from tests.faults.nifti_files import write
+from tests.faults.tally import Counts, Tally, table
 
 if TYPE_CHECKING:
-    from small_case import Killed, SmallCase
+    from tests.faults.small_case import Killed, SmallCase
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +89,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 @pytest.fixture(scope="session")
 def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
     """A case that is reconstructed in about a second."""
-    from small_case import make_small_case
+    from tests.faults.small_case import make_small_case
 
     return make_small_case(tmp_path_factory.mktemp("small-case"))
 
@@ -96,7 +97,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> SmallCase:
 @pytest.fixture(scope="session")
 def killed() -> Iterator[Killed]:
     """Runs of g3r-infer in processes of their own, to be killed."""
-    from small_case import fork_server
+    from tests.faults.small_case import fork_server
 
     with fork_server() as run:
         yield run

@@ -1,6 +1,6 @@
 """Runs fuzz cases: in the test's process, or many of them in one of its own with bounded memory.
 
-python tests/faults/fuzz.py headers 10000 1        # prints a line of JSON with the counts
+python -m tests.faults.fuzz headers 10000 1        # prints a line of JSON with the counts
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from commands import TooSlowError, within
-
 from g3r.errors import InputError
+from tests.faults.commands import TooSlowError, within
 
 MAX_SECONDS = 5.0
 MAX_GAINED_BYTES = 1_500_000_000
@@ -35,13 +34,13 @@ class Fuzz(Protocol):
 
 
 def header_fuzz(folder: Path, seed: int) -> Fuzz:
-    from fuzz_headers import HeaderFuzz
+    from tests.faults.fuzz_headers import HeaderFuzz
 
     return HeaderFuzz(folder, seed)
 
 
 def checkpoint_fuzz(folder: Path, seed: int) -> Fuzz:
-    from fuzz_checkpoints import CheckpointFuzz
+    from tests.faults.fuzz_checkpoints import CheckpointFuzz
 
     return CheckpointFuzz(folder, seed)
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzz_headers import damaged_bytes
 
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.checkpoints.file import weights_digest
@@ -24,6 +23,7 @@ from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid, load_pose_
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from tests.faults.fuzz_headers import damaged_bytes
 
 Loader = Callable[[Path], tuple[torch.nn.Module, Any]]
 

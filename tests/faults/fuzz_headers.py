@@ -1,6 +1,6 @@
 """Random damage to NIfTI files. Each case must load as a whole stack, or end in one `InputError`.
 
-`python tests/faults/fuzz.py headers 10000 1` runs them in a process with bounded memory (fuzz.py).
+`python -m tests.faults.fuzz headers 10000 1` runs them in a process with bounded memory (fuzz.py).
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import gzip
 from pathlib import Path
 
 import numpy as np
-from nifti_files import ball, image, raw, write
 
 from g3r.acquisition.planes import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
+from tests.faults.nifti_files import ball, image, raw, write
 
 SHAPE = (14, 12, 5)
 

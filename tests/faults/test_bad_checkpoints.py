@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 import torch
-from commands import assert_refused, run
-from fuzz_checkpoints import Canary, rewritten, small_pose, small_prior
-from nifti_files import write
-from tally import Tally
 
 from g3r.cli import export
 from g3r.cli.infer import main
 from g3r.errors import InputError
 from g3r.prior.checkpoint import load_prior
+from tests.faults.commands import assert_refused, run
+from tests.faults.fuzz_checkpoints import Canary, rewritten, small_pose, small_prior
+from tests.faults.nifti_files import write
+from tests.faults.tally import Tally
 
 pytestmark = pytest.mark.usefixtures("networks_once")
 

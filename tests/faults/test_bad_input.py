@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bad_files import BAD_MASKS, BAD_STACKS, moved
-from commands import assert_refused, run
-from nifti_files import AFFINE, ball, image, write
-from tally import Tally
 
 from g3r.cli.infer import main
+from tests.faults.bad_files import BAD_MASKS, BAD_STACKS, moved
+from tests.faults.commands import assert_refused, run
+from tests.faults.nifti_files import AFFINE, ball, image, write
+from tests.faults.tally import Tally
 
 REFUSES = "g3r-infer"
 

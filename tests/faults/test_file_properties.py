@@ -9,17 +9,17 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 import pytest
-from commands import assert_refused, run
-from fuzz_headers import FIELDS, NUMBERS
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from nifti_files import ball, image, write, write_raw
 from scipy.spatial.transform import Rotation
-from tally import Tally
 
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.cli.infer import main
+from tests.faults.commands import assert_refused, run
+from tests.faults.fuzz_headers import FIELDS, NUMBERS
+from tests.faults.nifti_files import ball, image, write, write_raw
+from tests.faults.tally import Tally
 
 FIELD_EPSILON = float(np.finfo(np.float32).eps)
 """NIfTI-1 keeps affines as float32."""

@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from fuzz import KINDS, run_cases
-from tally import Tally
+
+from tests.faults.fuzz import KINDS, run_cases
+from tests.faults.tally import Tally
 
 FEW, MANY = 300, 10_000
 SEED = 20_261
@@ -29,8 +30,8 @@ def test_a_few_hundred_cases(kind: str, tmp_path: Path, tally: Tally):
 @pytest.mark.parametrize("kind", KINDS)
 def test_ten_thousand_cases_with_bounded_memory(kind: str, tally: Tally):
     """In a process of its own: a crash of the interpreter, a hang or a lack of memory would end it."""
-    line = [sys.executable, str(Path(__file__).with_name("fuzz.py")), kind, str(MANY), str(SEED + 1)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=400)
+    line = [sys.executable, "-m", "tests.faults.fuzz", kind, str(MANY), str(SEED + 1)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=400, cwd=Path(__file__).parents[2])
     if done.returncode:
         tally.add(MANY)
     assert done.returncode == 0, done.stderr[-3000:]

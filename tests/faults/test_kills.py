@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_case import WHOLE, Killed, SmallCase, names
-from tally import Tally
 
 from g3r.acquisition.images import load_volume
+from tests.faults.small_case import WHOLE, Killed, SmallCase, names
+from tests.faults.tally import Tally
 
 N_KILLS, N_SIGNALS = 24, 12
 

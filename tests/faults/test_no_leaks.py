@@ -12,9 +12,7 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 import pytest
-from nifti_files import AFFINE, ball, image, write_raw
 from scipy.ndimage import gaussian_filter
-from tally import Tally
 
 from data_synth import cli as simulate
 from g3r.acquisition.header_text import HeaderText, read_header_text
@@ -22,6 +20,8 @@ from g3r.acquisition.images import load_volume, save_volume
 from g3r.cli.infer import main
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
+from tests.faults.nifti_files import AFFINE, ball, image, write_raw
+from tests.faults.tally import Tally
 
 CANARY = "DOE^JANE 1987"
 """As short as the shortest text field, so that each can hold it whole."""

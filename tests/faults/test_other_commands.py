@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from bad_files import BAD_STACKS, USABLE_AS_A_VOLUME
-from commands import assert_refused, run
-from nifti_files import ball, write
-from tally import Tally
 
 from data_synth import cli as simulate
 from g3r.cli import bench, export
 from g3r.cli.infer import main as infer
+from tests.faults.bad_files import BAD_STACKS, USABLE_AS_A_VOLUME
+from tests.faults.commands import assert_refused, run
+from tests.faults.nifti_files import ball, write
+from tests.faults.tally import Tally
 
 
 @pytest.fixture(autouse=True, scope="module")

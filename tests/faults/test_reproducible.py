@@ -12,12 +12,12 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from small_case import SmallCase
-from tally import Tally
 
 from g3r.cli.infer import main as infer
 from g3r.errors import InputError
 from g3r.output.earlier_run import FileHash, read_run
+from tests.faults.small_case import SmallCase
+from tests.faults.tally import Tally
 
 SAME = ("volume.nii.gz", "mask.nii.gz", "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "sections.png")
 QUICK = ("--preset", "draft", "--resolution", "2", "--thickness", "4")

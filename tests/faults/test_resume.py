@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_case import SmallCase, names
-from tally import Tally
 
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
@@ -22,6 +20,8 @@ from g3r.geometry import RigidPose
 from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 from g3r.run.stage_store import NAMES, RECORDS, Stages, stage_rng
+from tests.faults.small_case import SmallCase, names
+from tests.faults.tally import Tally
 
 STAGES = ("motion", "prior", "fit-to-prior", "fit-to-slices")
 

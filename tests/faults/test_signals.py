@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_case import WHOLE, SmallCase, names
-from tally import Tally
 
 from g3r.acquisition.images import load_volume
 from g3r.gaussians import GaussianCloud
 from g3r.planning.presets import PRESETS
+from tests.faults.small_case import WHOLE, SmallCase, names
+from tests.faults.tally import Tally
 
 N_STEPS = PRESETS["draft"].slice_stage.n_steps
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from tally import Case, Counts, Tally, table
+
+from tests.faults.tally import Case, Counts, Tally, table
 
 
 def wrong_after_all(case: Case) -> None:
@@ -33,12 +35,12 @@ def test_cases_are_counted_and_errors_are_lost_and_go_on():
 
 @pytest.mark.parametrize("refused", [1, 2])
 def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int):
-    for name in ("conftest.py", "tally.py", "nifti_files.py"):
-        shutil.copy(Path(__file__).with_name(name), tmp_path)
+    shutil.copy(Path(__file__).with_name("conftest.py"), tmp_path)
     test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
     (tmp_path / "test_kills.py").write_text(test)
     line = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(tmp_path), "--rootdir", str(tmp_path)]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == (pytest.ExitCode.TESTS_FAILED if refused == 1 else 0), done.stdout
     lines = [line.split() for line in done.stdout.splitlines()]
     assert ["kills", "3", "1", str(refused), str(2 - refused)] in lines

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tally import Tally
 
 from g3r.errors import InputError
+from tests.faults.tally import Tally
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 pytest.importorskip("torchio", reason="the training extra is not installed")

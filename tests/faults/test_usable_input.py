@@ -14,13 +14,13 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 import pytest
-from bad_files import header, moved, only_sform
-from commands import run
-from nifti_files import AFFINE, SHAPE, ball, image, raw, write, write_raw
-from tally import Tally
 
 from g3r.acquisition.stacks import load_stack
 from g3r.cli.infer import main
+from tests.faults.bad_files import header, moved, only_sform
+from tests.faults.commands import run
+from tests.faults.nifti_files import AFFINE, SHAPE, ball, image, raw, write, write_raw
+from tests.faults.tally import Tally
 
 pytestmark = pytest.mark.usefixtures("networks_once")
 

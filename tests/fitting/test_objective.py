@@ -6,7 +6,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from test_stages import BALL, GRID, make_slices, seeded, true_cloud
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.errors import NumericalError
@@ -19,6 +18,7 @@ from g3r.fitting.slice_term import SliceTerm
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.overlap import OverlapFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
+from tests.fitting.test_stages import BALL, GRID, make_slices, seeded, true_cloud
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, bias_field_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4

@@ -34,7 +34,7 @@ def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
     return cloud, Planes(rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2)))
 
 
-@pytest.mark.parametrize("amplitude", ["exact", "printed"])
+@pytest.mark.parametrize("attenuation", ["exact", "printed"])
 def test_the_adjoint_of_the_system(attenuation: str):
     cloud, planes = scene()
     rng = np.random.default_rng(1)
@@ -68,7 +68,7 @@ def test_records_that_may_not_be_kept_are_made_again():
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])
-@pytest.mark.parametrize("amplitude", ["exact", "printed"])
+@pytest.mark.parametrize("attenuation", ["exact", "printed"])
 def test_known_peaks_are_recovered(attenuation: str, damping: float):
     cloud, planes = scene()
     gain = np.linspace(0.5, 2, len(planes))

@@ -45,7 +45,7 @@ def gradients(leaves, planes, pixel_weight, dtype, **options):
     return pixels.detach(), [leaf.grad for leaf in leaves]
 
 
-@pytest.mark.parametrize("amplitude", ["exact", "printed"])
+@pytest.mark.parametrize("attenuation", ["exact", "printed"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("psf", [1.0, 0.0])
 def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
@@ -60,7 +60,7 @@ def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
         assert (a - b).norm() <= 1e-4 * a.norm(), name
 
 
-@pytest.mark.parametrize("amplitude", ["exact", "printed"])
+@pytest.mark.parametrize("attenuation", ["exact", "printed"])
 def test_reference_gradcheck(attenuation):
     leaves, planes, _ = scene(3, n=2, n_planes=2)
     planes = Planes(

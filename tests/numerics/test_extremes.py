@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from fast_backends import BACKENDS, FAST
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes
@@ -19,6 +18,7 @@ from g3r.geometry import RigidPose
 from studies.numerics.errors import gradient_tolerance, shape_tolerance, sized_scenes
 from studies.numerics.oracles import volume_at
 from studies.numerics.scenes import ORIGIN_MM, Scene, cloud_of, head_scene, single, slender_scenes, stacks_of_planes
+from tests.numerics.fast_backends import BACKENDS, FAST
 
 
 def of_sigma(sigma_mm: float, thickness_mm: float) -> Scene:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from fast_backends import BACKENDS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -16,6 +15,7 @@ from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
 from studies.numerics.errors import shape_tolerance
 from studies.numerics.scenes import Scene, cloud_of, single
+from tests.numerics.fast_backends import BACKENDS
 
 QUICK = settings(
     max_examples=40,

@@ -1,7 +1,6 @@
 """Heads that the tests of registration share; making them takes longer than most of the tests."""
 
 import pytest
-from moving_heads import Moving, as_slices, simulated
 
 from data_synth.heads import PhantomSubject
 from data_synth.motion import LEVELS
@@ -12,6 +11,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
+from tests.registration.moving_heads import Moving, as_slices, simulated
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_heads import STILL, as_slices, pixel_errors_mm, simulated, turned_about
 from scipy.ndimage import gaussian_filter
 
 from data_synth.motion import MotionLevel
@@ -15,6 +14,7 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.bias_correction import LENGTH_MM, bias_corrected
 from g3r.registration.prior_registration import register_to_prior
+from tests.registration.moving_heads import STILL, as_slices, pixel_errors_mm, simulated, turned_about
 
 
 def shaded(slices: Slices, strength: float) -> Slices:

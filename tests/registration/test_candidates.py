@@ -4,16 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_heads import (
-    STILL,
-    Moving,
-    as_slices,
-    pixel_errors_mm,
-    simulated,
-    slices_disturbed,
-    stack_moved,
-    turned_about,
-)
 
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
@@ -30,6 +20,16 @@ from g3r.registration.candidates import (
 )
 from g3r.registration.placement import StackSamples, refine_placement, volume_without
 from g3r.registration.segments import head_distance_mm
+from tests.registration.moving_heads import (
+    STILL,
+    Moving,
+    as_slices,
+    pixel_errors_mm,
+    simulated,
+    slices_disturbed,
+    stack_moved,
+    turned_about,
+)
 
 
 @pytest.fixture(scope="module")

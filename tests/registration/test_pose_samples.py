@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from moving_heads import slices_disturbed
 from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -21,6 +20,7 @@ from g3r.registration.pose_samples import (
     turns_about,
     uniform_rotations,
 )
+from tests.registration.moving_heads import slices_disturbed
 
 CENTER_MM = np.array([10.0, -20.0, 30.0])
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from moving_heads import STILL, Moving, as_slices, simulated
 
 from data_synth.phantom import Phantom, fetal_brain_phantom
 from data_synth.simulator import SimulatedStack
@@ -19,6 +18,7 @@ from g3r.registration.quality import (
     stack_qualities,
 )
 from g3r.registration.slice_rounds import DROPPED_WEIGHT, MAX_DROPPED_SHARE, slice_weights
+from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
 
 QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)
 
@@ -81,7 +81,7 @@ def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[f
 
 
 @pytest.mark.parametrize(
-    ("held_out", "ncc", "weight", "sure"),
+    ("held_out", "ncc", "weight", "reliable"),
     [
         (0.8, 0.95, 1.0, True),
         (MIN_HELD_OUT - 0.01, 0.95, 1.0, False),

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_heads import Moving, as_slices, pixel_errors_mm, simulated, slices_disturbed
 
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
@@ -22,6 +21,7 @@ from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.registration.slice_rounds import slice_weights
 from g3r.registration.stack_registration import register_stacks, self_consistency
+from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm, simulated, slices_disturbed
 
 OFF = RegistrationSettings(template=False, network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=1.8)
 

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from initialisation import given, settings
-from initialisation import strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.interleave import acquisition_order

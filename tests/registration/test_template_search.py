@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from moving_heads import Moving, as_slices, pixel_errors_mm, rotation_angle_deg, simulated, turned_about
 from scipy.spatial.transform import Rotation
 
 from data_synth.phantom import Phantom
@@ -25,6 +24,14 @@ from g3r.registration.template_search import (
     place_in_template,
     template_fits,
     template_orientations,
+)
+from tests.registration.moving_heads import (
+    Moving,
+    as_slices,
+    pixel_errors_mm,
+    rotation_angle_deg,
+    simulated,
+    turned_about,
 )
 
 TURNS = {"180 x": [np.pi, 0, 0], "180 z": [0, 0, np.pi], "oblique": [2.0, -1.2, 1.5]}

@@ -121,7 +121,7 @@ def test_noise_and_missing_slices_raise_it(grid: VolumeGrid, mask: np.ndarray) -
     np.testing.assert_array_equal(sparse[right], calm[right])
 
 
-@pytest.mark.parametrize(("trusted", "note"), [(False, UNRELIABLE_NOTE), (None, UNCHECKED_NOTE), (True, None)])
+@pytest.mark.parametrize(("reliable", "note"), [(False, UNRELIABLE_NOTE), (None, UNCHECKED_NOTE), (True, None)])
 def test_doubted_registration_is_said(
     grid: VolumeGrid, mask: np.ndarray, reliable: bool | None, note: str | None
 ) -> None:

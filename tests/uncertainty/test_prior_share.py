@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from test_stages import BALL, GRID, INDEX, make_slices, seeded, true_cloud
 
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
@@ -14,6 +13,7 @@ from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty.prior_share import estimate_prior_share
+from tests.fitting.test_stages import BALL, GRID, INDEX, make_slices, seeded, true_cloud
 
 UPPER = GRID.world(INDEX)[..., 2] > 2.0
 LOWER = GRID.world(INDEX)[..., 2] < -2.0
