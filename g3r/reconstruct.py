@@ -1,192 +1,165 @@
-"""GaussianReconstructor: the pipeline from stacks to a volume, a screen of calls."""
+"""GaussianReconstructor: the way of the data from stacks to a volume."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
-from g3r.acquisition.planes import Slices
+from g3r.acquisition.planes import Planes, Slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import fit_adaptive
-from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
+from g3r.fitting.initial_volumes import (
+    InitialVolumes,
+    PriorVolume,
+    gaussian_spacing_mm,
+    normalised_slices,
+    with_pixels_of,
+)
 from g3r.fitting.observer import FitObserver
-from g3r.fitting.prior_stage import VolumeTarget, fit_prior
+from g3r.fitting.prior_stage import PriorCloud, VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
-from g3r.output.assemble import Cut, RunSoFar, cut_short, finished
-from g3r.output.record import Clock, skipped_slice_notes
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.output.assemble import StageResults, assemble
 from g3r.output.result import ReconstructionResult
-from g3r.planning.presets import PRESETS, ReconstructionSettings
-from g3r.planning.time_budget import TimeBudget
+from g3r.planning.presets import ReconstructionSettings, adapted, preset
+from g3r.planning.stages import Stage, stage_rng
+from g3r.planning.time_budget import FixedPlan, Plan
 from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
 from g3r.pose_network.inference import predict_poses
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.checkpoint import PriorCheckpoint, load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.inference import estimate_prior
-from g3r.registration import Registration, register
+from g3r.registration import Registration, RegistrationSettings, register
+from g3r.registration.atlas_frame import Orientation
 from g3r.registration.prior_registration import register_to_prior
-from g3r.registration.quality import pose_warnings, stack_qualities
+from g3r.registration.quality import StackQuality, pose_warnings, stack_qualities
 from g3r.registration.template_search import head_volume_mm3, template_fits
 from g3r.run.allocator import release_memory
+from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
-from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
-from g3r.run.stop_request import StopRequest
+
+STORED_RECORDS = (
+    Registration,
+    InitialVolumes,
+    PriorVolume,
+    PriorCloud,
+    SliceFit,
+    Slices,
+    Planes,
+    RigidPose,
+    Orientation,
+    VolumeGrid,
+    GaussianCloud,
+)
+"""What the files of a stage store may hold."""
+
+RESOLUTION_RANGE_MM = (0.3, 3.0)
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
 DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
 
-RESOLUTION_RANGE_MM = (0.3, 3.0)
+NOTE_ON_SINGLE = {
+    None: "slices of the single stack stay where the atlas template or the header has them",
+    True: "slices of the single stack were registered to the prior volume",
+    False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
+}
+"""By whether they moved to the prior; None where that was not tried."""
 
 MIN_DISTILLATION = 1e-3
 """Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
 
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, steps done, steps in all)."""
 
-
-@dataclass
 class GaussianReconstructor:
     """Reconstructs subjects with one prior and one set of settings.
 
     Args:
-        checkpoint: prior file written by g3r-export; the weights that ship with the package when None.
+        checkpoint: prior written by g3r-export; the one that ships with the package when None.
         settings: see `ReconstructionSettings`, or the name of a preset.
-        progress: called with (stage, done, total) as each stage goes on.
-        pose_checkpoint: pose network and mean heads, written by g3r-export; those shipped when None.
-        observer: sees the cloud as the fit to the slices goes on.
+        pose_checkpoint: pose network and atlas template, written by g3r-export; those shipped when None.
+        observer: sees the cloud during the fit to the slices.
 
     Raises:
         InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
     """
 
-    checkpoint: str | os.PathLike[str] | None = None
-    settings: ReconstructionSettings | str = "balanced"
-    progress: Progress = lambda stage, done, total: None
-    pose_checkpoint: str | os.PathLike[str] | None = None
-    observer: FitObserver | None = None
-    pose_network: PoseNetwork | None = field(init=False, default=None)
-    pose_meta: PoseCheckpoint | None = field(init=False, default=None)
-    network: DensityGatedPriorNetwork | None = field(init=False, default=None)
-    prior_meta: PriorCheckpoint | None = field(init=False, default=None)
-    _at: tuple[str, int, int] = field(init=False, default=("", 0, 0))
-
-    def __post_init__(self) -> None:
-        if isinstance(self.settings, str):
-            if self.settings not in PRESETS:
-                raise InputError(f"preset {self.settings!r}; expected one of {', '.join(PRESETS)}")
-            self.settings = PRESETS[self.settings]
+    def __init__(
+        self,
+        checkpoint: str | os.PathLike[str] | None = None,
+        settings: ReconstructionSettings | str = "balanced",
+        *,
+        pose_checkpoint: str | os.PathLike[str] | None = None,
+        observer: FitObserver | None = None,
+    ) -> None:
+        self.settings = preset(settings) if isinstance(settings, str) else settings
+        self.observer = observer
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
+        self.network: DensityGatedPriorNetwork | None = None
+        self.prior_meta: PriorCheckpoint | None = None
+        self.pose_network: PoseNetwork | None = None
+        self.pose_meta: PoseCheckpoint | None = None
         if self.settings.use_prior:
-            path = Path(self.checkpoint or DEFAULT_CHECKPOINT)
+            path = Path(checkpoint or DEFAULT_CHECKPOINT)
             self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
         if self.settings.registration.template or self.settings.registration.network:
-            path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
-            self.pose_network, self.pose_meta = load_pose_network(path)
+            self.pose_network, self.pose_meta = load_pose_network(Path(pose_checkpoint or DEFAULT_POSE_CHECKPOINT))
 
     def reconstruct(
         self,
         stacks: Sequence[Stack],
-        motion: Registration | None = None,
-        budget: TimeBudget | None = None,
+        registration: Registration | None = None,
         *,
-        stages: Stages | None = None,
-        stop_request: StopRequest | None = None,
+        plan: Plan | None = None,
+        run: RunContext | None = None,
     ) -> ReconstructionResult:
         """The volume, maps, poses and record of one subject.
 
         Args:
             stacks: one or more, of one head.
-            motion: what `register_stacks` (here or elsewhere) found for the same stacks, to fit
-                several times to one registration; found here when None. Slices of a single stack still move
-                to the prior volume afterwards, where there is one.
-            budget: chooses registration, views of the prior, Gaussians and steps in place of the settings.
-            stages: keeps what each stage gives, or has it from an earlier run; nothing is kept when None.
-            stop_request: a signal during the fit gives the volume so far (`record["partial"]`); before it,
-                and without this, `KeyboardInterrupt` passes through.
+            registration: what `register_stacks` found for the same stacks, to fit several times to one registration;
+                found here when None. Slices of a single stack still move to the prior volume afterwards.
+            plan: settings and deadlines; the reconstructor's settings without a deadline when None.
+            run: stage store, stop request and progress. A stop request during the fit gives the volume so far
+                (`record.partial`); before it, and without one, `KeyboardInterrupt` passes through.
 
         Raises:
-            InputError: stacks that cannot be used, or a motion of other slices.
+            InputError: stacks that cannot be used, or a registration of other slices.
             NumericalError: a fit that broke down.
         """
-        assert isinstance(self.settings, ReconstructionSettings)
-        stages = stages or Stages()
-        clock, notes, by_then = stages.clock, list[str](), None
-        slices, first_scale = normalised_slices(stacks)
-        notes += skipped_slice_notes(stacks, slices)
-        single = len(np.unique(slices.stack_id)) == 1
-        settings = _settings_for(self.settings, single)
-        if single:
-            notes.append("shading not estimated: a single stack cannot tell it from anatomy")
-        if motion is not None:
-            with clock("motion"):
-                motion = with_pixels_of(slices, motion)
-            notes.append("motion was given, not estimated here")
-        else:
-            if budget:
-                settings, by_then = budget.for_registration(settings)
-            motion = stages.once("motion", lambda: self._motion(slices, settings, clock, by_then))
-        qualities = stack_qualities(motion, len(stacks))
-        warnings = pose_warnings(motion, qualities, stacks)
-        if settings.registration.standard_orientation and motion.orientation is None:
-            notes.append(
-                "standard orientation unknown, the volume stays in scanner space: no mean head fits the "
-                f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
-            )
-        volume, settings = self._prior_volume(motion, settings, stages, budget, single)
-        notes += _notes_on_single(volume.accepted) if single else []
-        intensity = first_scale * volume.scale
-        run = RunSoFar(
-            stacks,
-            settings,
-            self.prior_meta,
-            self.pose_meta,
-            motion,
-            qualities,
-            volume,
-            intensity,
-            stages,
-            budget,
-            notes,
-            warnings,
+        plan, run = plan or FixedPlan(self.settings), run or RunContext()
+        slices, intensity = self._slices(stacks, run)
+        poses = self._poses(slices, registration, plan, run)
+        qualities = self._judge(poses, stacks, plan, run)
+        volumes = run.stage(Stage.COARSE, lambda: self._volumes(poses.slices, poses.gain, poses.weight))
+        prior = self._prior(volumes, poses, plan, run)
+        cloud = run.droppable_stage(Stage.FIT_TO_PRIOR, lambda: self._fit_to_prior(prior, plan, run))
+        fit = run.stoppable_stage(
+            Stage.FIT_TO_SLICES, lambda: self._fit_to_slices(cloud, prior, poses, plan, run)
         )
-        try:
-            second_by = None
-            if budget:
-                settings, by_then, second_by = budget.for_fit(
-                    settings,
-                    volume.start,
-                    volume.prior,
-                    clock.seconds["coarse"],
-                    math.prod(run.grid.shape),
-                    np.random.default_rng(settings.seed),
-                )
-                run = replace(run, settings=settings)
-            first = stages.once("fit to prior", lambda: self._prior_cloud(run, by_then))
-        except KeyboardInterrupt:
-            if stop_request is None or not stop_request.is_requested():
-                raise
-            stop_request.postpone()
-            return cut_short(run, self._cut("fit to prior", settings.prior_stage.n_steps), None, None)
-        if stop_request is None:
-            return finished(run, first, stages.once("fit to slices", lambda: self._fit(run, first, second_by)))
-        stop_request.postpone()
-        second_by = stop_request.cut(second_by)
-        fit = stages.once("fit to slices", lambda: self._fit(run, first, second_by), unless=stop_request.is_requested)
-        if stop_request.is_requested():
-            cut = Cut("fit to slices", len(fit.history), settings.slice_stage.n_steps)
-            return cut_short(run, cut, first, fit)
-        return finished(run, first, fit)
+        found = StageResults(
+            stacks=stacks,
+            registration=poses,
+            qualities=qualities,
+            prior=prior,
+            intensity=intensity * prior.scale,
+            cloud=cloud,
+            fit=fit,
+            prior_record=asdict(self.prior_meta) if self.prior_meta else None,
+            pose_record=self._pose_record(),
+        )
+        return assemble(found, plan, run)
 
     def register_stacks(self, stacks: Sequence[Stack]) -> Registration:
         """Poses of all slices of some stacks, as `reconstruct` finds them and takes them.
@@ -197,161 +170,174 @@ class GaussianReconstructor:
         return self.register(normalised_slices(stacks)[0])
 
     def register(
-        self, slices: Slices, settings: ReconstructionSettings | None = None, deadline: Deadline | None = None
+        self,
+        slices: Slices,
+        settings: RegistrationSettings | None = None,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+        deadline: Deadline | None = None,
     ) -> Registration:
         """Poses of all slices, with this reconstructor's template and pose network.
 
         Args:
             slices: at their header poses, intensities of order one.
             settings: those of the reconstructor when None.
-            deadline: see `register`.
+            progress: called with (rounds done, rounds in all).
+            deadline: when the search has to end.
         """
-        chosen = settings or self.settings
-        assert isinstance(chosen, ReconstructionSettings)
+        settings = settings or self.settings.registration
         template = self.pose_meta.template if self.pose_meta else None
         proposals = {}
-        wanted = chosen.registration.network
-        if chosen.registration.network_as_reserve:
+        wanted = settings.network
+        if settings.network_as_reserve:
             wanted &= template is None or not template_fits(slices, template)
         if self.pose_network is not None and self.pose_meta is not None and wanted:
             pose = predict_poses(self.pose_network, self.pose_meta, slices)
             proposals["network"] = pose @ slices.header_pose.inverse()
-        return register(
-            slices,
-            chosen.registration,
-            self._report("motion"),
-            template=template,
-            proposals=proposals,
-            deadline=deadline,
+        return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
+
+    def _pose_record(self) -> dict[str, str] | None:
+        meta = self.pose_meta
+        return {"training_data": meta.training_data, "g3r_version": meta.g3r_version} if meta else None
+
+    def _slices(self, stacks: Sequence[Stack], run: RunContext) -> tuple[Slices, float]:
+        """The slices at their header poses, in normalised intensities, and what 1 stands for."""
+        slices, scale = normalised_slices(stacks)
+        run.notes += skipped_slice_notes(stacks, slices)
+        if slices.n_stacks == 1:
+            run.notes.append("bias field not estimated: a single stack cannot tell it from anatomy")
+        return slices, scale
+
+    def _poses(
+        self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext
+    ) -> Registration:
+        if given is not None:
+            run.notes.append("registration was given, not estimated here")
+            with run.clock(Stage.REGISTRATION):
+                return with_pixels_of(slices, given)
+        deadline = plan.for_registration()
+        report = run.report(Stage.REGISTRATION)
+        return run.stage(
+            Stage.REGISTRATION, lambda: self.register(slices, plan.settings.registration, report, deadline)
         )
 
-    def _motion(
-        self, slices: Slices, settings: ReconstructionSettings, clock: Clock, deadline: Deadline | None
-    ) -> Registration:
-        with clock("motion"):
-            return self.register(slices, settings, deadline)
+    def _judge(
+        self, poses: Registration, stacks: Sequence[Stack], plan: Plan, run: RunContext
+    ) -> list[StackQuality]:
+        """How far the poses of each stack can be relied on; what cannot is said."""
+        qualities = stack_qualities(poses, len(stacks))
+        run.warnings += pose_warnings(poses, qualities, stacks)
+        if plan.settings.registration.standard_orientation and poses.orientation is None:
+            run.notes.append(
+                "standard orientation unknown, the volume stays in scanner space: no atlas template fits the "
+                f"{head_volume_mm3(poses.slices) / 1000:.0f} ml that are masked; check the masks"
+            )
+        return qualities
 
-    def _prior_volume(
-        self,
-        motion: Registration,
-        settings: ReconstructionSettings,
-        stages: Stages,
-        budget: TimeBudget | None,
-        single: bool,
-    ) -> tuple[PriorVolume, ReconstructionSettings]:
-        """The prior volume, and the settings with the views that the budget allowed."""
-        chosen = settings
+    def _volumes(
+        self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> InitialVolumes:
+        """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
+        voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
+        return InitialVolumes.of(slices, gain, weight, voxel_mm)
 
-        def make() -> PriorVolume:
-            nonlocal chosen
-            clock, gain = stages.clock, motion.gain
-            voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
-            with clock("coarse"):
-                start = FitStart.of(motion.slices, gain, motion.weight, voxel_mm)
-            if budget:
-                chosen = budget.for_prior(settings, clock.seconds["coarse"])
-            with clock("prior"):
-                self.progress("prior", 0, 1)
-                prior = self._prior(start, chosen)
-                self.progress("prior", 1, 1)
-            scale, accepted = start.scale, None
-            if single and settings.use_prior and settings.registration.segments:
-                with clock("slices to prior"):
-                    nudged, gain, accepted = register_to_prior(start.slices, gain, prior, start.grid)
-                    if accepted:
-                        start = FitStart.of(nudged, gain, motion.weight, voxel_mm)
-                        scale *= start.scale
-                        prior = self._prior(start, chosen)
-            return PriorVolume(start, prior, gain, scale, accepted)
+    def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
+        """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
+        plan.for_prior(run.clock.seconds[Stage.COARSE])
+        report = run.report(Stage.PRIOR)
+        report(0, 1)
+        values = run.stage(Stage.PRIOR, lambda: self._prior_values(volumes, plan.settings))
+        report(1, 1)
+        prior = PriorVolume(volumes=volumes, values=values, gain=poses.gain, scale=volumes.scale)
+        if volumes.slices.n_stacks > 1:
+            return prior
+        if plan.settings.use_prior and plan.settings.registration.segments:
+            prior = run.stage(
+                Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses.weight, plan.settings)
+            )
+        run.notes.append(NOTE_ON_SINGLE[prior.accepted])
+        return prior
 
-        return stages.once("prior", make), chosen
-
-    def _prior(self, start: FitStart, settings: ReconstructionSettings) -> NDArray[np.float32]:
+    def _prior_values(self, volumes: InitialVolumes, settings: ReconstructionSettings) -> NDArray[np.float32]:
         if self.network is None:
-            return start.sharp
-        prior = estimate_prior(
+            return volumes.sharp
+        values = estimate_prior(
             self.network,
-            start.coarse,
-            start.density,
-            start.sharp,
+            volumes.coarse,
+            volumes.density,
+            volumes.sharp,
             n_views=settings.prior_views,
             max_whole_voxels=settings.prior_whole_voxels,
             tile_voxels=settings.prior_tile_voxels,
             halo_voxels=settings.prior_halo_voxels,
         )
         release_memory()  # the most that is ever freed at a time
-        return prior
+        return values
 
-    def _prior_cloud(self, run: RunSoFar, deadline: Deadline | None) -> PriorCloud:
-        """Stage 1 of the fit."""
-        settings, start, prior = run.settings, run.volume.start, run.volume.prior
-        report, stage = self._report("fit to prior"), settings.prior_stage
-        rng = stage_rng(settings.seed, "fit to prior")
-        spacing_mm = gaussian_spacing_mm(start.slices, settings.gaussian_spacing_pixels)
-        with run.stages.clock("fit to prior"):
-            if settings.adaptive is not None:
-                cloud, found = fit_adaptive(
-                    prior, start.mask, start.grid, spacing_mm, settings.adaptive, stage, rng, report, deadline
-                )
-                counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
-                return PriorCloud(cloud, found.loss, counts)
-            cloud = seed_cloud(prior, start.mask, start.grid, spacing_mm)
-            counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-            target = VolumeTarget.of(prior, start.mask.astype(np.float32), start.grid)
-            cloud, history = fit_prior(cloud, target, stage, rng, report, deadline)
-            return PriorCloud(cloud, history, counts)
+    def _slices_to_prior(
+        self, prior: PriorVolume, weight: NDArray[np.float64], settings: ReconstructionSettings
+    ) -> PriorVolume:
+        """The slices registered to the prior volume, and the prior volume that they give there."""
+        before = prior.volumes
+        slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
+        if not accepted:
+            return replace(prior, gain=gain, accepted=False)
+        volumes = self._volumes(slices, gain, weight)
+        values = self._prior_values(volumes, settings)
+        scale = prior.scale * volumes.scale
+        return PriorVolume(volumes=volumes, values=values, gain=gain, scale=scale, accepted=True)
 
-    def _fit(self, run: RunSoFar, first: PriorCloud, deadline: Deadline | None) -> SliceFit:
-        """Stage 2 of the fit."""
-        settings, start = run.settings, run.volume.start
-        with run.stages.clock("fit to slices"):
-            distil_to = None
-            if settings.use_prior and settings.distillation:
-                # the prior counts where slices are sparse; where they are dense they know better. It was made
-                # of the same slices: from several stacks only 1 - c of what it says there is its own
-                power = 1 if len(np.unique(start.slices.stack_id)) == 1 else 2
-                unmeasured = np.maximum((1 - confidence(start.density)) ** power, MIN_DISTILLATION)
-                slice_weight = (unmeasured * start.mask).astype(np.float32)
-                distil_to = VolumeTarget.of(run.volume.prior, slice_weight, start.grid)
-            return fit_slices(
-                first.cloud,
-                start.slices,
-                run.volume.gain,
-                run.motion.weight,
-                distil_to,
-                settings.slice_stage,
-                stage_rng(settings.seed, "fit to slices"),
-                self._report("fit to slices"),
+    def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud:
+        """Gaussians seeded in the prior volume and fitted to it (Eq. 8)."""
+        volumes, values, coarse_s = prior.volumes, prior.values, run.clock.seconds[Stage.COARSE]
+        n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
+        deadline = plan.for_fit_to_prior(volumes, values, coarse_s, n_output_voxels)
+        settings, report = plan.settings, run.report(Stage.FIT_TO_PRIOR)
+        rng = stage_rng(settings.seed, Stage.FIT_TO_PRIOR)
+        spacing_mm = gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels)
+        if settings.adaptive is not None:
+            cloud, found = fit_adaptive(
+                values,
+                volumes.mask,
+                volumes.grid,
+                spacing_mm,
+                settings.adaptive,
+                settings.prior_stage,
+                rng,
+                report,
                 deadline,
-                self.observer,
             )
+            counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
+            return PriorCloud(cloud, found.loss, counts)
+        cloud = seed_cloud(values, volumes.mask, volumes.grid, spacing_mm)
+        counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
+        target = VolumeTarget.of(values, volumes.mask.astype(np.float32), volumes.grid)
+        cloud, history = fit_prior(cloud, target, settings.prior_stage, rng, report, deadline)
+        return PriorCloud(cloud, history, counts)
 
-    def _report(self, stage: str) -> Callable[[int, int], None]:
-        def report(done: int, total: int) -> None:
-            self._at = stage, done, total
-            self.progress(stage, done, total)
-
-        return report
-
-    def _cut(self, stage: str, n_steps: int) -> Cut:
-        """Where the run is now, if it has begun the stage."""
-        return Cut(*self._at) if self._at[0] == stage else Cut(stage, 0, n_steps)
-
-
-def _settings_for(settings: ReconstructionSettings, single: bool) -> ReconstructionSettings:
-    """The settings as they hold for a single stack, or for several."""
-    stage = settings.slice_stage
-    if single:
-        # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
-        held = settings.use_prior and settings.distillation and settings.registration.segments
-        return replace(settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held))
-    # several stacks check each other: the schedule alone decides how hard the prior pulls
-    return replace(settings, slice_stage=replace(stage, prior_error=0.0))
-
-
-def _notes_on_single(accepted: bool | None) -> list[str]:
-    if accepted is None:
-        return ["slices of the single stack stay where the mean head or the header has them"]
-    if accepted:
-        return ["slices of the single stack were registered to the prior volume"]
-    return ["slices of the single stack stay in line up to the fit: the prior gave no reason to move"]
+    def _fit_to_slices(
+        self, cloud: PriorCloud | None, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
+    ) -> SliceFit | None:
+        """Gaussians and poses fitted to the slices, held to the prior where slices are sparse (Eq. 9)."""
+        if cloud is None:
+            return None
+        volumes = prior.volumes
+        settings = adapted(plan.settings, volumes.slices.n_stacks)
+        distil_to = None
+        if settings.use_prior and settings.distillation:
+            # the prior counts where slices are sparse; where they are dense they know better. It was made
+            # of the same slices: from several stacks only 1 - c of what it says there is its own
+            power = 1 if volumes.slices.n_stacks == 1 else 2
+            unmeasured = np.maximum((1 - confidence(volumes.density)) ** power, MIN_DISTILLATION)
+            distil_to = VolumeTarget.of(prior.values, (unmeasured * volumes.mask).astype(np.float32), volumes.grid)
+        return fit_slices(
+            cloud.cloud,
+            volumes.slices,
+            prior.gain,
+            poses.weight,
+            distil_to,
+            settings.slice_stage,
+            stage_rng(settings.seed, Stage.FIT_TO_SLICES),
+            run.report(Stage.FIT_TO_SLICES),
+            run.deadline(plan.for_fit_to_slices()),
+            self.observer,
+        )

@@ -22,9 +22,19 @@ MARGIN_MM = 5.0
 """Of the prior's grid around the masked pixels."""
 
 
-@dataclass(frozen=True)
-class FitStart:
-    """Slices, V_coarse and V_sharp in normalised intensities (given ones over `scale`), M_rho, mask."""
+@dataclass(frozen=True, kw_only=True)
+class InitialVolumes:
+    """Posed slices and the volumes that they give by themselves, in normalised intensities.
+
+    Attributes:
+        slices: given intensities over `scale`.
+        coarse: V_coarse [I, J, K] (G3R Eq. 6).
+        density: M_rho [I, J, K] (G3R Eq. 6).
+        sharp: V_sharp [I, J, K], the least-squares volume.
+        mask: foreground [I, J, K].
+        grid: of all four.
+        scale: what intensities were divided by.
+    """
 
     slices: Slices
     coarse: NDArray[np.float32]
@@ -35,14 +45,14 @@ class FitStart:
     scale: float
 
     @classmethod
-    def of(cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float) -> FitStart:
-        """The start for slices in their poses.
+    def of(cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float) -> InitialVolumes:
+        """The volumes of slices in their poses.
 
         Args:
             slices: K slices.
             gain: [K] intensity factors.
-            weight: [K] trust.
-            voxel_mm: of the grid.
+            weight: [K] slice weights.
+            voxel_mm: voxel size of the grid.
         """
         grid = grid_around(slices, voxel_mm, margin_mm=MARGIN_MM)
         slice_weight = weight[slices.pixel_plane]
@@ -51,7 +61,27 @@ class FitStart:
         scale = normalisation_scale(coarse, density)
         slices = slices.scaled(1 / scale)
         mask = foreground_mask(slices, grid, weight)
-        return cls(slices, coarse / np.float32(scale), density, sharp / np.float32(scale), mask, grid, scale)
+        coarse, sharp = coarse / np.float32(scale), sharp / np.float32(scale)
+        return cls(slices=slices, coarse=coarse, density=density, sharp=sharp, mask=mask, grid=grid, scale=scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorVolume:
+    """What the fit starts from and is drawn to.
+
+    Attributes:
+        volumes: the slices as they are fitted, and the volumes that they give.
+        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp where no network is used.
+        gain: [K] intensity factors of the slices.
+        scale: what intensities were divided by since registration.
+        accepted: whether slices of a single stack moved to the prior; None where that was not tried.
+    """
+
+    volumes: InitialVolumes
+    values: NDArray[np.float32]
+    gain: NDArray[np.float64]
+    scale: float
+    accepted: bool | None = None
 
 
 def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
@@ -67,19 +97,19 @@ def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
     return slices.scaled(1 / scale), scale
 
 
-def with_pixels_of(slices: Slices, motion: Registration) -> Registration:
-    """A motion estimate with the pixels of the slices to be fitted.
+def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
+    """A registration with the pixels of the slices to be fitted.
 
     Raises:
         InputError: the two are not about the same slices.
     """
-    found = motion.slices
+    found = registration.slices
     if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
         raise InputError(
-            f"motion of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
+            f"registration of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "
             "register the same stacks with the same masks"
         )
-    return replace(motion, slices=slices.with_pose(found.planes.pose))
+    return replace(registration, slices=slices.with_pose(found.planes.pose))
 
 
 def gaussian_spacing_mm(slices: Slices, spacing_pixels: float) -> float:

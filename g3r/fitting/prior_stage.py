@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,15 @@ class PriorStageSettings:
     steps_per_draw: int = 10
     cutoff_sigma: float = CUTOFF_SIGMA
     projection_bytes: int = MAX_PROJECTION_BYTES
+
+
+@dataclass(frozen=True)
+class PriorCloud:
+    """The cloud that the fit to the prior gives, the loss of each step, and how its Gaussians came about."""
+
+    cloud: GaussianCloud
+    history: list[float]
+    counts: dict[str, Any]
 
 
 @dataclass(frozen=True)

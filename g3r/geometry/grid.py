@@ -47,6 +47,12 @@ class VolumeGrid:
         affine[:3, 3] = (low + high) / 2 - (shape - 1) / 2 * spacing_mm
         return cls((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
+    def respaced(self, spacing_mm: float) -> VolumeGrid:
+        """The axis-aligned grid of cubic voxels of another size over the same box; this grid where the size is its own."""
+        if np.isclose(self.spacing_mm[0], spacing_mm, rtol=1e-6):
+            return self
+        return VolumeGrid.isotropic(self.world([0, 0, 0]), self.world(np.array(self.shape) - 1), spacing_mm)
+
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
         """Distance of neighbouring voxels along each axis [3]."""

@@ -1,151 +1,285 @@
-"""run.json: what is needed to judge a result and to run it again."""
+"""run.json as a record: what is needed to judge a result and to run it again; file names only, no paths."""
 
 from __future__ import annotations
 
-import logging
+import json
+import os
 import platform
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from g3r._version import __version__
-from g3r.acquisition.planes import MIN_SLICE_PIXELS, Slices
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
-from g3r.fitting.slice_stage import SliceFit
-from g3r.planning.memory_estimate import peak_bytes
+from g3r.errors import InputError
+from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.presets import ReconstructionSettings
-from g3r.pose_network.checkpoint import PoseCheckpoint
-from g3r.prior.checkpoint import PriorCheckpoint
+from g3r.planning.time_budget import BudgetRecord
 from g3r.registration import Registration
-from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
+from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality, registration_reliable, registration_summary
+from g3r.run.context import StoppedAt
+from g3r.run.json_record import from_plain, to_plain
+from g3r.run.provenance import FileHash
 
-logger = logging.getLogger(__name__)
+MAX_RECORD_BYTES = 50_000_000
 
 
-def run_record(
-    settings: ReconstructionSettings,
-    prior: PriorCheckpoint | None,
-    pose: PoseCheckpoint | None,
+@dataclass(frozen=True, kw_only=True)
+class StackRecord:
+    """One stack: its geometry and how its slices were registered; fields are None where it had no slices."""
+
+    name: str
+    thickness_mm: float
+    spacing_mm: list[float] = field(default_factory=list)
+    n_slices: int = 0
+    quality: StackQuality | None = None
+    interleave: int | None = None
+    n_segments: int | None = None
+    n_downweighted_slices: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationRecord:
+    """How the poses were found.
+
+    Attributes:
+        reliable: whether all stacks are registered; None where nothing checks them (a single stack).
+        summary: one line on all stacks.
+        initialisation: where the search started.
+        held_out_correlation: of each initialisation, stack by stack.
+        space: "standard" or "scanner".
+        correlation_with_template: of the head with the atlas template; None in scanner space.
+        rounds: figures of each round.
+    """
+
+    reliable: bool | None
+    summary: str
+    initialisation: str
+    held_out_correlation: dict[str, list[float]]
+    space: str
+    correlation_with_template: float | None
+    rounds: list[dict[str, float]]
+
+    @classmethod
+    def of(cls, registration: Registration, qualities: Sequence[StackQuality]) -> RegistrationRecord:
+        """The record of a registration."""
+        orientation = registration.orientation
+        return cls(
+            reliable=registration_reliable(qualities),
+            summary=registration_summary(qualities),
+            initialisation=registration.initialisation,
+            held_out_correlation=registration.initialisations,
+            space="scanner" if orientation is None else "standard",
+            correlation_with_template=orientation and orientation.correlation,
+            rounds=registration.history,
+        )
+
+
+@dataclass(frozen=True)
+class InactiveTerm:
+    """A term of the model that is absent, and why."""
+
+    term: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandRecord:
+    """What `g3r-infer` was told."""
+
+    stacks: list[str]
+    preset: str | None
+    seed: int
+    threads: int
+    space: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """The files that a result is made of.
+
+    Attributes:
+        stacks: one per stack.
+        masks: one per stack; empty without.
+        prior, pose_network: None where not used.
+    """
+
+    stacks: tuple[FileHash, ...]
+    masks: tuple[FileHash, ...] = ()
+    prior: FileHash | None = None
+    pose_network: FileHash | None = None
+
+    def named(self) -> dict[str, FileHash]:
+        """All of them, by what they are."""
+        files = {f"stack {n + 1}": file for n, file in enumerate(self.stacks)}
+        files |= {f"mask {n + 1}": file for n, file in enumerate(self.masks)}
+        files |= {"prior": self.prior} if self.prior else {}
+        return files | ({"pose network": self.pose_network} if self.pose_network else {})
+
+    def differences(self, now: Inputs) -> list[str]:
+        """A sentence for each file of `now` that is not the same bytes, or is not used any more."""
+        then, found = self.named(), now.named()
+        lines = [
+            f"{name} ({file.name}) is not the file that the configuration's result was made of"
+            for name, file in found.items()
+            if name not in then or then[name].sha256 != file.sha256
+        ]
+        return lines + [f"{name} ({then[name].name}) is not used now" for name in then if name not in found]
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide the numbers."""
+    return {"python": platform.python_version()} | {name: version(name) for name in ("torch", "numpy", "numba")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """run.json.
+
+    Attributes:
+        settings: as they were used.
+        inputs, command, memory, header_text: what the command adds; None from Python.
+        prior, pose_network: the networks' own records; None where one was not used.
+        registration: None where the file is only a configuration.
+        bias_field: coefficients of each stack's bias field; empty where it was not estimated.
+        gaussians: how their number came about.
+        n_rollbacks: times that a fit went back to its best state.
+        loss: by stage, figures of each step.
+        uncertainty: what `uncertainty.nii.gz` means; None where the run was interrupted.
+        resumed: stages that were taken from an earlier run.
+        partial: whether the run was interrupted, at `stopped_at`.
+    """
+
+    g3r: str = __version__
+    versions: dict[str, str] = field(default_factory=versions)
+    settings: ReconstructionSettings
+    inputs: Inputs | None = None
+    command: CommandRecord | None = None
+    time_budget: BudgetRecord | None = None
+    memory: MemoryRecord | None = None
+    prior: dict[str, Any] | None = None
+    pose_network: dict[str, Any] | None = None
+    stacks: list[StackRecord]
+    registration: RegistrationRecord | None = None
+    bias_field: list[list[float]] = field(default_factory=list)
+    n_gaussians: int = 0
+    gaussians: dict[str, Any] = field(default_factory=dict)
+    n_rollbacks: int = 0
+    inactive_terms: list[InactiveTerm] = field(default_factory=list)
+    loss: dict[str, list[Any]] = field(default_factory=dict)
+    uncertainty: dict[str, Any] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory_bytes: int = 0
+    resumed: list[str] = field(default_factory=list)
+    partial: bool = False
+    stopped_at: StoppedAt | None = None
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    header_text: list[dict[str, Any]] | None = None
+
+    def to_json(self) -> str:
+        """The text of run.json."""
+        return json.dumps(to_plain(self), indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> RunRecord:
+        """The record in the text of a run.json.
+
+        Raises:
+            ValueError: it is no JSON, or not the record of this version.
+        """
+        try:
+            return from_plain(cls, json.loads(text), "run")
+        except RecursionError:
+            raise ValueError("nested too deeply") from None
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> RunRecord:
+        """Read a run.json.
+
+        Raises:
+            InputError: it is no such file, or of a version with other settings.
+        """
+        path = Path(path)
+        try:
+            if path.stat().st_size > MAX_RECORD_BYTES:
+                raise InputError(f"{path}: is too large for a run.json; pass one that g3r-infer wrote")
+            return cls.from_json(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); pass a run.json") from None
+        except (json.JSONDecodeError, UnicodeDecodeError):
+            raise InputError(f"{path}: is not JSON; pass a run.json that g3r-infer wrote") from None
+        except (ValueError, TypeError) as error:
+            raise InputError(
+                f"{path}: is not a run.json of this version of g3r ({error}); pass one that g3r-infer wrote"
+            ) from None
+
+
+def stack_records(
     stacks: Sequence[Stack],
-    slices: Slices,
-    motion: Registration,
-    qualities: list[StackQuality],
-    fit: SliceFit,
-    clock: Clock,
-    notes: list[str],
-    warnings: list[str],
-) -> dict[str, Any]:
-    """run.json: what is needed to judge the result and to run it again; file names only, no paths."""
-    of_stack = [slices.stack_id == n for n in range(len(stacks))]
-    # motion has an entry for each stack that has slices, which not every given one need have
-    place = {int(stack): k for k, stack in enumerate(np.unique(slices.stack_id))}
-    return {
-        "g3r": __version__,
-        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
-        "settings": asdict(settings),
-        "prior": asdict(prior) if prior else None,
-        "pose_network": {"training_data": pose.training_data, "g3r_version": pose.g3r_version} if pose else None,
-        "stacks": [
-            {
-                "name": stack.name,
-                "thickness_mm": stack.thickness_mm,
-                "spacing_mm": [round(float(x), 6) for x in stack.spacing_mm],
-                "n_slices": int(chosen.sum()),
-                "pose_confidence": qualities[n].record(),
-                "interleave": motion.interleave[place[n]] if n in place else None,
-                "n_segments": motion.n_segments[place[n]] if n in place else None,
-                "n_downweighted_slices": int((fit.weight[chosen] < 0.5).sum()),
-            }
-            for n, (stack, chosen) in enumerate(zip(stacks, of_stack, strict=True))
-        ],
-        "shading": fit.bias_field,
-        "n_gaussians": len(fit.cloud),
-        "n_rollbacks": sum("rollback" in entry for entry in fit.history),
-        "registration": {"trusted": registration_reliable(qualities), "summary": registration_summary(qualities)},
-        "motion": {
-            "start": motion.initialisation,
-            "held_out_correlation_by_start": motion.initialisations,
-            "orientation": "scanner" if motion.orientation is None else "standard",
-            "correlation_with_mean_head": motion.orientation and motion.orientation.correlation,
-            "rounds": motion.history,
-        },
-        "seconds": clock.seconds,
-        "cpu_seconds": clock.cpu_seconds,
-        "peak_memory_bytes": peak_bytes(),
-        "notes": notes,
-        "warnings": warnings,
-    }
+    registration: Registration,
+    qualities: Sequence[StackQuality],
+    weight: np.ndarray,
+) -> list[StackRecord]:
+    """One record for each stack that was given.
+
+    Args:
+        stacks: in the order of their numbers in the slices.
+        registration: has an entry for each stack that has slices, which not every given one need have.
+        qualities: one per stack.
+        weight: [K] slice weights at the end of the fit.
+    """
+    stack_id = registration.slices.stack_id
+    place = {int(stack): k for k, stack in enumerate(np.unique(stack_id))}
+    return [
+        StackRecord(
+            name=stack.name,
+            thickness_mm=stack.thickness_mm,
+            spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
+            n_slices=int((stack_id == n).sum()),
+            quality=qualities[n],
+            interleave=registration.interleave[place[n]] if n in place else None,
+            n_segments=registration.n_segments[place[n]] if n in place else None,
+            n_downweighted_slices=int((weight[stack_id == n] < DOWNWEIGHTED_BELOW).sum()),
+        )
+        for n, stack in enumerate(stacks)
+    ]
 
 
-class Clock:
-    """Wall and CPU seconds of each stage, and a line in the log when it ends."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.cpu_seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time what is done inside."""
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.seconds[stage] = round(time.perf_counter() - wall, 3)
-        self.cpu_seconds[stage] = round(time.process_time() - cpu, 3)
-        logger.info("%s: %.1f s", stage, self.seconds[stage])
-
-
-def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
-    """A line for each stack of which slices were left out for want of masked pixels."""
-    lines = []
-    for n, stack in enumerate(stacks):
-        marked = np.flatnonzero(stack.mask.any((0, 1)))
-        missing = sorted(set(marked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
-        if missing:
-            numbers = ", ".join(map(str, missing))
-            lines.append(f"{stack.name}: slices {numbers} left out, fewer than {MIN_SLICE_PIXELS} masked pixels")
-    return lines
-
-
-def inactive_terms(slices: Slices, settings: ReconstructionSettings, counts: dict[str, Any]) -> list[dict[str, str]]:
+def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: dict[str, Any]) -> list[InactiveTerm]:
     """Which terms of the model are absent, each with the reason: what the data cannot determine.
 
     Args:
         slices: that were fitted.
         settings: as they were used for these slices.
-        counts: how the number of Gaussians came about.
+        gaussians: how the number of Gaussians came about.
     """
-    stage, terms = settings.slice_stage, []
+    stage, found = settings.slice_stage, []
     single = len(np.unique(slices.stack_id)) == 1
-
-    def absent(term: str, reason: str) -> None:
-        terms.append({"term": term, "reason": reason})
-
     if len(slices) == 1:
-        absent("gain of the slice", "a single slice: its gain cannot be told from the peaks")
+        found.append(InactiveTerm("gain of the slice", "a single slice: amplitudes explain its gain as well"))
     if single:
-        absent("shading", "a single stack cannot tell it from anatomy")
+        found.append(InactiveTerm("bias field", "a single stack cannot tell it from anatomy"))
     elif not stage.optimise_bias_field:
-        absent("shading", "switched off in the settings")
+        found.append(InactiveTerm("bias field", "switched off in the settings"))
     if not stage.optimise_poses:
-        absent(
-            "poses in the fit",
-            "a single stack without a prior to hold it drifts" if single else "switched off in the settings",
-        )
+        reason = "a single stack without a prior to hold it drifts" if single else "switched off in the settings"
+        found.append(InactiveTerm("poses in the fit", reason))
     if not settings.use_prior:
-        absent("distance to the prior", "no prior was asked for")
+        found.append(InactiveTerm("distance to the prior", "no prior was asked for"))
     elif not settings.distillation:
-        absent("distance to the prior", "distillation is switched off in the settings")
-    bound = counts.get("bound")
-    if bound is not None:
-        absent(
-            "finer Gaussians",
-            f"the prior volume is within {bound:g} (local root mean square) of them for "
-            f"{100 * (1 - counts['share_over_bound']):.1f} % of the head, or they stand "
-            f"{counts['finest_spacing_mm']:.2f} mm apart, as close as pixels can tell",
+        found.append(InactiveTerm("distance to the prior", "distillation is switched off in the settings"))
+    if gaussians.get("bound") is not None:
+        share, spacing_mm = 1 - gaussians["share_over_bound"], gaussians["finest_spacing_mm"]
+        reason = (
+            f"the Gaussians are within {gaussians['bound']:g} (local root mean square) of the prior volume for "
+            f"{100 * share:.1f} % of the head, or {spacing_mm:.2f} mm apart, as close as pixels can tell"
         )
-    return terms
+        found.append(InactiveTerm("finer Gaussians", reason))
+    return found

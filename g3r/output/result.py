@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +16,12 @@ from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
-from g3r.run.output_folder import OutputFolder
+from g3r.output.files import OUTPUT_NAMES, slice_table
+from g3r.output.record import RunRecord
+from g3r.run.output_folder import OutputFolder, check_output_folder
 
 if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
     from g3r.gaussians import GaussianCloud
-
-SLICE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason")
-
-FULL_WEIGHT = 0.99
-"""Slices trusted less than this get a reason in slices.tsv."""
-
-LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
-"""A down-weighted slice with a gain below the first has lost signal; one with less than the second of its
-stack's median of pixels is small; one that correlates less than the third with the volume does not fit."""
-
-OUTPUT_NAMES = (
-    "volume.nii.gz",
-    "mask.nii.gz",
-    "prior.nii.gz",
-    "coarse.nii.gz",
-    "density.nii.gz",
-    "uncertainty.nii.gz",
-    "prior_share.nii.gz",
-    "gaussians.npz",
-    "slices.tsv",
-    "run.json",
-    "sections.png",
-)
 
 CAPTIONS = {
     "density": "1: covered by one gapless stack",
@@ -59,22 +36,22 @@ PICTURE_BYTES = 3_000_000
 """More than the picture, the tables and the record ever took."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructionResult:
     """One reconstructed subject; intensities are those of the stacks.
 
-    Args:
+    Attributes:
         volume, mask: [I, J, K] on `grid`.
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
-        gain, weight, ncc: [K] intensity factor, trust and correlation with the volume of each slice.
+        gain, weight, ncc: [K] intensity factor, weight and correlation with the volume of each slice.
         uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask. None,
-            and not written, where the run was interrupted (`record["partial"]`).
+            and not written, where the run was interrupted (`record.partial`).
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
-        header_text: what the written headers say in words; nothing when None.
+        header_text: text for the headers of the files; nothing when None.
     """
 
     volume: NDArray[np.float32]
@@ -91,9 +68,16 @@ class ReconstructionResult:
     weight: NDArray[np.float64]
     ncc: NDArray[np.float64]
     uncertainty: NDArray[np.float32] | None
-    prior_share: NDArray[np.float32] | None = None
-    record: dict[str, Any] = field(default_factory=dict)
+    prior_share: NDArray[np.float32] | None
+    record: RunRecord
     header_text: HeaderText | None = None
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.grid.shape))
+        return (
+            f"ReconstructionResult({shape} voxels of {self.grid.spacing_mm[0]:g} mm, {len(self.slices)} slices, "
+            f"{len(self.cloud)} Gaussians{', partial' if self.record.partial else ''})"
+        )
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False, run: OutputFolder | None = None) -> None:
         """Write every output into a folder; it appears whole or not at all.
@@ -101,22 +85,22 @@ class ReconstructionResult:
         Args:
             folder: to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
-            run: that holds this folder already; one for this call alone when None.
+            run: holds this folder already; one for this call alone when None.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
         """
         folder = Path(folder)
         if run is None:
-            check_output_folder(folder, replace=replace)
+            check_output_folder(folder, OUTPUT_NAMES, replace=replace)
             with OutputFolder(folder, OUTPUT_NAMES) as run:
                 self.save(folder, replace=replace, run=run)
             return
-        check_output_folder(folder, replace=replace)
+        check_output_folder(folder, OUTPUT_NAMES, replace=replace)
         try:
             run.make_room(self._max_bytes() + PICTURE_BYTES)
-            with run.result() as beside:
-                self._write(beside)
+            with run.result() as staged:
+                self._write(staged)
         except OSError as error:
             raise cannot_be_written(folder, error, self._max_bytes()) from None
 
@@ -143,8 +127,9 @@ class ReconstructionResult:
         from g3r.output.sections import save_sections
 
         self.cloud.save(folder / "gaussians.npz")
-        (folder / "slices.tsv").write_text(self.slice_table(), encoding="utf-8")
-        (folder / "run.json").write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
+        table = slice_table(self.slices, self.gain, self.weight, self.ncc)
+        (folder / "slices.tsv").write_text(table, encoding="utf-8")
+        (folder / "run.json").write_text(self.record.to_json(), encoding="utf-8")
         rows, ranges = {"volume": self.volume}, dict(RANGES)
         if self.uncertainty is not None:
             rows["uncertainty"] = self.uncertainty
@@ -168,86 +153,18 @@ class ReconstructionResult:
         )
 
     def _title(self) -> str:
-        """Of the picture: what must be known before it is believed."""
-        said = []
-        if self.record.get("partial"):
-            cut = self.record["interrupted"]
-            said.append(f"PARTIAL: interrupted in {cut['stage']}, step {cut['step']} of {cut['n_steps']}")
-        if self.record.get("registration", {}).get("trusted") is False:
-            said.append("REGISTRATION DOUBTFUL: do not trust this volume (see run.json)")
-        return "; ".join(said)
-
-    def slice_table(self) -> str:
-        """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector, mm)."""
-        motion = self.slices.world_from_header()
-        rotvec = motion.rotvec_rad()
-        lines = ["\t".join(SLICE_COLUMNS)]
-        for k in range(len(self.slices)):
-            pose = [f"{x:.9g}" for x in (*rotvec[k], *motion.translation_mm[k])]
-            trust = [f"{x:.4g}" for x in (self.gain[k], self.weight[k], self.ncc[k])]
-            reason = self._reason(k) if self.weight[k] < FULL_WEIGHT else "-"
-            number = [str(self.slices.stack_id[k]), str(self.slices.slice_index[k])]
-            lines.append("\t".join([*number, *pose, *trust, reason]))
-        return "\n".join(lines) + "\n"
-
-    def _reason(self, k: int) -> str:
-        """Why slice k is trusted little, as far as its figures tell."""
-        n_pixels = np.bincount(self.slices.pixel_plane, minlength=len(self.slices))
-        typical = np.median(n_pixels[self.slices.stack_id == self.slices.stack_id[k]])
-        if self.gain[k] < LOST_SIGNAL_GAIN:
-            return "signal loss"
-        if n_pixels[k] < SMALL_SHARE * typical:
-            return "does not fit, small slice"
-        return "does not fit" if self.ncc[k] < POOR_NCC else "high residual"
-
-
-def check_output_folder(folder: Path, *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
-    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
-
-    Args:
-        folder: that will be written.
-        replace: whether it may hold an earlier result.
-        inputs: files that are read; none of them may be in the way.
-
-    Raises:
-        InputError: see above, or a parent in which no folder can be made and renamed.
-    """
-    try:
-        if folder.is_symlink() and not folder.exists():
-            raise InputError(f"{folder}: is a link to nothing; remove it or choose another --output")
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-        if folder.exists() and any(folder.iterdir()) and not replace:
-            raise InputError(f"{folder}: is not empty; pass --force to replace an earlier result, or choose another")
-        target = Path(os.path.realpath(folder))
-        parent = next(path for path in target.parents if path.exists())
-        if not parent.is_dir():
-            raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
-        usable = [parent, target] if target.exists() else [parent]
-        if not all(os.access(path, os.W_OK | os.X_OK) for path in usable):
-            raise InputError(f"{folder}: cannot be written; choose another --output")
-        if target.exists() and target.stat().st_dev != parent.stat().st_dev:
-            raise InputError(
-                f"{folder}: is a file system of its own, and a result is put in place as a whole folder; "
-                f"choose a folder in it, as {folder / 'result'}"
-            )
-        outputs = {(folder / name).resolve() for name in OUTPUT_NAMES}
-    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a loop of links
-        found = getattr(error, "strerror", None) or error
-        raise InputError(f"{folder}: cannot be written ({found}); choose another --output") from None
-    for path in inputs:
-        try:
-            is_output = Path(path).resolve() in outputs
-        except (OSError, ValueError, RuntimeError):  # who reads it says what is wrong
-            continue
-        if is_output:
-            raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")
+        """What must be known before the picture is believed."""
+        lines = []
+        if self.record.stopped_at:
+            lines.append(f"PARTIAL: {self.record.stopped_at}")
+        if self.record.registration and self.record.registration.reliable is False:
+            lines.append("REGISTRATION DOUBTFUL: do not trust this volume (see run.json)")
+        return "; ".join(lines)
 
 
 def is_partial(folder: str | os.PathLike[str]) -> bool:
     """Whether a folder holds the result of an interrupted run."""
     try:
-        record = json.loads((Path(folder) / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return RunRecord.read(Path(folder) / "run.json").partial
+    except InputError:
         return False
-    return isinstance(record, dict) and record.get("partial") is True

@@ -8,10 +8,7 @@ studies.tradeoff.memory`, docs/tradeoff.md): they are on the safe side, and cove
 from __future__ import annotations
 
 import math
-import resource
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -21,13 +18,12 @@ from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
 from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
+from g3r.planning.stages import Stage
 from g3r.registration.template_search import head_volume_mm3
+from g3r.run.machine import held_bytes
 
 GRID_SLACK = 1.1
 """Voxels over those of the box at header poses: heads that were turned into the atlas frame."""
-
-USUAL_PROCESS_BYTES = 500_000_000
-"""Python with the libraries and networks loaded, where the system does not tell."""
 
 PAIR_BYTES = 48
 """A kept record of a pair (`gaussians.kernels.PAIR`)."""
@@ -37,10 +33,10 @@ PAIR_BYTES = 48
 class MemoryEstimate:
     """What each stage holds at most, in bytes, the process with its libraries included."""
 
-    stages: dict[str, int]
+    stages: dict[Stage, int]
 
     @property
-    def stage(self) -> str:
+    def stage(self) -> Stage:
         """Which one needs most."""
         return max(self.stages, key=lambda name: self.stages[name])
 
@@ -54,12 +50,11 @@ class MemoryEstimate:
         return f"needs about {gigabytes(self.peak)} of memory, most of it in {self.stage}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ProblemSizes:
     """What the estimate is made of: counts, none of them in bytes."""
 
     n_pixels: int
-    n_stacks: int
     prior_shape: tuple[int, ...]
     prior_voxels: float
     output_voxels: float
@@ -95,23 +90,23 @@ def estimate_memory(
     prior_records = min(PAIR_BYTES * sizes.n_pairs, settings.prior_stage.projection_bytes)
     outputs = volumes + OUTPUTS_PER_VOXEL * output + cloud
     stages = {
-        "loading": resting,
-        "motion": resting + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
-        "coarse volumes": volumes + COARSE_PER_PIXEL * n_pixels + 4 * (COARSE_VOLUMES + buffers) * voxels,
+        Stage.LOADING: resting,
+        Stage.REGISTRATION: resting + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
+        Stage.COARSE: volumes + COARSE_PER_PIXEL * n_pixels + 4 * (COARSE_VOLUMES + buffers) * voxels,
     }
     if settings.use_prior:
         seen = _seen_voxels(sizes.prior_shape, settings)
         begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
-        stages["prior network"] = volumes + begin + per_voxel * seen + 16 * voxels
+        stages[Stage.PRIOR] = volumes + begin + per_voxel * seen + 16 * voxels
     stages |= {
-        "fit to prior": volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
-        "fit to slices": volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
-        "volume": outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
+        Stage.FIT_TO_PRIOR: volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
+        Stage.FIT_TO_SLICES: volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
+        Stage.VOLUME: outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
     if settings.use_prior:
-        stages["prior share"] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
-    stages["uncertainty"] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
-    stages["writing"] = outputs + WRITING_PER_VOXEL * output
+        stages[Stage.PRIOR_SHARE] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
+    stages[Stage.UNCERTAINTY] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
+    stages[Stage.WRITING] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
 
 
@@ -145,13 +140,12 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
     per_stack = reach_mm / float(slices.thickness_mm.min())
     in_prior = reach_mm / voxel_mm
     return ProblemSizes(
-        slices.planes.n_pixels,
-        n_stacks,
-        grid.shape,
-        n_voxels,
-        n_voxels * (voxel_mm / settings.resolution_mm) ** 3,
-        n_gaussians,
-        n_gaussians * max(n_stacks * per_stack, in_prior),
+        n_pixels=slices.planes.n_pixels,
+        prior_shape=grid.shape,
+        prior_voxels=n_voxels,
+        output_voxels=n_voxels * (voxel_mm / settings.resolution_mm) ** 3,
+        n_gaussians=n_gaussians,
+        n_pairs=n_gaussians * max(n_stacks * per_stack, in_prior),
     )
 
 
@@ -162,37 +156,3 @@ def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> fl
         return n_voxels
     widest = settings.prior_tile_voxels + 2 * settings.prior_halo_voxels
     return math.prod(min(GRID_SLACK ** (1 / 3) * extent, widest) for extent in shape)
-
-
-def held_bytes() -> int:
-    """What this process holds now."""
-    return _kilobytes(Path("/proc/self/status"), "VmRSS") or USUAL_PROCESS_BYTES
-
-
-def peak_bytes() -> int:
-    """The most that this process has held so far.
-
-    Not `getrusage`, where the system counts this process alone: there a process begins with the peak of the
-    one that started it.
-    """
-    own = _kilobytes(Path("/proc/self/status"), "VmHWM")
-    if own is not None:
-        return own
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def available_bytes() -> int | None:
-    """What the machine could still give; None where it does not tell."""
-    return _kilobytes(Path("/proc/meminfo"), "MemAvailable")
-
-
-def _kilobytes(path: Path, field: str) -> int | None:
-    try:
-        lines = path.read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError:
-        return None
-    for line in lines:
-        if line.startswith(f"{field}:"):
-            return int(line.split()[1]) * 1024
-    return None

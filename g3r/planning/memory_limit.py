@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 from g3r.acquisition.planes import Slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack
@@ -14,30 +14,34 @@ from g3r.planning.memory_estimate import (
     PAIR_BYTES,
     MemoryEstimate,
     ProblemSizes,
-    available_bytes,
     estimate_memory,
-    held_bytes,
     sizes_of,
 )
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
+from g3r.planning.stages import Stage
 from g3r.run.allocator import can_release_memory_eagerly, release_memory_eagerly
+from g3r.run.machine import available_bytes, held_bytes
 
 logger = logging.getLogger(__name__)
 
 MIN_PROJECTION_BYTES = 20_000_000
-STAGES_WITH_PROJECTIONS = ("fit to prior", "fit to slices", "prior share")
+STAGES_WITH_PROJECTIONS = (Stage.FIT_TO_PRIOR, Stage.FIT_TO_SLICES, Stage.PRIOR_SHARE)
 PLANNED_HALO_VOXELS = 48
 PLANNED_TILES = (128, 96, 64, 48, 32, 16)
 """Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MemoryPlan:
     """Settings that stay below a limit.
 
-    settings; their estimate; limit_bytes (None: no limit); what was changed, as sentences for run.json;
-    whether freed memory has to be given back at once (`release_memory_eagerly`).
+    Attributes:
+        settings: with what was given up for the limit.
+        estimate: their memory.
+        limit_bytes: None without a limit.
+        changes: what was given up, as sentences for run.json.
+        at_once: whether freed memory has to be returned to the system at once (`release_memory_eagerly`).
     """
 
     settings: ReconstructionSettings
@@ -46,14 +50,26 @@ class MemoryPlan:
     changes: list[str]
     at_once: bool = False
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> MemoryRecord:
         """What run.json says."""
-        return {
-            "stated_bytes": self.estimate.peak,
-            "stage": self.estimate.stage,
-            "limit_bytes": self.limit_bytes,
-            "changes": self.changes,
-        }
+        return MemoryRecord(self.estimate.peak, self.estimate.stage, self.limit_bytes, self.changes)
+
+
+@dataclass(frozen=True)
+class MemoryRecord:
+    """Memory as it was stated before the run.
+
+    Attributes:
+        stated_bytes: the most that any stage takes.
+        stage: which one.
+        limit_bytes: None without a limit.
+        changes: what was given up for it.
+    """
+
+    stated_bytes: int
+    stage: str
+    limit_bytes: int | None
+    changes: list[str]
 
 
 def plan_memory(
@@ -110,7 +126,7 @@ def plan_for_stacks(stacks: Sequence[Stack], settings: ReconstructionSettings, l
     for change in plan.changes:
         logger.info(change)
     free, more = available_bytes(), plan.estimate.peak - held_bytes()
-    if limit_bytes is None and free is not None and more > free:
+    if limit_bytes is None and more > free:
         logger.warning(
             "%s more of memory needed, %s available: choose a coarser --resolution or --max-memory",
             gigabytes(more),
@@ -131,7 +147,7 @@ def _lowered(slices: Slices, settings: ReconstructionSettings, limit: int | None
     """Settings changed until they need no more than the limit, or nothing is left to change."""
     found = estimate(settings)
     if limit is None or found.peak <= limit:
-        return MemoryPlan(settings, found, limit, [])
+        return MemoryPlan(settings=settings, estimate=found, limit_bytes=limit, changes=[])
     changes = []
     at_once = can_release_memory_eagerly()
     if at_once:
@@ -146,7 +162,8 @@ def _lowered(slices: Slices, settings: ReconstructionSettings, limit: int | None
     if tiled is not less:
         edge = tiled.prior_tile_voxels
         changes.append(f"memory limit: prior network in tiles of {edge} voxels (slower; within 1e-3)")
-    return MemoryPlan(tiled, estimate(tiled, at_once), limit, changes, at_once)
+    estimated = estimate(tiled, at_once)
+    return MemoryPlan(settings=tiled, estimate=estimated, limit_bytes=limit, changes=changes, at_once=at_once)
 
 
 def _fewer_projections(

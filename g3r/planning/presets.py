@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
@@ -99,6 +100,33 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
 }
 """Settings by name, from quick to careful."""
+
+
+def preset(name: str) -> ReconstructionSettings:
+    """The settings of a preset.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in PRESETS:
+        raise InputError(f"preset {name!r}; expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSettings:
+    """The settings as they hold for a single stack, or for several.
+
+    Args:
+        settings: that were asked for.
+        n_stacks: with slices.
+    """
+    stage = settings.slice_stage
+    if n_stacks == 1:
+        # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
+        held = settings.use_prior and settings.distillation and settings.registration.segments
+        return replace(settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held))
+    # several stacks check each other: the schedule alone decides how hard the prior pulls
+    return replace(settings, slice_stage=replace(stage, prior_error=0.0))
 
 
 def changed(settings: Any, options: Mapping[str, Any]) -> Any:

@@ -11,15 +11,14 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm
+from g3r.fitting.initial_volumes import InitialVolumes, gaussian_spacing_mm
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
@@ -66,87 +65,169 @@ COST_EXPONENT = 0.6
 """A step takes seconds as this power of the number of Gaussians in a head: smaller ones have fewer pixels."""
 
 
-@dataclass
-class TimeBudget:
-    """The seconds there are, and what they were spent on.
+@dataclass(frozen=True, kw_only=True)
+class BudgetRecord:
+    """What a time budget chose; fields are None where the run ended before the choice.
 
-    Args:
-        deadline: by which files are to be written.
-        given_s: for the record.
+    Attributes:
+        seconds: that were given.
+        registration, fit: names of the presets that registration and the fit follow.
+        prior_views: views of the prior.
+        step_s: measured seconds of one optimiser step.
+        n_gaussians_timed: Gaussians in that step.
+        reserve_s: seconds kept for what follows the fit.
+        left_s: seconds for the fit.
+        loops: for each loop of the run, in order, the fraction of its schedule at each step.
     """
 
+    seconds: float
+    registration: str | None = None
+    prior_views: int | None = None
+    fit: str | None = None
+    step_s: float | None = None
+    n_gaussians_timed: int | None = None
+    reserve_s: float | None = None
+    left_s: float | None = None
+    loops: list[list[float]] = field(default_factory=list)
+
+
+class Plan(Protocol):
+    """The settings of a run, and when its loops have to end."""
+
+    settings: ReconstructionSettings
+
+    def for_registration(self) -> Deadline | None:
+        """Decide how registration searches; returns when it has to end."""
+
+    def for_prior(self, coarse_s: float) -> None:
+        """Decide the number of views; `coarse_s` is what V_coarse and V_sharp took."""
+
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline | None:
+        """Decide Gaussians and steps of both stages of the fit; returns when the first has to end."""
+
+    def for_fit_to_slices(self) -> Deadline | None:
+        """When the second stage of the fit has to end."""
+
+    def record(self) -> BudgetRecord | None:
+        """What was decided; None where nothing was."""
+
+
+@dataclass
+class FixedPlan:
+    """Settings that hold to the end, and no deadline."""
+
+    settings: ReconstructionSettings
+
+    def for_registration(self) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def for_prior(self, coarse_s: float) -> None:
+        """Nothing to decide."""
+
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def for_fit_to_slices(self) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def record(self) -> BudgetRecord | None:
+        """Nothing was decided."""
+        return None
+
+
+@dataclass
+class TimeBudget:
+    """Settings that follow the seconds that are left.
+
+    Args:
+        settings: what the budget does not decide; changed with each decision.
+        deadline: when the files have to be written.
+        given_s: seconds of the budget.
+    """
+
+    settings: ReconstructionSettings
     deadline: Deadline
     given_s: float
     choices: dict[str, Any] = field(default_factory=dict)
+    fit_deadline: Deadline | None = None
 
     @classmethod
-    def of(cls, seconds: float, spent_s: float = 0.0) -> TimeBudget:
+    def of(cls, settings: ReconstructionSettings, seconds: float, spent_s: float = 0.0) -> TimeBudget:
         """A budget of which some seconds are spent already.
+
+        Args:
+            settings: what the budget does not decide.
+            seconds: of the whole command.
+            spent_s: of them, before this call.
 
         Raises:
             ValueError: not a positive number.
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
-        return cls(replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord()), seconds)
+        deadline = replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord())
+        return cls(settings, deadline, seconds)
 
     @property
     def missed(self) -> bool:
         """Whether more was taken than promised: a tenth and two seconds over the budget."""
         return self.deadline.remaining_s < -(0.1 * self.given_s + 2.0)
 
-    def for_registration(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
-        """Settings with the registration of the preset that the budget allows, and its deadline."""
+    def for_registration(self) -> Deadline:
+        """Search as the preset does that the budget allows."""
         left = self.deadline.remaining_s
         allowed = [name for name, min_s in REGISTRATION_FROM_S.items() if self.given_s >= min_s]
         name = max(allowed, key=lambda name: REGISTRATION_FROM_S[name])
+        asked = self.settings.registration
         chosen = replace(
-            PRESETS[name].registration,
-            standard_orientation=settings.registration.standard_orientation,
-            seed=settings.registration.seed,
+            PRESETS[name].registration, standard_orientation=asked.standard_orientation, seed=asked.seed
         )
-        self.choices["motion"] = name
+        self.settings = replace(self.settings, registration=chosen)
+        self.choices["registration"] = name
         logger.info("time budget: %.0f s left, registration as in %s", left, name)
-        return replace(settings, registration=chosen), self.deadline.part(REGISTRATION_SHARE)
+        return self.deadline.part(REGISTRATION_SHARE)
 
-    def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
-        """Settings with as many views of the prior as fit, at most those of `accurate`.
+    def for_prior(self, coarse_s: float) -> None:
+        """Take as many views of the prior as fit, at most those of `accurate`.
 
         Args:
-            settings: so far.
             coarse_s: what V_coarse and V_sharp took.
         """
         view_s = COARSE_PER_VIEW * coarse_s
         views = int(VIEWS_SHARE * max(0.0, self.deadline.remaining_s) / view_s) if view_s > 0 else 1
         views = min(max(1, views), PRESETS["accurate"].prior_views)
+        self.settings = replace(self.settings, prior_views=views)
         self.choices["prior_views"] = views
-        return replace(settings, prior_views=views)
 
-    def for_fit(
-        self,
-        settings: ReconstructionSettings,
-        start: FitStart,
-        prior: NDArray[np.float32],
-        coarse_s: float,
-        n_output_voxels: int,
-        rng: np.random.Generator,
-    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
-        """Settings with the Gaussians and steps that fit, and the deadlines of both stages.
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline:
+        """Take the most careful preset whose Gaussians and steps fit, with the deadline of the first stage.
 
         Args:
-            settings: so far.
-            start: posed slices and their volumes.
-            prior: [I, J, K] on the start's grid.
-            coarse_s: what making the start took.
+            volumes: posed slices and their volumes.
+            prior: [I, J, K] on their grid.
+            coarse_s: what making the volumes took.
             n_output_voxels: of the volume to be written.
-            rng: for the steps that are timed.
         """
+        settings = self.settings
         after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
         if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
-            return self._hurried(settings, after_s + (coarse_s if settings.use_prior else 0.0))
+            # timing a step would take the time of the steps themselves
+            reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)
+            self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
+            logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
+            return self._take("draft", PRESETS["draft"].share_probes, reserve_s)
         probed = PRESETS["fast"].gaussian_spacing_pixels
-        cloud = seed_cloud(prior, start.mask, start.grid, gaussian_spacing_mm(start.slices, probed))
-        step_s = timed_step(cloud, start.slices, rng)
+        cloud = seed_cloud(prior, volumes.mask, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
+        step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
@@ -163,21 +244,17 @@ class TimeBudget:
             "left_s": round(left, 2),
         }
         logger.info("time budget: %.0f s left for the fit, Gaussians as in %s", left, chosen)
-        return self._chosen(settings, chosen, probes, reserve_s)
+        return self._take(chosen, probes, reserve_s)
 
-    def _hurried(
-        self, settings: ReconstructionSettings, reserve_s: float
-    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
-        """For when timing a step would take the time of the steps themselves."""
-        self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
-        logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
-        return self._chosen(settings, "draft", PRESETS["draft"].share_probes, reserve_s)
+    def for_fit_to_slices(self) -> Deadline:
+        """When the second stage of the fit has to end; `for_fit_to_prior` comes first."""
+        assert self.fit_deadline is not None
+        return self.fit_deadline
 
-    def _chosen(
-        self, settings: ReconstructionSettings, name: str, probes: int, reserve_s: float
-    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
-        preset = PRESETS[name]
-        settings = replace(
+    def _take(self, name: str, probes: int, reserve_s: float) -> Deadline:
+        """Follow a preset in the fit; returns the deadline of its first stage."""
+        preset, settings = PRESETS[name], self.settings
+        self.settings = replace(
             settings,
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
             adaptive=preset.adaptive,
@@ -185,40 +262,45 @@ class TimeBudget:
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
         )
-        both = self.deadline.part(1.0, reserve_s)
-        return settings, both.part(PRIOR_STAGE_SHARE), both
+        self.fit_deadline = self.deadline.part(1.0, reserve_s)
+        return self.fit_deadline.part(PRIOR_STAGE_SHARE)
 
-    def record(self) -> dict[str, Any]:
-        """For run.json."""
-        loop_record = self.deadline.loop_record
-        return {"seconds": self.given_s, **self.choices, "pace": loop_record.loops if loop_record else []}
+    def record(self) -> BudgetRecord:
+        """What was decided, for run.json."""
+        loops = self.deadline.loop_record.loops if self.deadline.loop_record else []
+        return BudgetRecord(seconds=self.given_s, loops=loops, **self.choices)
 
 
-class RepeatedBudget(TimeBudget):
-    """A run with a time budget once more, without a clock: the settings are known, loops do what they did.
+class RepeatedBudget(FixedPlan):
+    """A run with a time budget once more, without a clock: settings are known, loops do what they did.
 
     Args:
-        record: what `TimeBudget.record` said of the run.
+        settings: as they were used in that run.
+        earlier: what it recorded.
     """
 
-    def __init__(self, record: Mapping[str, Any]) -> None:
-        told = {name: value for name, value in record.items() if name not in ("seconds", "pace")}
-        deadline = Deadline(loop_record=LoopRecord(record["pace"], repeating=True))
-        super().__init__(deadline, record["seconds"], told)
+    def __init__(self, settings: ReconstructionSettings, earlier: BudgetRecord) -> None:
+        super().__init__(settings)
+        self.earlier = earlier
+        self.deadline = Deadline(loop_record=LoopRecord(earlier.loops, repeating=True))
 
-    def for_registration(self, settings: ReconstructionSettings) -> tuple[ReconstructionSettings, Deadline]:
-        """The settings as they are."""
-        return settings, self.deadline
+    def for_registration(self) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
 
-    def for_prior(self, settings: ReconstructionSettings, coarse_s: float) -> ReconstructionSettings:
-        """The settings as they are."""
-        return settings
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
 
-    def for_fit(
-        self, settings: ReconstructionSettings, *known: Any
-    ) -> tuple[ReconstructionSettings, Deadline, Deadline]:
-        """The settings as they are."""
-        return settings, self.deadline, self.deadline
+    def for_fit_to_slices(self) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
+
+    def record(self) -> BudgetRecord:
+        """What the earlier run decided."""
+        return self.earlier
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:

@@ -1,34 +1,45 @@
-"""What a run has on disk before its result is whole: a folder beside the output, locked while it lives.
+"""The folder that a run writes: staged in a locked folder, then put in place as a whole.
 
-`DIR.unfinished` holds the stages that are done (`g3r.run.stage_store`) and the result while it is being written. The
-lock goes with the process however that ends, so an unlocked folder is a dead run's, and the next run to the
+`DIR.unfinished` holds the stages that are done (`g3r.run.stage_store`) and the result while it is written. The
+lock ends with the process, however that ends. So an unlocked folder belongs to a dead run, and the next run to the
 same output may take what it finds there or remove it. Nothing of a living run is ever touched.
+
+Where DIR is a file system of its own (a mount point), nothing can be renamed onto it: there the staging folder is
+`DIR/.unfinished`, and the files move one by one, the record last.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
 import shutil
-from collections.abc import Collection, Iterator
+import sys
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
+from filelock import FileLock, Timeout
+
 from g3r.errors import InputError, cannot_be_written
+from g3r.run.atomic_file import sync
 
 SUFFIX = ".unfinished"
+
+FOUND_ON_DISKS = {SUFFIX, "lost+found"}
+"""Names that an empty file system may hold."""
+
+LAST_NAME = "run.json"
+"""Moved last where files move one by one: a folder that holds it is complete."""
 
 
 class OutputFolder:
     """The folder of one run; use it as a context, which holds the lock.
 
-    At the end the folder goes, unless `stages` holds something to go on from.
+    At the end the staging folder goes, unless `stages` holds something to go on from.
 
     Args:
         output: folder that the result will be.
-        names: of files that a result may have; others that lie in an earlier result are kept. None replaces
+        names: of files that a result may have; others that are in an earlier result are kept. None replaces
             the whole folder.
 
     Raises:
@@ -38,22 +49,24 @@ class OutputFolder:
     def __init__(self, output: str | os.PathLike[str], names: Collection[str] | None = None) -> None:
         self.named = Path(output)
         self.output = Path(os.path.realpath(output))  # a link is followed, not replaced
-        self.folder = self.output.with_name(self.output.name + SUFFIX)
-        self.stages = self.folder / "stages"
+        self.is_mount = self.output.is_dir() and is_mount(self.output)
+        self.staging = self.output / SUFFIX if self.is_mount else self.output.with_name(self.output.name + SUFFIX)
+        self.stages = self.staging / "stages"
         self.names = names
-        self._whole, self._earlier = self.folder / "whole", self.folder / "earlier"
-        self._lock: int | None = None
+        self._new, self._backup = self.staging / "new", self.staging / "backup"
+        self._half_backup = self.staging / "half-backup"
+        self._lock: FileLock | None = None
         self._made: list[Path] = []
 
     def __enter__(self) -> OutputFolder:
-        parents = [self.folder.parent, *self.folder.parent.parents]
+        parents = [self.staging.parent, *self.staging.parent.parents]
         self._made = [path for path in parents if not path.exists()]
         try:
-            self._lock = self._take_lock()
+            self._take_lock()
             self._clean()
         except OSError as error:
             self._let_go()
-            raise cannot_be_written(self.folder, error) from None
+            raise cannot_be_written(self.staging, error) from None
         return self
 
     def __exit__(
@@ -62,7 +75,9 @@ class OutputFolder:
         with suppress(OSError):
             self._clean()
             if not (self.stages.is_dir() and any(self.stages.glob("*.npz"))):
-                shutil.rmtree(self.folder, ignore_errors=True)
+                if sys.platform == "win32" and self._lock is not None:  # an open file cannot be removed there
+                    self._lock.release()
+                shutil.rmtree(self.staging, ignore_errors=True)
         self._let_go()
 
     def forget_stages(self) -> None:
@@ -72,7 +87,7 @@ class OutputFolder:
     def make_room(self, needed_bytes: int) -> None:
         """Give the stages up where only that leaves enough space for the result."""
         kept = sum(path.stat().st_size for path in self.stages.glob("*"))
-        free = shutil.disk_usage(self.folder).free
+        free = shutil.disk_usage(self.staging).free
         if free < needed_bytes <= free + kept:
             self.forget_stages()
 
@@ -86,74 +101,136 @@ class OutputFolder:
             OSError: it cannot be put in place.
         """
         assert self._lock is not None, "enter first"
-        shutil.rmtree(self._whole, ignore_errors=True)
+        shutil.rmtree(self._new, ignore_errors=True)
         try:
-            self._whole.mkdir()
-            yield self._whole
-            for path in self._whole.iterdir():  # a full disk may say so no sooner
-                _to_disk(path)
-            if self.output.exists():
-                os.rename(self.output, self._earlier)
-            os.rename(self._whole, self.output)
+            self._new.mkdir()
+            yield self._new
+            for path in self._new.iterdir():  # a full disk may say so no sooner
+                sync(path)
+            if self.is_mount:
+                self._half_backup.mkdir()
+                _move_files(self.output, self._half_backup, self.names)
+                os.rename(self._half_backup, self._backup)
+                _move_files(self._new, self.output)
+            else:
+                if self.output.exists():
+                    os.rename(self.output, self._backup)
+                os.rename(self._new, self.output)
         finally:
             self._clean()
 
     def _clean(self) -> None:
         """Remove a result that was not finished; finish or undo the exchange of an earlier one."""
-        shutil.rmtree(self._whole, ignore_errors=True)
-        if not self._earlier.exists():
+        if self.is_mount:
+            self._clean_mount()
+            return
+        shutil.rmtree(self._new, ignore_errors=True)
+        if not self._backup.exists():
             return
         if not self.output.exists():
-            os.rename(self._earlier, self.output)
+            os.rename(self._backup, self.output)
             return
-        for path in self._earlier.iterdir():
+        for path in self._backup.iterdir():
             own = self.names is None or path.name in self.names
             if not own and not (self.output / path.name).exists():
                 os.rename(path, self.output / path.name)
-        shutil.rmtree(self._earlier, ignore_errors=True)
+        shutil.rmtree(self._backup, ignore_errors=True)
 
-    def _take_lock(self) -> int:
-        while True:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            path = self.folder / "lock"
-            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    def _clean_mount(self) -> None:
+        if self._half_backup.exists():  # nothing new was moved in yet
+            _move_files(self._half_backup, self.output)
+        elif self._backup.exists() and not (self.output / LAST_NAME).exists():
+            for path in self.output.iterdir():
+                if self.names is None or path.name in self.names:
+                    path.unlink()
+            _move_files(self._backup, self.output)
+        for folder in (self._new, self._half_backup, self._backup):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _take_lock(self) -> None:
+        path, process = self.staging / "lock", self.staging / "process"
+        while self._lock is None:
+            self.staging.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(path, timeout=0)
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-                    process = os.read(lock, 20).decode(errors="replace").strip() or "unknown"
-                    os.close(lock)
-                    raise InputError(
-                        f"{self.named}: another run is writing it (process {process}); wait for it, or "
-                        "choose another --output"
-                    ) from None
-                # a file system without locks: nothing can be told about other runs
-            if self._is_current(lock, path):
+                lock.acquire()
+            except Timeout:
+                if not path.exists():  # its run ended and removed the folder in between
+                    continue
+                number = "unknown"
+                with suppress(OSError):
+                    number = process.read_text(encoding="ascii", errors="replace").strip() or number
+                raise InputError(
+                    f"{self.named}: another run is writing it (process {number}); wait for it, or "
+                    "choose another --output"
+                ) from None
+            if path.exists():
+                self._lock = lock
                 with suppress(OSError):  # a full disk: then the process is not named
-                    os.ftruncate(lock, 0)
-                    os.pwrite(lock, str(os.getpid()).encode(), 0)
-                return lock
-            os.close(lock)  # its run ended and removed the folder in between
-
-    @staticmethod
-    def _is_current(lock: int, path: Path) -> bool:
-        try:
-            return os.path.samestat(os.fstat(lock), path.stat())
-        except FileNotFoundError:
-            return False
+                    process.write_text(str(os.getpid()), encoding="ascii")
+            else:
+                lock.release()
 
     def _let_go(self) -> None:
         if self._lock is not None:
-            os.close(self._lock)
+            self._lock.release()
             self._lock = None
         for path in self._made:
             with suppress(OSError):
                 path.rmdir()  # only where empty
 
 
-def _to_disk(path: Path) -> None:
-    number = os.open(path, os.O_RDONLY)
+def is_mount(folder: Path) -> bool:
+    """Whether a folder is a file system of its own, onto which nothing can be renamed."""
+    return folder.stat().st_dev != folder.parent.stat().st_dev
+
+
+def check_output_folder(
+    folder: Path, names: Collection[str], *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()
+) -> None:
+    """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
+
+    Args:
+        folder: that will be written.
+        names: of files that a result may have.
+        replace: whether it may hold an earlier result.
+        inputs: files that are read; none of them may be in the way.
+
+    Raises:
+        InputError: see above, or a parent in which no folder can be made and renamed.
+    """
     try:
-        os.fsync(number)
-    finally:
-        os.close(number)
+        if folder.is_symlink() and not folder.exists():
+            raise InputError(f"{folder}: is a link to nothing; remove it or choose another --output")
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
+        if not replace and folder.exists() and any(path.name not in FOUND_ON_DISKS for path in folder.iterdir()):
+            raise InputError(f"{folder}: is not empty; pass --force to replace an earlier result, or choose another")
+        target = Path(os.path.realpath(folder))
+        parent = next(path for path in target.parents if path.exists())
+        if not parent.is_dir():
+            raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
+        written = [target] if target.exists() else [parent]
+        if target.exists() and not is_mount(target):
+            written.append(parent)  # in which the folder is renamed
+        if not all(os.access(path, os.W_OK | os.X_OK) for path in written):
+            raise InputError(f"{folder}: cannot be written; choose another --output")
+        outputs = {(folder / name).resolve() for name in names}
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a loop of links
+        found = getattr(error, "strerror", None) or error
+        raise InputError(f"{folder}: cannot be written ({found}); choose another --output") from None
+    for path in inputs:
+        try:
+            is_output = Path(path).resolve() in outputs
+        except (OSError, ValueError, RuntimeError):  # who reads it says what is wrong
+            continue
+        if is_output:
+            raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")
+
+
+def _move_files(source: Path, target: Path, names: Collection[str] | None = None) -> None:
+    """Move files within one file system, the record last; only some names where they are given."""
+    found = [path for path in source.iterdir() if path.name not in FOUND_ON_DISKS]
+    for path in sorted(found, key=lambda path: path.name == LAST_NAME):
+        if names is None or path.name in names:
+            os.rename(path, target / path.name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -15,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+from g3r.run.atomic_file import atomic_path
 
 TREE = "tree"
 
@@ -33,16 +34,12 @@ def write_stage(path: Path, value: Any) -> None:
         TypeError: something else is in it.
     """
     arrays: Arrays = {}
-    tree = json.dumps(_packed(value, arrays)).encode()
+    tree = json.dumps(_packed(value, arrays, {})).encode()
     buffer = io.BytesIO()
     arrays[TREE] = np.frombuffer(tree, np.uint8)
     np.savez(buffer, **arrays)
-    beside = path.with_name(f".{path.name}")  # the run's lock keeps others out
-    try:
-        beside.write_bytes(buffer.getbuffer())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_stage(path: Path, records: Sequence[type]) -> Any:
@@ -65,11 +62,12 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
         raise UnreadableStage(f"{path}: {error}") from None
 
 
-def as_stored(value: Any, records: Sequence[type]) -> Any:
-    """A value as reading its file would give it: sums over arrays may depend on how they lie in memory."""
+def as_stored(value: Any) -> Any:
+    """A value as reading its file would give it: sums over arrays may depend on their order in memory."""
     arrays: Arrays = {}
-    tree = _packed(value, arrays)
-    return _unpacked(tree, arrays, {record.__name__: record for record in records})
+    records: dict[str, type] = {}
+    tree = _packed(value, arrays, records)
+    return _unpacked(tree, arrays, records)
 
 
 def _in_order(array: NDArray[Any]) -> NDArray[Any]:
@@ -77,24 +75,25 @@ def _in_order(array: NDArray[Any]) -> NDArray[Any]:
     return array if array.flags.forc else np.ascontiguousarray(array)
 
 
-def _packed(value: Any, arrays: Arrays) -> Any:
+def _packed(value: Any, arrays: Arrays, records: dict[str, type]) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list):
-        return [_packed(one, arrays) for one in value]
+        return [_packed(one, arrays, records) for one in value]
     if isinstance(value, tuple):
-        return {"tuple": [_packed(one, arrays) for one in value]}
+        return {"tuple": [_packed(one, arrays, records) for one in value]}
     if isinstance(value, dict):
-        return {"dict": {str(key): _packed(one, arrays) for key, one in value.items()}}
+        return {"dict": {str(key): _packed(one, arrays, records) for key, one in value.items()}}
     if isinstance(value, np.ndarray | torch.Tensor):
         name = f"array{len(arrays)}"
         kind = "array" if isinstance(value, np.ndarray) else "tensor"
         arrays[name] = _in_order(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy())
         return {kind: name}
     if is_dataclass(value):
-        content = {field.name: _packed(getattr(value, field.name), arrays) for field in fields(value)}
+        records[type(value).__name__] = type(value)
+        content = {field.name: _packed(getattr(value, field.name), arrays, records) for field in fields(value)}
         return {"record": type(value).__name__, "fields": content}
     raise TypeError(f"{type(value).__name__} has no place in a stage's file")
 

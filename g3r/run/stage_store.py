@@ -1,172 +1,117 @@
-"""The stages of a run: what each gives, its own random numbers, and files to go on from."""
+"""Files that hold what the stages of a run gave, so that a later run goes on from the last one that is there."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from g3r.acquisition.planes import Planes, Slices
 from g3r.errors import InputError
-from g3r.fitting.initial_volumes import FitStart
-from g3r.fitting.slice_stage import SliceFit
-from g3r.gaussians import GaussianCloud
-from g3r.geometry import RigidPose, VolumeGrid
-from g3r.output.record import Clock
-from g3r.registration import Registration
-from g3r.registration.atlas_frame import Orientation
+from g3r.run.atomic_file import write_text
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 
 logger = logging.getLogger(__name__)
 
-NAMES = ("motion", "prior", "fit to prior", "fit to slices", "prior share")
-"""In their order; the first four are kept in files."""
+PROVENANCE_NAME = "provenance.json"
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class PriorVolume:
-    """What the fit starts from and is drawn to.
+class FinishedStage:
+    """What a stage gave in an earlier run, and the seconds that it took then."""
 
-    start: slices as they are fitted, and the volumes that they give; prior [I, J, K] on its grid, V_sharp
-    without a network; gain [K]; scale, what intensities were divided by since motion; believed, whether
-    slices of a single stack moved to the prior (None where that was not tried).
-    """
-
-    start: FitStart
-    prior: NDArray[np.float32]
-    gain: NDArray[np.float64]
-    scale: float
-    accepted: bool | None
+    value: Any
+    seconds: float
+    cpu_seconds: float
 
 
-@dataclass(frozen=True)
-class PriorCloud:
-    """The cloud that stage 1 of the fit gives, the loss of each step, and how its Gaussians came about."""
-
-    cloud: GaussianCloud
-    history: list[float]
-    counts: dict[str, Any]
-
-
-RECORDS = (
-    Registration,
-    PriorVolume,
-    PriorCloud,
-    SliceFit,
-    FitStart,
-    Slices,
-    Planes,
-    RigidPose,
-    Orientation,
-    VolumeGrid,
-    GaussianCloud,
-)
-"""What files of stages may hold."""
-
-
-def stage_rng(seed: int, stage: str) -> np.random.Generator:
-    """The random numbers of one stage: the same whether or not the stages before it ran in this process."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NAMES.index(stage),)))
-
-
-class Stages:
-    """Runs stages, and keeps what they give in a folder where there is one.
+class StageStore:
+    """Keeps what stages give in a folder, one file a stage.
 
     Args:
-        clock: of the run; seconds of a stage that is read are those that it took to make.
         folder: for the files; None keeps nothing.
-        provenance: everything that decides the results, by name; None keeps nothing.
-        resume: whether to take the stages that are there already, rather than to begin anew.
+        provenance: everything that decides the results, by name.
+        records: dataclasses that the results may hold.
+        resume: whether to read the stages that are there already, rather than to begin anew.
 
     Raises:
-        InputError: stages that were made of something else.
+        InputError: the stages that are there were made of something else.
     """
 
     def __init__(
         self,
-        clock: Clock | None = None,
         folder: Path | None = None,
         provenance: Mapping[str, str] | None = None,
+        records: Sequence[type] = (),
         *,
         resume: bool = False,
     ) -> None:
-        self.clock = clock or Clock()
         self.folder = folder
+        self.records = records
+        self.reads = resume
         self.resumed: list[str] = []
         if folder is None:
             return
-        told = folder / "made_of.json"
-        if resume and told.exists():
-            _refuse_other(folder, told, provenance or {})
-        self.reads = resume
-        self._begin(told, provenance or {})
+        path = folder / PROVENANCE_NAME
+        if resume and path.exists():
+            _refuse_other(folder, path, provenance or {})
+        self._begin(path, provenance or {})
 
-    def once(self, name: str, make: Callable[[], Result], unless: Callable[[], bool] = lambda: False) -> Result:
-        """What a stage gives: read if it was finished, else made, and kept if it can be.
+    def read(self, name: str) -> FinishedStage | None:
+        """What an earlier run made of a stage; None where it has to be made."""
+        path = self._path(name)
+        if path is None or not self.reads or not path.exists():
+            return None
+        try:
+            seconds, cpu_seconds, value = read_stage(path, self.records)
+        except UnreadableStage as error:
+            logger.warning("%s; it is made again", error)
+            return None
+        self.resumed.append(str(name))
+        logger.info("%s: taken from the earlier run", name)
+        return FinishedStage(value, seconds, cpu_seconds)
 
-        Args:
-            name: of the stage.
-            make: what it does.
-            unless: whether what was made is not the whole, and must not be kept.
-        """
-        path = None if self.folder is None else self.folder / f"{name.replace(' ', '-')}.npz"
-        if path is not None and self.reads and path.exists():
-            try:
-                seconds, cpu_seconds, value = read_stage(path, RECORDS)
-            except UnreadableStage as error:
-                logger.warning("%s; it is made again", error)
-            else:
-                self.clock.seconds |= seconds
-                self.clock.cpu_seconds |= cpu_seconds
-                self.resumed.append(name)
-                logger.info("%s: taken from the earlier run", name)
-                return value
-        before = set(self.clock.seconds)
-        value = as_stored(make(), RECORDS)
-        if path is not None and not unless():
-            new = [key for key in self.clock.seconds if key not in before]
-            took = tuple({key: told[key] for key in new} for told in (self.clock.seconds, self.clock.cpu_seconds))
-            self._keep(path, (*took, value))
-        return value
+    def as_stored(self, value: Result) -> Result:
+        """A value as reading its file would give it, so that a run with and without files computes the same."""
+        return as_stored(value)
 
-    def _begin(self, told: Path, provenance: Mapping[str, str]) -> None:
+    def write(self, name: str, value: Any, seconds: float, cpu_seconds: float) -> None:
+        """Keep what a stage gave; a full disk gives up the files, not the run."""
+        path = self._path(name)
+        if path is None:
+            return
+        try:
+            write_stage(path, (seconds, cpu_seconds, value))
+        except OSError as error:
+            self._give_up(error)
+
+    def _path(self, name: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"{name.replace(' ', '-')}.npz"
+
+    def _begin(self, provenance_path: Path, provenance: Mapping[str, str]) -> None:
         assert self.folder is not None
         try:
             if not self.reads and self.folder.exists():
                 for path in self.folder.iterdir():
                     path.unlink()
             self.folder.mkdir(parents=True, exist_ok=True)
-            beside = told.with_name(f".{told.name}")
-            beside.write_text(json.dumps(dict(provenance), indent=2) + "\n", encoding="utf-8")
-            os.replace(beside, told)
-        except OSError as error:
-            self._give_up(error)
-
-    def _keep(self, path: Path, value: Any) -> None:
-        try:
-            write_stage(path, value)
+            write_text(provenance_path, json.dumps(dict(provenance), indent=2) + "\n")
         except OSError as error:
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> None:
-        """Go on without files: the result matters more than a way back to it."""
         logger.warning("%s: stages cannot be kept (%s); --resume will not find them", self.folder, error.strerror)
         self.folder = None
 
 
-def _refuse_other(folder: Path, told: Path, provenance: Mapping[str, str]) -> None:
+def _refuse_other(folder: Path, path: Path, provenance: Mapping[str, str]) -> None:
     try:
-        then = json.loads(told.read_text(encoding="utf-8"))
-        differing = sorted(key for key in {*then, *provenance} if then.get(key) != provenance.get(key))
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        differing = sorted(key for key in {*earlier, *provenance} if earlier.get(key) != provenance.get(key))
     except (OSError, ValueError, AttributeError, TypeError):
         differing = ["a file that cannot be read"]
     if differing:

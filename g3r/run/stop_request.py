@@ -47,7 +47,7 @@ class StopRequest:
         """From now on there is something to keep: a first signal lets the present step end."""
         self._postponed = True
 
-    def cut(self, deadline: Deadline | None) -> Deadline:
+    def with_deadline(self, deadline: Deadline | None) -> Deadline:
         """A deadline that also comes when the end is asked for."""
         return replace(deadline or Deadline(), is_stopped=self.is_requested)
 

@@ -180,7 +180,7 @@ def quick_settings() -> ReconstructionSettings:
         draft,
         resolution_mm=1.5,
         use_prior=False,
-        registration=replace(draft.motion, n_rounds=2),
+        registration=replace(draft.registration, n_rounds=2),
         slice_stage=replace(draft.slice_stage, n_steps=5),
     )
 

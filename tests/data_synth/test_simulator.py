@@ -83,7 +83,7 @@ def test_sampling_the_truth_at_the_true_poses_gives_the_slices(fine: bool) -> No
         replace(CLEAN, orientation=o, motion=LEVELS["severe"], thickness_mm=1.0, gap_mm=2.0, interleave=3)
         for o in ("axial", "sagittal")
     ]
-    settings = [replace(s, registration=replace(s.motion, dropout_share=0.0)) for s in settings]
+    settings = [replace(s, motion=replace(s.motion, dropout_share=0.0)) for s in settings]
     for one in simulate_stacks(volume, BALL, AFFINE, settings, np.random.default_rng(2), fine=fine):
         inside = deep(one)
         expected = map_coordinates(volume, GRID.index(true_points_mm(one)[inside]).T, order=3)

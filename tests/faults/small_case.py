@@ -72,8 +72,8 @@ def make_small_case(folder: Path) -> SmallCase:
     options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
     assert simulate([*options, "--seed", "61001", "--output", str(folder / "stacks")]) == 0
     draft = PRESETS["draft"]
-    motion = replace(
-        draft.motion,
+    registration = replace(
+        draft.registration,
         template=False,
         network=False,
         stacks=False,
@@ -81,7 +81,7 @@ def make_small_case(folder: Path) -> SmallCase:
         n_rounds=1,
         standard_orientation=False,
     )  # a fraction of a second; the poses do not matter here
-    settings = replace(draft, motion=motion, resolution_mm=2.0, use_prior=False)
+    settings = replace(draft, registration=registration, resolution_mm=2.0, use_prior=False)
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
     inputs = Inputs(*(tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask")))
     record = {

@@ -340,7 +340,7 @@ def test_two_thread_counts_agree():
     "options",
     [
         {"backend": "cuda"},
-        {"amplitude": "wrong"},
+        {"attenuation": "wrong"},
         {"cutoff_sigma": 0.0},
         {"cutoff_sigma": 6.5},
         {"cutoff_sigma": float("nan")},

@@ -69,8 +69,8 @@ def test_more_time_never_means_a_shorter_registration():
 
 
 def test_registration_keeps_the_space_and_the_seed_that_were_asked_for():
-    motion = replace(SETTINGS.motion, standard_orientation=False, seed=7)
-    settings, deadline = budget(60.0).for_registration(replace(SETTINGS, motion=motion))
+    registration = replace(SETTINGS.registration, standard_orientation=False, seed=7)
+    settings, deadline = budget(60.0).for_registration(replace(SETTINGS, registration=registration))
     assert settings.registration.seed == 7
     assert not settings.registration.standard_orientation
     assert 0 < deadline.remaining_s < 60

@@ -95,7 +95,7 @@ def test_every_figure_can_call_a_stack_unsure(held_out: float, ncc: float, weigh
     found = stack_qualities(estimate, 2)
     assert [one.reliable for one in found] == [True, reliable]
     assert found[1].record() == {
-        "sure": reliable,
+        "reliable": reliable,
         "held_out_correlation": held_out,
         "median_slice_ncc": ncc,
         "downweighted_share": 0.75 if weight < 0.5 else 0.0,

@@ -185,7 +185,7 @@ def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]):
     assert estimate.history == []
 
 
-@pytest.mark.parametrize(("n_slices", "layer"), [(1, "template"), (2, "runs")])
+@pytest.mark.parametrize(("n_slices", "layer"), [(1, "template"), (2, "segments")])
 def test_stacks_of_one_or_two_slices(still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str):
     """Too few to register well, but no reason to break down."""
     slices, _ = as_slices(still)

@@ -48,21 +48,21 @@ def test_in_another_thread_signals_are_left_alone():
 
 def test_a_cut_ends_a_loop_at_the_next_step_whatever_the_least():
     one, done = StopRequest(), []
-    for step, fraction in timed_steps(10, one.cut(None), least=8):
+    for step, fraction in timed_steps(10, one.with_deadline(None), least=8):
         done.append((step, fraction))
         if step == 3:
             one.signal = signal.SIGINT
     assert done == list(timed_steps(10))[:4]
-    assert list(timed_steps(10, one.cut(None))) == []
+    assert list(timed_steps(10, one.with_deadline(None))) == []
 
 
 def test_waiting_for_a_cut_changes_no_schedule():
-    assert list(timed_steps(45, StopRequest().cut(None))) == list(timed_steps(45))
+    assert list(timed_steps(45, StopRequest().with_deadline(None))) == list(timed_steps(45))
 
 
 def test_parts_of_a_deadline_can_be_cut_too():
     one = StopRequest()
-    deadline = one.cut(Deadline.after(100.0)).part(0.5)
+    deadline = one.with_deadline(Deadline.after(100.0)).part(0.5)
     assert deadline.remaining_s <= 50
     one.signal = signal.SIGINT
     assert list(timed_steps(3, deadline)) == []

@@ -85,7 +85,7 @@ def test_bias_table():
 def test_nested_settings():
     settings = PRESETS["balanced"]
     other = changed(settings, {"registration.n_rounds": 0, "use_prior": False})
-    assert (other.motion.n_rounds, other.use_prior) == (0, False)
+    assert (other.registration.n_rounds, other.use_prior) == (0, False)
     assert other.slice_stage == settings.slice_stage
     with pytest.raises(ValueError, match="no field 'n_turns'"):
         changed(settings, {"registration.n_turns": 1})

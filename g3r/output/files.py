@@ -1,0 +1,66 @@
+"""The files of an output folder: their names, and the table of slices."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+
+OUTPUT_NAMES = (
+    "volume.nii.gz",
+    "mask.nii.gz",
+    "prior.nii.gz",
+    "coarse.nii.gz",
+    "density.nii.gz",
+    "uncertainty.nii.gz",
+    "prior_share.nii.gz",
+    "gaussians.npz",
+    "slices.tsv",
+    "run.json",
+    "sections.png",
+)
+
+SLICE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason")
+
+FULL_WEIGHT = 0.99
+"""Slices of a smaller weight get a reason in slices.tsv."""
+
+LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
+"""A down-weighted slice with a gain below the first has lost signal; one with less than the second of its
+stack's median number of pixels is small; one that correlates less than the third with the volume does not fit."""
+
+
+def slice_table(
+    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], ncc: NDArray[np.float64]
+) -> str:
+    """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector in rad, mm).
+
+    Args:
+        slices: K slices in their last poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        ncc: [K] correlation with the volume.
+    """
+    motion = slices.world_from_header()
+    rotvec = motion.rotvec_rad()
+    n_pixels = np.bincount(slices.pixel_plane, minlength=len(slices))
+    lines = ["\t".join(SLICE_COLUMNS)]
+    for k in range(len(slices)):
+        pose = [f"{x:.9g}" for x in (*rotvec[k], *motion.translation_mm[k])]
+        figures = [f"{x:.4g}" for x in (gain[k], weight[k], ncc[k])]
+        reason = "-"
+        if weight[k] < FULL_WEIGHT:
+            typical = float(np.median(n_pixels[slices.stack_id == slices.stack_id[k]]))
+            reason = _reason(gain[k], ncc[k], n_pixels[k] / typical)
+        lines.append("\t".join([str(slices.stack_id[k]), str(slices.slice_index[k]), *pose, *figures, reason]))
+    return "\n".join(lines) + "\n"
+
+
+def _reason(gain: float, ncc: float, size_share: float) -> str:
+    """Why a slice is down-weighted, as far as its figures tell."""
+    if gain < LOST_SIGNAL_GAIN:
+        return "signal loss"
+    if size_share < SMALL_SHARE:
+        return "does not fit, small slice"
+    return "does not fit" if ncc < POOR_NCC else "high residual"

@@ -1,0 +1,36 @@
+"""The stages of a reconstruction: one name for the clock, the store, the memory estimate and the time budget."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+
+
+class Stage(StrEnum):
+    """What a run goes through, in order; the value is what people and run.json read."""
+
+    LOADING = "loading"
+    REGISTRATION = "registration"
+    COARSE = "coarse volume"
+    PRIOR = "prior"
+    SLICES_TO_PRIOR = "slices to prior"
+    FIT_TO_PRIOR = "fit to prior"
+    FIT_TO_SLICES = "fit to slices"
+    VOLUME = "volume"
+    PRIOR_SHARE = "prior share"
+    UNCERTAINTY = "uncertainty"
+    WRITING = "writing"
+
+
+_SPAWN_KEY = {Stage.FIT_TO_PRIOR: 2, Stage.FIT_TO_SLICES: 3, Stage.PRIOR_SHARE: 4}
+
+
+def stage_rng(seed: int, stage: Stage) -> np.random.Generator:
+    """The random numbers of one stage: the same whether or not the stages before it ran in this process.
+
+    Args:
+        seed: of the run.
+        stage: one of those that draw numbers.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY[stage],)))

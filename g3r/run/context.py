@@ -1,0 +1,129 @@
+"""What a run carries besides its data: stage store, clock, stop request, progress, and what it has to say."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from g3r.run.clock import Clock
+from g3r.run.deadline import Deadline
+from g3r.run.stage_store import StageStore
+from g3r.run.stop_request import StopRequest
+
+logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class StoppedAt:
+    """Where a stop request ended a run."""
+
+    stage: str
+    step: int
+    n_steps: int
+
+    def __str__(self) -> str:
+        return f"interrupted in {self.stage}, step {self.step} of {self.n_steps}"
+
+
+@dataclass(kw_only=True)
+class RunContext:
+    """Runs the stages of one computation: times them, keeps what they give, and ends early when it is asked to.
+
+    A stop request before the first droppable or stoppable stage raises `KeyboardInterrupt`. Afterwards it
+    sets `stopped_at`, and the caller makes its result of what there is.
+
+    Args:
+        store: keeps what stages give, or has it from an earlier run; by default nothing is kept.
+        stop_request: signals that end the run early; None leaves them alone.
+        progress: called with (stage, steps done, steps in all).
+        clock: seconds of each stage.
+        notes: remarks for the record.
+        warnings: what must be known before the result is believed; logged when the result is made.
+        stopped_at: where a stop request ended the run; None while it was not.
+    """
+
+    store: StageStore = field(default_factory=StageStore)
+    stop_request: StopRequest | None = None
+    progress: Progress = lambda stage, done, total: None
+    clock: Clock = field(default_factory=Clock)
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    stopped_at: StoppedAt | None = None
+    _position: StoppedAt | None = field(default=None, init=False)
+
+    def stage(self, name: str, make: Callable[[], Result]) -> Result:
+        """What a stage gives: from the store if it was finished in an earlier run, else made, timed and kept."""
+        return self._run(name, make)
+
+    def droppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:
+        """A stage that a first stop request ends at once.
+
+        Returns:
+            What the stage gives; None where it was stopped.
+        """
+        try:
+            return self._run(name, make)
+        except KeyboardInterrupt:
+            if not self._stop_is_requested():
+                raise
+            self.postpone_stop()
+            at = self._position
+            self.stopped_at = at if at and at.stage == name else StoppedAt(str(name), 0, 0)
+            return None
+
+    def stoppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:
+        """A stage whose loop a stop request ends after the step under way; what it gives then is not kept.
+
+        The loop looks at a deadline from `deadline`.
+
+        Returns:
+            What the stage gives; None where the run was stopped before it.
+        """
+        if self.stopped_at is not None:
+            return None
+        self.postpone_stop()
+        result = self._run(name, make, keep=lambda: not self._stop_is_requested())
+        if self._stop_is_requested():
+            self.stopped_at = self._position or StoppedAt(str(name), 0, 0)
+        return result
+
+    def deadline(self, deadline: Deadline | None) -> Deadline | None:
+        """A deadline that also comes when the stop is requested; None where there is neither."""
+        return deadline if self.stop_request is None else self.stop_request.with_deadline(deadline)
+
+    def postpone_stop(self) -> None:
+        """From now on there is something worth keeping: a first signal only sets the stop request."""
+        if self.stop_request is not None:
+            self.stop_request.postpone()
+
+    def report(self, stage: str) -> Callable[[int, int], None]:
+        """The progress function (steps done, steps in all) of one stage."""
+
+        def report(done: int, total: int) -> None:
+            self._position = StoppedAt(str(stage), done, total)
+            self.progress(stage, done, total)
+
+        return report
+
+    def _run(self, name: str, make: Callable[[], Result], keep: Callable[[], bool] = lambda: True) -> Result:
+        self._position = None
+        found = self.store.read(name)
+        if found is not None:
+            self.clock.add(name, found.seconds, found.cpu_seconds)
+            return found.value
+        with self.clock(name):
+            value = make()
+        value = self.store.as_stored(value)
+        if keep():
+            self.store.write(name, value, self.clock.seconds[name], self.clock.cpu_seconds[name])
+        return value
+
+    def _stop_is_requested(self) -> bool:
+        return self.stop_request is not None and self.stop_request.is_requested()

@@ -1,0 +1,74 @@
+"""What this machine offers to a run: cores and memory, on Linux, macOS and Windows."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import psutil
+
+from g3r.errors import InputError
+
+_STATUS = Path("/proc/self/status")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    process = psutil.Process()
+    if hasattr(process, "cpu_affinity"):  # macOS has none
+        return len(process.cpu_affinity())
+    return psutil.cpu_count() or 1
+
+
+def use_threads(n_threads: int | None = None) -> int:
+    """Give torch's and numba's thread pools the same number of threads; they take turns, stage by stage.
+
+    Args:
+        n_threads: as many as there are cores for this process when None.
+
+    Returns:
+        The number that is used.
+
+    Raises:
+        InputError: more than numba was started with.
+    """
+    import numba
+    import torch
+
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    wanted = n_threads or min(available_cores(), most)
+    if wanted > most:
+        raise InputError(f"--threads {wanted}: this machine offers {most}; choose at most that")
+    numba.set_num_threads(wanted)
+    torch.set_num_threads(wanted)
+    return wanted
+
+
+def held_bytes() -> int:
+    """Memory that this process holds now."""
+    return int(psutil.Process().memory_info().rss)
+
+
+def available_bytes() -> int:
+    """Memory that the machine could still give."""
+    return int(psutil.virtual_memory().available)
+
+
+def peak_bytes() -> int:
+    """The most memory that this process has held so far.
+
+    Linux counts in `/proc`: by `getrusage` a process begins with the peak of the one that started it.
+    """
+    if _STATUS.is_file():
+        for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    used = psutil.Process().memory_info()
+    if hasattr(used, "peak_wset"):  # Windows
+        return int(used.peak_wset)
+    try:
+        import resource
+    except ImportError:
+        return int(used.rss)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
