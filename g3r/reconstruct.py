@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import head_volume_mm3, normalised_slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import fit_adaptive
-from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
+from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
@@ -35,7 +36,7 @@ from g3r.prior.inference import estimate_prior
 from g3r.registration import Registration, register
 from g3r.registration.prior_registration import register_to_prior
 from g3r.registration.quality import pose_warnings, stack_qualities
-from g3r.registration.template_search import head_volume_mm3, template_fits
+from g3r.registration.template_search import template_fits
 from g3r.run.allocator import release_memory
 from g3r.run.deadline import Deadline
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
@@ -124,7 +125,7 @@ class GaussianReconstructor:
         clock, notes, by_then = stages.clock, list[str](), None
         slices, first_scale = normalised_slices(stacks)
         notes += skipped_slice_notes(stacks, slices)
-        single = len(np.unique(slices.stack_id)) == 1
+        single = slices.n_stacks == 1
         settings = _settings_for(self.settings, single)
         if single:
             notes.append("shading not estimated: a single stack cannot tell it from anatomy")
@@ -309,7 +310,7 @@ class GaussianReconstructor:
             if settings.use_prior and settings.distillation:
                 # the prior counts where slices are sparse; where they are dense they know better. It was made
                 # of the same slices: from several stacks only 1 - c of what it says there is its own
-                power = 1 if len(np.unique(start.slices.stack_id)) == 1 else 2
+                power = 1 if start.slices.n_stacks == 1 else 2
                 unmeasured = np.maximum((1 - confidence(start.density)) ** power, MIN_DISTILLATION)
                 slice_weight = (unmeasured * start.mask).astype(np.float32)
                 distil_to = VolumeTarget.of(run.volume.prior, slice_weight, start.grid)

@@ -18,6 +18,7 @@ from g3r.errors import NumericalError
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
 from g3r.output.record import inactive_terms, run_record
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import ReconstructionSettings
@@ -29,7 +30,7 @@ from g3r.registration.quality import StackQuality, registration_reliable
 from g3r.run.allocator import release_memory
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
 from g3r.uncertainty import estimate_uncertainty
-from g3r.uncertainty.prior_share import estimate_prior_share, on_grid
+from g3r.uncertainty.prior_share import estimate_prior_share
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from g3r._version import __version__
-from g3r.acquisition.planes import MIN_SLICE_PIXELS, Slices
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import MIN_SLICE_PIXELS
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.slice_stage import SliceFit
 from g3r.planning.memory_estimate import peak_bytes
@@ -120,7 +121,7 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings, counts: dic
         counts: how the number of Gaussians came about.
     """
     stage, terms = settings.slice_stage, []
-    single = len(np.unique(slices.stack_id)) == 1
+    single = slices.n_stacks == 1
 
     def absent(term: str, reason: str) -> None:
         terms.append({"term": term, "reason": reason})

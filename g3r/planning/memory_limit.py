@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.planning.memory_estimate import (
