@@ -32,7 +32,8 @@ from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 from data_synth.subject_cache import KeptSubjects, SyntheticSubject
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.least_squares import sharpened_volume
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.geometry import RigidPose, VolumeGrid
 
 logger = logging.getLogger(__name__)

@@ -12,17 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
-from g3r.acquisition.planes import Planes, Slices, skipped_slice_notes
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import fit_adaptive
-from g3r.fitting.initial_volumes import (
-    InitialVolumes,
-    PriorVolume,
-    gaussian_spacing_mm,
-    normalised_slices,
-    with_pixels_of,
-)
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import PriorCloud, VolumeTarget, fit_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
@@ -31,9 +26,9 @@ from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.assemble import StageResults, assemble
 from g3r.output.result import ReconstructionResult
+from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, preset
 from g3r.planning.stages import Stage, stage_rng
-from g3r.planning.time_budget import FixedPlan, Plan
 from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
 from g3r.pose_network.inference import predict_poses
 from g3r.pose_network.network import PoseNetwork
@@ -44,7 +39,7 @@ from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.prior_registration import register_to_prior
 from g3r.registration.quality import StackQuality, pose_warnings, stack_qualities
-from g3r.registration.template_search import head_volume_mm3, template_fits
+from g3r.registration.template_search import template_fits
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
@@ -145,9 +140,7 @@ class GaussianReconstructor:
         volumes = run.stage(Stage.COARSE, lambda: self._volumes(poses.slices, poses.gain, poses.weight))
         prior = self._prior(volumes, poses, plan, run)
         cloud = run.droppable_stage(Stage.FIT_TO_PRIOR, lambda: self._fit_to_prior(prior, plan, run))
-        fit = run.stoppable_stage(
-            Stage.FIT_TO_SLICES, lambda: self._fit_to_slices(cloud, prior, poses, plan, run)
-        )
+        fit = run.stoppable_stage(Stage.FIT_TO_SLICES, lambda: self._fit_to_slices(cloud, prior, poses, plan, run))
         found = StageResults(
             stacks=stacks,
             registration=poses,
@@ -207,9 +200,7 @@ class GaussianReconstructor:
             run.notes.append("bias field not estimated: a single stack cannot tell it from anatomy")
         return slices, scale
 
-    def _poses(
-        self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext
-    ) -> Registration:
+    def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:
         if given is not None:
             run.notes.append("registration was given, not estimated here")
             with run.clock(Stage.REGISTRATION):
@@ -220,9 +211,7 @@ class GaussianReconstructor:
             Stage.REGISTRATION, lambda: self.register(slices, plan.settings.registration, report, deadline)
         )
 
-    def _judge(
-        self, poses: Registration, stacks: Sequence[Stack], plan: Plan, run: RunContext
-    ) -> list[StackQuality]:
+    def _judge(self, poses: Registration, stacks: Sequence[Stack], plan: Plan, run: RunContext) -> list[StackQuality]:
         """How far the poses of each stack can be relied on; what cannot is said."""
         qualities = stack_qualities(poses, len(stacks))
         run.warnings += pose_warnings(poses, qualities, stacks)
@@ -233,9 +222,7 @@ class GaussianReconstructor:
             )
         return qualities
 
-    def _volumes(
-        self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> InitialVolumes:
+    def _volumes(self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
         voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
         return InitialVolumes.of(slices, gain, weight, voxel_mm)
@@ -251,9 +238,7 @@ class GaussianReconstructor:
         if volumes.slices.n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
-            prior = run.stage(
-                Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses.weight, plan.settings)
-            )
+            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses.weight, plan.settings))
         run.notes.append(NOTE_ON_SINGLE[prior.accepted])
         return prior
 

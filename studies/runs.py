@@ -97,9 +97,9 @@ def reconstructed(case: SimulatedCase, settings: ReconstructionSettings, checkpo
         error,
         seconds,
         cpu_seconds,
-        tuple(result.record["warnings"]),
+        tuple(result.record.warnings),
         scores,
-        result.record["seconds"],
+        result.record.seconds,
         orientation_deg(case, error.common),
     )
 

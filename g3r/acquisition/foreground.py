@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, gaussian_filter, label
 
 from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.slicing import slice_spacing_mm
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
@@ -44,7 +45,8 @@ def foreground_mask(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floatin
     volume_mm3 = planes.spacing_mm.prod(1) * (slices.thickness_mm * weight)[source]
     covered = (volume_mm3 / grid.voxel_volume_mm3)[operator.plane].astype(np.float32)
     inside, total = operator.adjoint(covered * mask), operator.adjoint(covered)
-    sigma = 0.5 * _slice_distance_mm(slices) / grid.spacing_mm.mean()
+    distance_mm = max(slice_spacing_mm(slices.take(slices.stack_id == stack)) for stack in np.unique(slices.stack_id))
+    sigma = 0.5 * distance_mm / grid.spacing_mm.mean()
     inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
     brain = (inside > INSIDE_SHARE * total) & (inside > MIN_DENSITY)
     pieces, n_pieces = label(brain)
@@ -96,16 +98,3 @@ def _ends(slices: Slices) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             ends.append(row)
             steps.append(sign * step_mm * slices.planes.rotation[row][:, 2])
     return np.array(ends, dtype=np.int64), np.array(steps).reshape(-1, 3)
-
-
-def _slice_distance_mm(slices: Slices) -> float:
-    """The largest typical distance of neighbouring slices among the stacks, by their headers."""
-    distances = []
-    for stack in np.unique(slices.stack_id):
-        of_stack = slices.stack_id == stack
-        center = slices.header_pose.translation_mm[of_stack]
-        normal = slices.header_pose.rotation[of_stack][:, :, 2]
-        step = np.abs(((center[1:] - center[:-1]) * normal[1:]).sum(1))
-        index_step = np.maximum(np.diff(slices.slice_index[of_stack]), 1)
-        distances.append(np.median(step / index_step) if len(step) else float(slices.thickness_mm[of_stack][0]))
-    return float(max(distances))

@@ -70,7 +70,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
             f"{mask.name}: mask grid {mask.data.shape} differs from that of {reference.name} "
             f"{reference.data.shape}; resample the mask or pass the matching file"
         )
-    corners = np.array(np.meshgrid(*[(0, n - 1) for n in reference.data.shape], indexing="ij")).reshape(3, -1).T
+    corners = reference.grid.corner_index
     offset = reference.grid.index(mask.grid.world(corners)) - corners
     if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
         raise InputError(

@@ -145,7 +145,7 @@ def orientation_remarks(image: NiftiImage, grid: VolumeGrid) -> list[str]:
             other = VolumeGrid(grid.shape, header.get_qform())
     except Exception:  # the sform is the one that is used
         return ["the qform cannot be read; the sform is used"]
-    corners = np.array(np.meshgrid(*[(0, n - 1) for n in grid.shape], indexing="ij")).reshape(3, -1).T
+    corners = grid.corner_index
     apart_mm = float(np.linalg.norm(grid.world(corners) - other.world(corners), axis=1).max())
     if apart_mm <= HEADERS_AGREE_VOXELS * grid.spacing_mm.min():
         return []

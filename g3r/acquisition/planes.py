@@ -1,22 +1,15 @@
-"""Planes of pixels in space, and the slices of all stacks as one record."""
+"""Planes of pixels in space, and the slices of all stacks as one record (the y_k of G3R Eq. 1)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.stacks import Stack
-from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
-
-MIN_SLICE_PIXELS = 12
-"""Slices with fewer masked pixels carry no pose and little image; they are left out and named in run.json."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +53,9 @@ class Planes:
 
     def __len__(self) -> int:
         return len(self.rotation)
+
+    def __repr__(self) -> str:
+        return f"Planes({len(self)} planes, {self.n_pixels} pixels)"
 
     @cached_property
     def offset(self) -> NDArray[np.int64]:
@@ -115,6 +111,11 @@ class Planes:
         """The same pixel grids at other poses (world from plane)."""
         return replace(self, rotation=pose.rotation, center_mm=pose.translation_mm)
 
+    def corners_mm(self) -> NDArray[np.float64]:
+        """The corners of each pixel grid [K, 4, 3] in the plane's own frame."""
+        unit = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
+        return np.pad((self.shape * self.spacing_mm)[:, None] * unit, ((0, 0), (0, 0), (0, 1)))
+
 
 @dataclass(frozen=True)
 class Slices:
@@ -123,7 +124,7 @@ class Slices:
     Args:
         planes: [K] planes, cropped to the mask.
         value: [P] float32 pixel values.
-        mask: [P] bool, pixels that count.
+        mask: [P] bool, pixels of the brain.
         stack_id: [K] number of the stack.
         slice_index: [K] number of the slice in its stack.
         thickness_mm: [K].
@@ -139,20 +140,21 @@ class Slices:
     header_pose: RigidPose
 
     def __post_init__(self) -> None:
-        n_planes, n_pixels = len(self.planes), self.planes.n_pixels
-        for name, expected in (
-            ("value", n_pixels),
-            ("mask", n_pixels),
-            ("stack_id", n_planes),
-            ("slice_index", n_planes),
-            ("thickness_mm", n_planes),
-            ("header_pose", n_planes),
-        ):
+        for name in self.__dataclass_fields__:
+            expected = self.planes.n_pixels if name in ("value", "mask") else len(self.planes)
             if len(getattr(self, name)) != expected:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries; expected {expected}")
 
     def __len__(self) -> int:
         return len(self.planes)
+
+    def __repr__(self) -> str:
+        return f"Slices({len(self)} slices of {self.n_stacks} stacks, {len(self.pixel_index)} masked pixels)"
+
+    @property
+    def n_stacks(self) -> int:
+        """Number of stacks with at least one slice."""
+        return len(np.unique(self.stack_id))
 
     @cached_property
     def pixel_index(self) -> NDArray[np.int64]:
@@ -196,55 +198,6 @@ class Slices:
     def world_from_header(self) -> RigidPose:
         """Motion of each slice: takes a point by the file's header to where it is now estimated to be."""
         return self.planes.pose @ self.header_pose.inverse()
-
-
-def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
-    """Cut stacks into slices, each cropped to the bounding box of its mask.
-
-    Slices whose mask has fewer than 12 pixels are left out.
-
-    Raises:
-        InputError: no stack, or none with a usable slice.
-    """
-    if not stacks:
-        raise InputError("no stack given; pass at least one")
-    rotation, center, spacing, shape, psf = [], [], [], [], []
-    values, masks, stack_id, slice_index, thickness = [], [], [], [], []
-    for number, stack in enumerate(stacks):
-        axes = stack.affine[:3, :3] / stack.spacing_mm
-        # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
-        frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
-        left, _, right = np.linalg.svd(frame)
-        frame = left @ right
-        for k in range(stack.image.shape[2]):
-            inside = stack.mask[:, :, k]
-            if inside.sum() < MIN_SLICE_PIXELS:
-                continue
-            rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
-            box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-            middle = [(rows[0] + rows[-1]) / 2, (columns[0] + columns[-1]) / 2, k]
-            rotation.append(frame)
-            center.append(stack.grid.world(middle))
-            spacing.append(stack.spacing_mm[:2])
-            shape.append(inside[box].shape)
-            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm))
-            values.append(stack.image[(*box, k)].ravel())
-            masks.append(inside[box].ravel())
-            stack_id.append(number)
-            slice_index.append(k)
-            thickness.append(stack.thickness_mm)
-    if not rotation:
-        raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
-    planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
-    return Slices(
-        planes,
-        np.concatenate(values).astype(np.float32),
-        np.concatenate(masks),
-        np.array(stack_id, dtype=np.int64),
-        np.array(slice_index, dtype=np.int64),
-        np.array(thickness),
-        planes.pose,
-    )
 
 
 def volume_planes(grid: VolumeGrid) -> Planes:

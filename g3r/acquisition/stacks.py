@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.images import load_mask, load_volume
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import bounding_box
 
 logger = logging.getLogger(__name__)
 
@@ -112,9 +113,13 @@ class Stack:
         object.__setattr__(self, "affine", affine)
         object.__setattr__(self, "thickness_mm", float(self.thickness_mm))
 
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.image.shape))
+        return f"Stack({self.name}: {shape} voxels of {spaced(self.spacing_mm)} mm, {self.thickness_mm:g} mm thick)"
+
     @property
     def grid(self) -> VolumeGrid:
-        """The voxel grid of the file (after the slices were put on the third axis)."""
+        """The voxel grid, with the slices along the third axis."""
         return VolumeGrid(self.image.shape, self.affine)
 
     @property
@@ -218,5 +223,4 @@ def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> Non
 
 def _middle_mm(stack: Stack) -> NDArray[np.float64]:
     """World position of the middle of the mask's bounding box [3]."""
-    corners = [np.flatnonzero(stack.mask.any(axes))[[0, -1]].mean() for axes in ((1, 2), (0, 2), (0, 1))]
-    return stack.grid.world(corners)
+    return stack.grid.world([(axis.start + axis.stop - 1) / 2 for axis in bounding_box(stack.mask)])

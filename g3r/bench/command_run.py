@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -11,10 +10,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from g3r.errors import InputError, NumericalError
 from g3r.evaluation.case import SimulatedCase
+from g3r.output.record import RunRecord
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
@@ -33,7 +32,7 @@ class CommandRun:
     seconds: float
     cpu_seconds: float
     peak_bytes: int
-    record: dict[str, Any]
+    record: RunRecord
 
 
 def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]:
@@ -84,5 +83,5 @@ def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
         raise InputError(said.removeprefix("g3r-infer: "))
     if child.returncode:
         raise NumericalError(f"g3r-infer ended with {child.returncode}: {said[-2000:]}")
-    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
-    return CommandRun(seconds, usage.ru_utime + usage.ru_stime, record["peak_memory_bytes"], record)
+    record = RunRecord.read(output / "run.json")
+    return CommandRun(seconds, usage.ru_utime + usage.ru_stime, record.peak_memory_bytes, record)

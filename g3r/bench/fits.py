@@ -98,13 +98,13 @@ def measured_fit(
     watch = FitWatch(settings.slice_stage.n_steps)
     result = GaussianReconstructor(settings=settings, observer=watch).reconstruct(case.stacks, motion)
     found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
-    stages = dict(result.record["seconds"])
+    stages = dict(result.record.seconds)
     stages["fit to slices"] = round(stages["fit to slices"] - watch.spent, 3)
     return {
         "seconds": round(sum(stages.values()), 3),
-        "cpu_seconds": round(sum(result.record["cpu_seconds"].values()), 3),
+        "cpu_seconds": round(sum(result.record.cpu_seconds.values()), 3),
         "stages": stages,
-        "stages_cpu": dict(result.record["cpu_seconds"]),
+        "stages_cpu": dict(result.record.cpu_seconds),
         "n_gaussians": len(result.cloud),
         **found.record(),
         "curve": _curve(case, watch, result.slices, found, settings.slice_stage.cutoff_sigma),

@@ -114,10 +114,10 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
     from g3r.bench.scores import quality_of_folder
 
     runs = [run_infer(arguments, output) for _ in range(repeats)]
-    names = list(runs[-1].record["seconds"])
+    names = list(runs[-1].record.seconds)
     wall, cpu = median(run.seconds for run in runs), median(run.cpu_seconds for run in runs)
-    stages = {name: round(median(run.record["seconds"][name] for run in runs), 3) for name in names}
-    stages_cpu = {name: round(median(run.record["cpu_seconds"][name] for run in runs), 3) for name in names}
+    stages = {name: round(median(run.record.seconds[name] for run in runs), 3) for name in names}
+    stages_cpu = {name: round(median(run.record.cpu_seconds[name] for run in runs), 3) for name in names}
     stages[OUTSIDE_STAGES] = round(wall - sum(stages.values()), 3)
     stages_cpu[OUTSIDE_STAGES] = round(cpu - sum(stages_cpu.values()), 3)
     return {
@@ -127,7 +127,7 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
         "peak_bytes": max(run.peak_bytes for run in runs),
         "stages": stages,
         "stages_cpu": stages_cpu,
-        "n_gaussians": runs[-1].record["n_gaussians"],
+        "n_gaussians": runs[-1].record.n_gaussians,
         **quality_of_folder(case, output).record(),
     }
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.images import load_volume
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid
+from g3r.geometry.rigid import fit_rigid_robust
 
 POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
@@ -135,11 +135,7 @@ def target_registration_error(
     owner = np.repeat(np.arange(len(keys)), count)
     target = _place(header, true.pose.take([true_row[key] for key in keys]), owner)
     found = _place(header, estimated.pose.take([estimated_row[key] for key in keys]), owner)
-    weight = np.ones(len(header))
-    for _ in range(10):
-        common = fit_rigid(found, target, weight)
-        distance = np.linalg.norm(common.apply(found[None])[0] - target, axis=1)
-        weight = 1 / (1 + (distance / ROBUST_SCALE_MM) ** 2)
+    common, distance = fit_rigid_robust(found, target, scale_mm=ROBUST_SCALE_MM, n_rounds=10)
     per_slice = np.bincount(owner, distance) / np.bincount(owner)
     return PoseError(
         mean_mm=float(per_slice.mean()),

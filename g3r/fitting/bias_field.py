@@ -11,12 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.bias_basis import LENGTH_MM, N_TERMS, quadratic_terms, stacks_by_header
 from g3r.acquisition.planes import Slices
-
-LENGTH_MM = 40.0
-"""Unit of the coordinates, about half a head: coefficients are log-intensities at that distance."""
-
-N_TERMS = 5
 
 
 class StackBiasField:
@@ -29,25 +25,15 @@ class StackBiasField:
     """
 
     def __init__(self, slices: Slices) -> None:
-        planes = slices.planes.with_pose(slices.header_pose)
-        plane = planes.plane_id()
-        world = planes.pixel_world_mm()
-        stack_of_pixel = slices.stack_id[plane]
         self.stacks = np.unique(slices.stack_id)
-        basis = np.zeros((planes.n_pixels, N_TERMS), np.float32)
+        basis = np.zeros((slices.planes.n_pixels, N_TERMS), np.float32)
         self.ranges: list[tuple[int, int]] = []
-        for stack in self.stacks:
-            pixels = np.flatnonzero(stack_of_pixel == stack)
-            start, end = int(pixels[0]), int(pixels[-1]) + 1  # slices of a stack stand together
-            inside = slices.mask[start:end]
-            self.ranges.append((start, end))
-            if not inside.any():  # nothing tells its field: no terms
+        for pixels, inside, world_mm, axes in stacks_by_header(slices):
+            self.ranges.append((pixels.start, pixels.stop))
+            if not inside.any():  # nothing determines its field: no terms
                 continue
-            axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
-            center = world[start:end][inside].mean(0)
-            x, y = ((world[start:end] - center) @ axes / LENGTH_MM).T
-            terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
-            basis[start:end] = terms - terms[inside].mean(0)
+            terms = quadratic_terms(*((world_mm - world_mm[inside].mean(0)) @ axes / LENGTH_MM).T)
+            basis[pixels] = terms - terms[inside].mean(0)
         self.basis = np.ascontiguousarray(basis.T)
 
     def log_field(self, coefficients: NDArray[np.floating]) -> NDArray[np.float32]:

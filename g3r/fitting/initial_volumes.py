@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +11,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.foreground import foreground_mask
 from g3r.acquisition.least_squares import sharpened_volume
-from g3r.acquisition.planes import Slices, slices_from_stacks
-from g3r.acquisition.stacks import Stack
+from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 from g3r.registration import Registration
@@ -45,7 +43,9 @@ class InitialVolumes:
     scale: float
 
     @classmethod
-    def of(cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float) -> InitialVolumes:
+    def of(
+        cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
+    ) -> InitialVolumes:
         """The volumes of slices in their poses.
 
         Args:
@@ -82,19 +82,6 @@ class PriorVolume:
     gain: NDArray[np.float64]
     scale: float
     accepted: bool | None = None
-
-
-def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
-    """Slices of order one at their header poses, and what they were divided by.
-
-    Raises:
-        InputError: stacks that cannot be used, or intensities that are not positive.
-    """
-    slices = slices_from_stacks(stacks)
-    scale = float(np.percentile(slices.masked_value, 99))
-    if not scale > 0:
-        raise InputError(f"99th percentile inside the masks is {scale:g}; expected a positive intensity")
-    return slices.scaled(1 / scale), scale
 
 
 def with_pixels_of(slices: Slices, registration: Registration) -> Registration:

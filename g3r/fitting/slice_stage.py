@@ -133,7 +133,7 @@ def fit_slices(
             cutoff_sigma=settings.cutoff_sigma,
             projection_bytes=settings.projection_bytes,
         )
-    several = len(np.unique(slices.stack_id)) > 1  # one stack cannot tell its shading from anatomy
+    several = slices.n_stacks > 1  # one stack cannot tell its shading from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
     parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, bias_field, settings))
     loss = SliceLoss(parameters, slices, gain, slice_weight.astype(np.float64), bias_field, prior, settings)

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.objective import TINY, ImageTerm
 from g3r.fitting.parameters import FitParameters
 from g3r.gaussians.render import CUTOFF_SIGMA, right_jacobian
 from g3r.geometry import RigidPose
-from g3r.registration.slice_rounds import slice_weights
 
 
 class SliceTerm(ImageTerm):

@@ -1,4 +1,4 @@
-"""Rigid poses, voxel grids and symmetric 3x3 algebra, all in float64. Imports nothing of ours."""
+"""Rigid poses (`rigid`) and voxel grids (`grid`), all in float64. Imports nothing of ours."""
 
 from g3r.geometry.grid import VolumeGrid
 from g3r.geometry.rigid import RigidPose

@@ -1,4 +1,4 @@
-"""Voxel grids: a shape and an affine, with both directions of the mapping."""
+"""Voxel grids (a shape and an affine, RAS+ mm from index), bounding boxes, and maps read on another grid."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import affine_transform
 
 
 @dataclass(frozen=True)
 class VolumeGrid:
-    """A grid of voxels; an index names the voxel's centre.
+    """A grid of voxels; an integer index is the centre of a voxel.
 
     Args:
         shape: number of voxels (I, J, K).
@@ -39,7 +40,14 @@ class VolumeGrid:
 
     @classmethod
     def isotropic(cls, low_mm: ArrayLike, high_mm: ArrayLike, spacing_mm: float, margin_mm: float = 0.0) -> VolumeGrid:
-        """The axis-aligned RAS grid with cubic voxels that covers the box from low to high plus a margin."""
+        """The axis-aligned RAS grid with cubic voxels that covers a box and a margin around it.
+
+        Args:
+            low_mm: [3] lowest corner of the box.
+            high_mm: [3] highest corner.
+            spacing_mm: edge of the voxels.
+            margin_mm: added on every side.
+        """
         low = np.asarray(low_mm, dtype=np.float64) - margin_mm
         high = np.asarray(high_mm, dtype=np.float64) + margin_mm
         shape = np.maximum(np.ceil((high - low) / spacing_mm).astype(int) + 1, 1)
@@ -48,14 +56,14 @@ class VolumeGrid:
         return cls((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
     def respaced(self, spacing_mm: float) -> VolumeGrid:
-        """The axis-aligned grid of cubic voxels of another size over the same box; this grid where the size is its own."""
+        """The axis-aligned grid of cubic voxels of another size over the same box; this one if its voxels have it."""
         if np.isclose(self.spacing_mm[0], spacing_mm, rtol=1e-6):
             return self
         return VolumeGrid.isotropic(self.world([0, 0, 0]), self.world(np.array(self.shape) - 1), spacing_mm)
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
-        """Distance of neighbouring voxels along each axis [3]."""
+        """Distance between neighbouring voxels along each axis [3]."""
         return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0), dtype=np.float64)
 
     @property
@@ -67,6 +75,11 @@ class VolumeGrid:
     def center_mm(self) -> NDArray[np.float64]:
         """World position of the middle of the grid [3]."""
         return self.world((np.array(self.shape) - 1) / 2)
+
+    @property
+    def corner_index(self) -> NDArray[np.int64]:
+        """Indices of the eight corner voxels [8, 3]."""
+        return np.array(np.meshgrid(*[(0, n - 1) for n in self.shape], indexing="ij")).reshape(3, -1).T
 
     @property
     def index_from_world(self) -> NDArray[np.float64]:
@@ -81,3 +94,45 @@ class VolumeGrid:
         """Fractional indices of world positions [..., 3]."""
         inverse = self.index_from_world
         return np.asarray(world_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
+
+    def cropped(self, box: tuple[slice, ...]) -> VolumeGrid:
+        """The grid of `array[box]`, for a box as `bounding_box` returns it."""
+        affine = self.affine.copy()
+        affine[:3, 3] = self.world([axis.start for axis in box])
+        return VolumeGrid((box[0].stop - box[0].start, box[1].stop - box[1].start, box[2].stop - box[2].start), affine)
+
+
+def bounding_box(mask: NDArray[np.bool_], margin: ArrayLike = 0) -> tuple[slice, ...]:
+    """The smallest box that holds all of a mask, enlarged by a margin as far as the array reaches.
+
+    Args:
+        mask: boolean array of any dimension.
+        margin: voxels on every side, one number or one for each axis.
+
+    Raises:
+        ValueError: an empty mask.
+    """
+    if not mask.any():
+        raise ValueError("the mask is empty")
+    axes = range(mask.ndim)
+    inside = [np.flatnonzero(mask.any(tuple(other for other in axes if other != axis))) for axis in axes]
+    low = np.maximum([index[0] for index in inside] - np.asarray(margin), 0)
+    high = np.minimum([index[-1] + 1 for index in inside] + np.asarray(margin), mask.shape)
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float) -> NDArray[np.float32]:
+    """A map read on another grid by trilinear interpolation.
+
+    Args:
+        data: [I, J, K] on `source`.
+        source: its grid.
+        target: the grid of the answer.
+        outside: value where `source` does not reach.
+    """
+    if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
+        return data.astype(np.float32)
+    index = source.index_from_world @ target.affine
+    return affine_transform(
+        data.astype(np.float32), index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant", cval=outside
+    )

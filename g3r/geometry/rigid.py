@@ -1,4 +1,4 @@
-"""Rigid motions of world space (RAS+, mm): the only place where poses are composed and inverted."""
+"""Rigid motions of world space (RAS+, mm): composition, inversion and least-squares fits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Selection = NDArray[np.integer] | NDArray[np.bool_] | Sequence[int] | slice
-"""What `take` accepts: numbers, a mask, or a slice."""
+"""What `take` accepts: indices, a mask or a slice."""
 
 ORTHONORMALITY_TOLERANCE = 1e-6
 """Largest accepted entry of R R^T - 1; a rotation read from text has about 1e-7."""
@@ -18,14 +18,14 @@ ORTHONORMALITY_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class RigidPose:
-    """S rigid motions x -> R x + t.
+    """S rigid motions x -> R x + t, the poses of the slice model (G3R Eq. 1).
 
     Args:
         rotation: [S, 3, 3] proper rotations (det +1).
         translation_mm: [S, 3].
 
     Raises:
-        ValueError: wrong shape, a value that is not finite, or a matrix that is no rotation.
+        ValueError: wrong shape, a value that is not finite, or a matrix that is not a rotation.
     """
 
     rotation: NDArray[np.float64]
@@ -48,7 +48,7 @@ class RigidPose:
 
     @classmethod
     def identity(cls, n: int) -> RigidPose:
-        """N motions that change nothing."""
+        """`n` identity motions."""
         return cls(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3)))
 
     @classmethod
@@ -56,14 +56,22 @@ class RigidPose:
         """Motions from rotation vectors [S, 3] (axis times angle, rad) and translations [S, 3]."""
         return cls(rotation_matrix(rotvec_rad), np.asarray(translation_mm, dtype=np.float64))
 
+    @classmethod
+    def concatenated(cls, poses: Sequence[RigidPose]) -> RigidPose:
+        """The motions of several records one after the other."""
+        return cls(np.concatenate([p.rotation for p in poses]), np.concatenate([p.translation_mm for p in poses]))
+
     def __len__(self) -> int:
         return len(self.rotation)
+
+    def __repr__(self) -> str:
+        return f"RigidPose({len(self)} poses)"
 
     def __matmul__(self, other: RigidPose) -> RigidPose:
         """Composition: `a @ b` applies b first. A single motion is broadcast over the other's S."""
         rotation = self.rotation @ other.rotation
-        turned = (self.rotation @ other.translation_mm[..., None])[..., 0]
-        return RigidPose(orthonormal(rotation), turned + self.translation_mm)
+        rotated = (self.rotation @ other.translation_mm[..., None])[..., 0]
+        return RigidPose(orthonormal(rotation), rotated + self.translation_mm)
 
     def inverse(self) -> RigidPose:
         """The motions that undo these."""
@@ -74,8 +82,8 @@ class RigidPose:
         """Move points [S, ..., 3] (mm), the s-th block by the s-th motion."""
         points = np.asarray(points_mm, dtype=np.float64)
         middle = (1,) * (points.ndim - 2)
-        shift = self.translation_mm.reshape(len(self), *middle, 3)
-        return np.einsum("sij,s...j->s...i", self.rotation, points) + shift
+        translation = self.translation_mm.reshape(len(self), *middle, 3)
+        return np.einsum("sij,s...j->s...i", self.rotation, points) + translation
 
     def rotvec_rad(self) -> NDArray[np.float64]:
         """Rotation vectors [S, 3] (rad), angle in [0, pi]."""
@@ -84,6 +92,12 @@ class RigidPose:
     def take(self, index: Selection) -> RigidPose:
         """The motions at an index array, a mask or a slice."""
         return RigidPose(self.rotation[index], self.translation_mm[index])
+
+    def with_rows(self, rows: Selection, new: RigidPose) -> RigidPose:
+        """The motions with those at some rows replaced by `new` (one, or one for each row)."""
+        rotation, translation = self.rotation.copy(), self.translation_mm.copy()
+        rotation[rows], translation[rows] = new.rotation, new.translation_mm
+        return RigidPose(rotation, translation)
 
 
 def rotation_matrix(rotvec_rad: ArrayLike) -> NDArray[np.float64]:
@@ -104,7 +118,12 @@ def orthonormal(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def fit_rigid(
     source_mm: NDArray[np.float64], target_mm: NDArray[np.float64], weight: NDArray[np.float64] | None = None
 ) -> RigidPose:
-    """The one motion that brings points [P, 3] nearest to others in (weighted) least squares.
+    """The one motion that takes points nearest to others in (weighted) least squares.
+
+    Args:
+        source_mm: [P, 3].
+        target_mm: [P, 3] where each should go.
+        weight: [P] non-negative; equal when None.
 
     Source: Kabsch, Acta Cryst. A32 (1976).
     """
@@ -114,3 +133,32 @@ def fit_rigid(
     covariance = ((target_mm - target_mean) * weight[:, None]).T @ (source_mm - source_mean)
     rotation = orthonormal(covariance[None])
     return RigidPose(rotation, (target_mean - rotation[0] @ source_mean)[None])
+
+
+def fit_rigid_robust(
+    source_mm: NDArray[np.float64],
+    target_mm: NDArray[np.float64],
+    *,
+    scale_mm: float,
+    n_rounds: int,
+    weight: NDArray[np.float64] | None = None,
+) -> tuple[RigidPose, NDArray[np.float64]]:
+    """`fit_rigid` with Cauchy weights: points that end far from their target hardly count.
+
+    Args:
+        source_mm: [P, 3].
+        target_mm: [P, 3] where each should go.
+        scale_mm: distance at which a point counts half.
+        n_rounds: iteratively reweighted fits.
+        weight: [P] non-negative, multiplied into the Cauchy weights; equal when None.
+
+    Returns:
+        The motion, and the distance [P] (mm) of every moved point from its target.
+    """
+    prior = np.ones(len(source_mm)) if weight is None else weight
+    weight = prior
+    for _ in range(n_rounds):
+        pose = fit_rigid(source_mm, target_mm, weight)
+        distance_mm = np.linalg.norm(pose.apply(source_mm[None])[0] - target_mm, axis=1)
+        weight = prior / (1 + (distance_mm / scale_mm) ** 2)
+    return pose, distance_mm

@@ -20,18 +20,19 @@ from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms, stack_records
 from g3r.output.result import ReconstructionResult
+from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage, stage_rng
-from g3r.planning.time_budget import Plan
 from g3r.registration import Registration
 from g3r.registration.quality import StackQuality, registration_reliable
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
 from g3r.uncertainty import estimate_uncertainty
-from g3r.uncertainty.prior_share import estimate_prior_share, on_grid
+from g3r.uncertainty.prior_share import estimate_prior_share
 
 logger = logging.getLogger(__name__)
 
@@ -181,10 +182,7 @@ def _record(
         gaussians=gaussians | {"n_final": len(fit.cloud)},
         n_rollbacks=n_rollbacks,
         inactive_terms=inactive_terms(slices, settings, gaussians),
-        loss={
-            Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [],
-            Stage.FIT_TO_SLICES: list(fit.history),
-        },
+        loss={Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [], Stage.FIT_TO_SLICES: list(fit.history)},
         uncertainty=uncertainty,
         seconds=run.clock.seconds,
         cpu_seconds=run.clock.cpu_seconds,

@@ -18,8 +18,8 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.planning.memory_limit import MemoryRecord
+from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
-from g3r.planning.time_budget import BudgetRecord
 from g3r.registration import Registration
 from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality, registration_reliable, registration_summary
 from g3r.run.context import StoppedAt
@@ -75,7 +75,7 @@ class RegistrationRecord:
             initialisation=registration.initialisation,
             held_out_correlation=registration.initialisations,
             space="scanner" if orientation is None else "standard",
-            correlation_with_template=orientation and orientation.correlation,
+            correlation_with_template=None if orientation is None else orientation.correlation,
             rounds=registration.history,
         )
 
@@ -183,6 +183,13 @@ class RunRecord:
     warnings: list[str] = field(default_factory=list)
     header_text: list[dict[str, Any]] | None = None
 
+    def differences(self, inputs: Inputs) -> list[str]:
+        """A sentence for each input that is not the same file's bytes, and for another version of g3r."""
+        lines = self.inputs.differences(inputs) if self.inputs else []
+        if self.g3r != __version__:
+            lines.append(f"g3r is {__version__}, the configuration is of {self.g3r}")
+        return [f"{line}: the volume will be another" for line in lines]
+
     def to_json(self) -> str:
         """The text of run.json."""
         return json.dumps(to_plain(self), indent=2) + "\n"
@@ -222,10 +229,7 @@ class RunRecord:
 
 
 def stack_records(
-    stacks: Sequence[Stack],
-    registration: Registration,
-    qualities: Sequence[StackQuality],
-    weight: np.ndarray,
+    stacks: Sequence[Stack], registration: Registration, qualities: Sequence[StackQuality], weight: np.ndarray
 ) -> list[StackRecord]:
     """One record for each stack that was given.
 

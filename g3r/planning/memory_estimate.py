@@ -10,16 +10,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import head_volume_mm3
 from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
 from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage
-from g3r.registration.template_search import head_volume_mm3
 from g3r.run.machine import held_bytes
 
 GRID_SLACK = 1.1
@@ -130,7 +128,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
     n_voxels = GRID_SLACK * math.prod(grid.shape)
     spacing_mm = gaussian_spacing_mm(slices, settings.gaussian_spacing_pixels)
     n_gaussians = head_volume_mm3(slices) / spacing_mm**3
-    n_stacks = len(np.unique(slices.stack_id))
+    n_stacks = slices.n_stacks
     # a Gaussian reaches so far along a plane's normal, and so many planes of a stack lie within
     reach_mm = (
         2

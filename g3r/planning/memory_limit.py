@@ -7,16 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
-from g3r.planning.memory_estimate import (
-    PAIR_BYTES,
-    MemoryEstimate,
-    ProblemSizes,
-    estimate_memory,
-    sizes_of,
-)
+from g3r.planning.memory_estimate import PAIR_BYTES, MemoryEstimate, ProblemSizes, estimate_memory, sizes_of
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage

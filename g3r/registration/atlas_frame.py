@@ -10,7 +10,7 @@ import numpy as np
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid
+from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration.candidates import aligned_to
 from g3r.registration.normal_equations import correlation
 from g3r.registration.pose_samples import SearchPixels, perturbed
@@ -89,16 +89,9 @@ def centred_on_headers(slices: Slices) -> Slices:
     Poses are determined up to one rigid motion of the whole head. This choice keeps the volume where the
     scanner's coordinates say it is, on (robust) average over all slices.
     """
-    corners = np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
-    size_mm = slices.planes.shape * slices.planes.spacing_mm
-    half = np.pad(size_mm / 2, ((0, 0), (0, 1)))
-    local = half[:, None, :] * corners
-    here = slices.planes.pose.apply(local).reshape(-1, 3)
-    header = slices.header_pose.apply(local).reshape(-1, 3)
-    area = np.repeat(size_mm.prod(1), len(corners))
-    weight = area
-    for _ in range(10):
-        back = fit_rigid(here, header, weight)
-        away_mm = np.linalg.norm(back.apply(here[None])[0] - header, axis=1)
-        weight = area / (1 + (away_mm / HEADER_REACH_MM) ** 2)
+    corners = slices.planes.corners_mm()
+    here = slices.planes.pose.apply(corners).reshape(-1, 3)
+    header = slices.header_pose.apply(corners).reshape(-1, 3)
+    area = np.repeat((slices.planes.shape * slices.planes.spacing_mm).prod(1), corners.shape[1])
+    back, _ = fit_rigid_robust(here, header, scale_mm=HEADER_REACH_MM, n_rounds=10, weight=area)
     return slices.with_pose(back @ slices.planes.pose)

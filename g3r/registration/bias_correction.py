@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.bias_basis import LENGTH_MM, N_TERMS, quadratic_terms, stacks_by_header
 from g3r.acquisition.planes import Slices
-
-LENGTH_MM = 40.0
-"""Unit of the coordinates, about half a head."""
+from g3r.acquisition.robust import robust_width
 
 DARKEST = 0.1
 """Pixels under this share of a stack's mean count as this bright: a logarithm has no zero."""
@@ -37,17 +36,10 @@ def bias_corrected(slices: Slices) -> Slices:
     fitted to log intensity, Cauchy-weighted so that anatomy far from the mean counts little; slices keep
     their gains.
     """
-    planes = slices.planes.with_pose(slices.header_pose)
-    plane, world_mm = planes.plane_id(), planes.pixel_world_mm()
-    stack_of_pixel = slices.stack_id[plane]
     value = slices.value.copy()
-    for stack in np.unique(slices.stack_id):
-        pixels = np.flatnonzero(stack_of_pixel == stack)
-        inside = slices.mask[pixels]
-        axes = slices.header_pose.rotation[slices.stack_id == stack][0][:, :2]
-        in_plane = world_mm[pixels] @ axes / LENGTH_MM
-        x, y = (in_plane - in_plane[inside].mean(0)).T
-        terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
+    for pixels, inside, world_mm, axes in stacks_by_header(slices):
+        in_plane = world_mm @ axes / LENGTH_MM
+        terms = quadratic_terms(*(in_plane - in_plane[inside].mean(0)).T)
         bright = slices.value[pixels].astype(np.float64)
         level = float(bright[inside].mean())
         if not level > 0:
@@ -68,6 +60,5 @@ def _robust_fit(terms: NDArray[np.float64], log_value: NDArray[np.float64]) -> N
         weighted = basis * weight[:, None]
         found = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ log_value)
         residual = log_value - basis @ found
-        width = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-        weight = 1 / (1 + (residual / width) ** 2)
-    return found[:5]
+        weight = 1 / (1 + (residual / robust_width(residual)) ** 2)
+    return found[:N_TERMS]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.geometry.rigid import fit_rigid
+from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.placement import Placement, Prediction, StackSamples, predict, refine_placement, volume_without
 from g3r.registration.segments import changes_in_time, time_orders, transition_penalty
@@ -122,21 +122,11 @@ def aligned_to(slices: Slices, motion: RigidPose, other: RigidPose) -> RigidPose
 
     Robust: slices that the two place differently hardly count.
     """
-    corners = _corners(slices)
+    corners = slices.planes.corners_mm()
     here = (motion @ slices.header_pose).apply(corners).reshape(-1, 3)
     there = (other @ slices.header_pose).apply(corners).reshape(-1, 3)
-    weight = np.ones(len(here))
-    for _ in range(15):
-        common = fit_rigid(there, here, weight)
-        away_mm = np.linalg.norm(common.apply(there[None])[0] - here, axis=1)
-        weight = 1 / (1 + (away_mm / 5.0) ** 2)
+    common, _ = fit_rigid_robust(there, here, scale_mm=5.0, n_rounds=15)
     return common @ other
-
-
-def _corners(slices: Slices) -> NDArray[np.float64]:
-    size_mm = slices.planes.shape * slices.planes.spacing_mm
-    unit = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
-    return np.pad(size_mm[:, None, :] * unit, ((0, 0), (0, 0), (0, 1)))
 
 
 def refine_segments(

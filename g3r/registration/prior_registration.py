@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices
@@ -41,7 +42,7 @@ def register_to_prior(
         Slices, gains, and whether they were moved; those given where too little was gained.
     """
     model = SliceModel(slices, prior, grid, stride=max(1, len(slices.pixel_index) // 100_000))
-    width = 2 * 1.4826 * float(np.median(np.abs(model.residuals(slices.planes, gain)))) + 1e-6
+    width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     before = model.evaluate(slices.planes, gain, width)
     moved, new_gain, after = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)
     size = before.moments[:, 0]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width, slice_weights
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
@@ -86,7 +87,7 @@ def refine_slices(
         volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
         model = SliceModel(slices, volume, grid, stride=stride)
         residual = model.residuals(slices.planes, gain)
-        width = 2 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+        width = robust_width(residual, n_sigma=2)
         moved = 0
         if 0.1 < fraction < 0.8:
             slices, moved = try_neighbours(model, slices, gain, width=width)
@@ -107,28 +108,6 @@ def refine_slices(
     return FittedSlices(slices, gain, weight, ncc, history)
 
 
-MAX_DROPPED_SHARE = 0.2
-"""At most so many slices may weigh less than `DROPPED_WEIGHT`; where more do not fit, poses are at fault."""
-DROPPED_WEIGHT = 0.1
-
-
-def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Trust in each slice [K], going down smoothly where its mean robust loss stands out.
-
-    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
-    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices.
-    """
-    median = np.median(loss)
-    spread = 1.4826 * np.median(np.abs(loss - median)) + 0.05 * median + 1e-12
-    excess = np.maximum(0.0, (loss - median) / spread - 2.0)
-    weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
-    n_dropped = int(MAX_DROPPED_SHARE * len(weight))
-    by_weight = np.argsort(weight, kind="stable")
-    kept = by_weight[n_dropped:]
-    weight[kept] = np.maximum(weight[kept], DROPPED_WEIGHT)
-    return weight
-
-
 def _volume_of(
     slices: Slices,
     grid: VolumeGrid,
@@ -144,7 +123,7 @@ def _volume_of(
     pixel_weight = weight[operator.plane].astype(np.float32)
     if start is not None:  # pixels far from the present volume (spikes, signal loss) count less
         residual = value - operator.forward(start)
-        width = 3 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+        width = robust_width(residual, n_sigma=3)
         pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
     return solve_volume(
         operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix
@@ -53,9 +54,7 @@ def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
         fixed_slices = slices.take(np.isin(slices.stack_id, done))
         pose, ncc = _register_one(slices.take(moving), fixed_slices)
         agreement[int(stack)] = ncc
-        rotation, center = slices.planes.rotation.copy(), slices.planes.center_mm.copy()
-        rotation[moving], center[moving] = pose.rotation, pose.translation_mm
-        slices = slices.with_pose(RigidPose(rotation, center))
+        slices = slices.with_pose(slices.planes.pose.with_rows(moving, pose))
         done.append(stack)
         logger.debug("stack %d registered, correlation %.3f", stack, ncc)
     return slices, [agreement[int(s)] for s in stacks]
@@ -132,7 +131,7 @@ def refine_stack(model: SliceModel, slices: Slices, pose: RigidPose, n_steps: in
     gain = np.ones(len(slices))
     damping = 1e-2
     center = pose.translation_mm.mean(0)
-    width = _width(model.residuals(slices.planes.with_pose(pose), gain))
+    width = robust_width(model.residuals(slices.planes.with_pose(pose), gain), n_sigma=2)
     current = model.evaluate(slices.planes.with_pose(pose), gain, width)
     size = current.moments[:, 0]
     for _ in range(n_steps):
@@ -165,11 +164,6 @@ def _stack_transfer(pose: RigidPose, center: NDArray[np.float64]) -> NDArray[np.
     transfer[:, 3:, :3] = -transposed @ cross
     transfer[:, 3:, 3:] = transposed
     return transfer
-
-
-def _width(residual: NDArray[np.float32]) -> float:
-    """Twice the robust standard deviation (1.4826 MAD), never zero."""
-    return 2 * 1.4826 * float(np.median(np.abs(residual))) + 1e-6
 
 
 def _shortened(vector: NDArray[np.float64], longest: float) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import head_volume_mm3
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import correlation
 from g3r.registration.placement import Placement, StackSamples, own_moments, predict, refine_placement
@@ -133,25 +134,6 @@ def nearest_templates(slices: Slices, template: AtlasTemplate) -> list[FittedTem
     volume_mm3 = head_volume_mm3(slices)
     candidates = [fitted_template(template, n, volume_mm3) for n in range(len(template))]
     return sorted(candidates, key=lambda head: abs(np.log(head.scale)))[:3]
-
-
-def head_volume_mm3(slices: Slices) -> float:
-    """Median over stacks of masked area times slice spacing (mm^3)."""
-    volumes = []
-    for stack in np.unique(slices.stack_id):
-        one = slices.take(slices.stack_id == stack)
-        area = np.bincount(one.pixel_plane, minlength=len(one)) * one.planes.spacing_mm.prod(1)
-        volumes.append(area.sum() * _slice_spacing_mm(one))
-    return float(np.median(volumes))
-
-
-def _slice_spacing_mm(stack: Slices) -> float:
-    """Distance from slice to slice by the header; the thickness if there is one slice only."""
-    if len(stack) < 2:
-        return float(stack.thickness_mm[0])
-    normal = stack.header_pose.rotation[0, :, 2]
-    along = stack.header_pose.translation_mm @ normal
-    return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
 
 
 def fitted_template(template: AtlasTemplate, number: int, volume_mm3: float) -> FittedTemplate:

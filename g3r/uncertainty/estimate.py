@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
 from g3r.uncertainty.error_model import ErrorModel, load_calibration
 from g3r.uncertainty.predictors import gather_predictors, mean_residual
-from g3r.uncertainty.prior_share import on_grid
 
 CALIBRATION = Path(__file__).parent / "calibration.json"
 

@@ -17,7 +17,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
-from g3r.uncertainty.prior_share import on_grid
+from g3r.geometry.grid import on_grid
 
 RESIDUAL_VOXEL_MM = 1.6
 RESIDUAL_SMOOTHING_MM = 1.6

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
@@ -20,6 +20,7 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
 
 N_PROBES = 2
 PROBE_VOXEL_MM = 1.6
@@ -109,16 +110,6 @@ def remaining_share(
     floor = 1e-3 * float(square.max(initial=0))
     reached = square > floor
     return np.where(reached, together / np.where(reached, square, 1), 1).astype(np.float32)
-
-
-def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float) -> NDArray[np.float32]:
-    """A map [I, J, K] read on another grid by trilinear interpolation."""
-    if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
-        return data.astype(np.float32)
-    index = source.index_from_world @ target.affine
-    return affine_transform(
-        data.astype(np.float32), index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant", cval=outside
-    )
 
 
 def _coarse(grid: VolumeGrid) -> VolumeGrid:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from data_synth.atlas import TruthVolume, cropped, find_subjects, load_subject
 from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
 from g3r.acquisition.images import Volume
-from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.evaluation.align import resample
 from g3r.geometry import VolumeGrid
 from g3r.geometry.rigid import RigidPose

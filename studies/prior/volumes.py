@@ -18,7 +18,8 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.images import Volume
 from g3r.acquisition.least_squares import sharpened_volume
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import compare
 from g3r.evaluation.metrics import Scores

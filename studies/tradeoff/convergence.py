@@ -85,7 +85,7 @@ def _run(options: argparse.Namespace) -> int:
                 own = changed(settings, {**options_of_way, "slice_stage.n_steps": n_steps})
                 result = GaussianReconstructor(options.ckpt, own).reconstruct(case.stacks, motion)
                 found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
-                seconds = result.record["cpu_seconds"]
+                seconds = result.record.cpu_seconds
                 rows[name].append(
                     {
                         "steps": n_steps,

@@ -78,7 +78,8 @@ def measured(one: Configuration, folder: Path) -> dict[str, Any]:
     """Stated and measured bytes of one run of the command."""
     case = phantom(one.weeks, one.n_stacks, folder)
     run = run_infer(arguments_for(one, case, folder / "out"), folder / "out")
-    said = run.record["memory"]
+    said = run.record.memory
+    assert said is not None
     return {
         "weeks": one.weeks,
         "stacks": one.n_stacks,
@@ -86,8 +87,8 @@ def measured(one: Configuration, folder: Path) -> dict[str, Any]:
         "voxel_mm": one.voxel_mm,
         "threads": one.threads,
         "more": " ".join(one.more),
-        "stated_bytes": said["stated_bytes"],
-        "stage": said["stage"],
+        "stated_bytes": said.stated_bytes,
+        "stage": said.stage,
         "measured_bytes": run.peak_bytes,
     }
 

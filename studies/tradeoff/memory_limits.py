@@ -41,11 +41,12 @@ def _row(case: SimulatedCase, name: str, arguments: Sequence[str], output: Path,
         run = run_infer([*arguments, *([] if limit is None else ["--max-memory", str(limit)])], output)
     except InputError as error:
         return row | {"refused": str(error)}
-    said = run.record["memory"]
+    said = run.record.memory
+    assert said is not None
     return row | {
-        "stated_bytes": said["stated_bytes"],
+        "stated_bytes": said.stated_bytes,
         "measured_bytes": run.peak_bytes,
-        "changes": said["changes"],
+        "changes": said.changes,
         "seconds": round(run.seconds, 1),
         "cpu_seconds": round(run.cpu_seconds, 1),
         "psnr_db": quality_of_folder(case, output).psnr_db,

@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
             common = case.pose_error(result.slices).common
             volume = Volume(result.volume, _moved(common, result.grid.affine), case.name)
             scores = compare(volume, case.truth, case.truth_mask, align=True).scores
-            seconds = result.record["cpu_seconds"]
+            seconds = result.record.cpu_seconds
             rows.append(
                 [
                     case.name,

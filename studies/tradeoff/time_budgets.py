@@ -52,15 +52,16 @@ def _run(options: argparse.Namespace) -> int:
         for budget_s in sorted(options.budgets):
             given = [*plain[:at], "--time-budget", f"{budget_s:g}", *plain[at + 2 :]]
             run = run_infer(given, output)
-            chosen = run.record["time_budget"]
+            chosen = run.record.time_budget
+            assert chosen is not None
             rows.append(
                 {
                     "budget_s": budget_s,
                     "seconds": round(run.seconds, 1),
-                    "motion": chosen["motion"],
-                    "fit": chosen["fit"],
-                    "n_steps": len(run.record["loss"]["fit to slices"]),
-                    "n_gaussians": run.record["n_gaussians"],
+                    "motion": chosen.registration,
+                    "fit": chosen.fit,
+                    "n_steps": len(run.record.loss["fit to slices"]),
+                    "n_gaussians": run.record.n_gaussians,
                     **quality_of_folder(case, output).record(),
                 }
             )

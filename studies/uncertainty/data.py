@@ -151,9 +151,9 @@ def judged(
         error[result.mask][chosen],
         score(result.volume, truth, both).psnr_db,
         pose_error.median_mm,
-        result.record["registration"]["trusted"],
+        result.record.registration is not None and result.record.registration.reliable,
         time.perf_counter() - start,
-        result.record["cpu_seconds"]["uncertainty"],
+        result.record.cpu_seconds["uncertainty"],
         registered,
     )
 
@@ -173,7 +173,7 @@ def relative_error(
 def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
     """What the map of a result was made of."""
     scale = np.float32(result.intensity_scale)
-    fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record["shading"])
+    fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record.bias_field)
     return collect(
         result.volume / scale,
         result.mask,

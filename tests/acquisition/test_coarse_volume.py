@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.coarse_volume import coarse_and_density, confidence, normalisation_scale
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import label
 
 from g3r.acquisition.foreground import foreground_mask
-from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid

@@ -7,7 +7,8 @@ from data_synth.heads import PhantomSubject, load_volume_of
 from data_synth.simulator import orthogonal_settings, simulate_stacks
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.least_squares import SHARP_CONVENTION, sharpened_volume
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.geometry import VolumeGrid
 
 

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import Volume, load_mask, load_volume, save_volume
 from g3r.acquisition.nifti import MAX_VOXEL_COUNT
-from g3r.acquisition.planes import Planes, slices_from_stacks, volume_from_pixels, volume_planes
+from g3r.acquisition.planes import Planes, volume_from_pixels, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid

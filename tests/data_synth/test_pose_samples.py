@@ -12,8 +12,8 @@ from data_synth.pose_samples import draw_slice_set
 from data_synth.simulator import StackSettings, simulate_stacks
 from data_synth.slice_sampling import Head, sample_slices
 from data_synth.trajectories import JERK_DEG, QUIET_DEG, load_trajectories, modelled_trajectory, timed_trajectory
-from g3r.acquisition.planes import slices_from_stacks
 from g3r.acquisition.slice_images import slice_images
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
 

@@ -13,7 +13,7 @@ from data_synth.pathology import enlarged_ventricles, with_lesion, with_lesions
 from data_synth.protocol_sampling import draw_settings, rigid_stack, with_mask_errors, with_skull_rim
 from data_synth.simulator import StackSettings, simulate_stacks
 from g3r.acquisition.coarse_volume import coarse_and_density
-from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 

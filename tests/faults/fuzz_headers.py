@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from tests.faults.nifti_files import ball, image, raw, write
 

@@ -12,10 +12,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from g3r.output.earlier_run import FileHash, Inputs
+
 from data_synth.cli import main as simulate
 from g3r._version import __version__
 from g3r.cli.infer import main as infer
-from g3r.output.earlier_run import FileHash, Inputs
 from g3r.planning.presets import PRESETS
 
 FOLDER = Path(__file__).parent

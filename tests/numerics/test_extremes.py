@@ -270,7 +270,11 @@ def test_clouds_that_are_not_numbers_are_refused(name: str, tally):
 def test_calls_that_make_no_sense_are_refused(backend: str, tally):
     scene = head_scene()
     cloud, n = single(scene.cloud), len(scene.planes)
-    bad = [{"twist": torch.full((n, 6), torch.nan)}, {"log_gain": torch.full((n,), torch.inf)}, {"attenuation": "other"}]
+    bad = [
+        {"twist": torch.full((n, 6), torch.nan)},
+        {"log_gain": torch.full((n,), torch.inf)},
+        {"attenuation": "other"},
+    ]
     refused = tally.refused
     for options in bad:
         with tally.case(may_refuse=True):

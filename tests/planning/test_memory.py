@@ -12,7 +12,8 @@ import pytest
 import g3r.planning.memory_estimate
 import g3r.planning.memory_limit
 from data_synth.cli import main as simulate
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.bench.command_run import CommandRun, run_infer
 from g3r.cli import infer

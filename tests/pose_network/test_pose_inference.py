@@ -11,8 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.atlas_template import AtlasTemplate
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.slice_images import slice_images
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.geometry import RigidPose
 from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid

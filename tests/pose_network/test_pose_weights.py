@@ -8,7 +8,7 @@ from scipy.ndimage import center_of_mass
 
 import g3r.prior
 from g3r.acquisition.images import load_mask, load_volume
-from g3r.acquisition.planes import slices_from_stacks
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.evaluation.case import load_case
 from g3r.geometry import RigidPose
 from g3r.pose_network.checkpoint import load_pose_network

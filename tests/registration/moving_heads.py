@@ -8,9 +8,10 @@ import numpy as np
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
-from g3r.acquisition.planes import Slices, slices_from_stacks
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid
+from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration import Registration
 
 STILL = MotionLevel()
@@ -64,11 +65,7 @@ def pixel_errors_mm(slices: Slices, truth: RigidPose) -> np.ndarray:
     The global motion is fitted robustly, so that slices that went astray do not tilt it.
     """
     found, true = slices.planes.pixel_world_mm(slices.pixel_index), true_places_mm(slices, truth)
-    weight = np.ones(len(found))
-    for _ in range(8):
-        error = np.linalg.norm(fit_rigid(found, true, weight).apply(found[None])[0] - true, axis=1)
-        weight = 1 / (1 + error**2)
-    return error
+    return fit_rigid_robust(found, true, scale_mm=1.0, n_rounds=8)[1]
 
 
 def true_places_mm(slices: Slices, truth: RigidPose) -> np.ndarray:

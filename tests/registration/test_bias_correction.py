@@ -8,11 +8,12 @@ from scipy.ndimage import gaussian_filter
 
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
+from g3r.acquisition.bias_basis import LENGTH_MM
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.bias_correction import LENGTH_MM, bias_corrected
+from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.prior_registration import register_to_prior
 from tests.registration.moving_heads import STILL, as_slices, pixel_errors_mm, simulated, turned_about
 

@@ -8,6 +8,7 @@ import pytest
 
 from data_synth.phantom import Phantom, fetal_brain_phantom
 from data_synth.simulator import SimulatedStack
+from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE, slice_weights
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.quality import (
     MIN_HELD_OUT,
@@ -17,7 +18,6 @@ from g3r.registration.quality import (
     registration_summary,
     stack_qualities,
 )
-from g3r.registration.slice_rounds import DROPPED_WEIGHT, MAX_DROPPED_SHARE, slice_weights
 from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
 
 QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)

@@ -13,13 +13,13 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import slice_weights
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import centred_on_headers
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
-from g3r.registration.slice_rounds import slice_weights
 from g3r.registration.stack_registration import register_stacks, self_consistency
 from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm, simulated, slices_disturbed
 

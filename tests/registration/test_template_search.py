@@ -10,6 +10,7 @@ from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import head_volume_mm3
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import standard_orientation
@@ -19,7 +20,6 @@ from g3r.registration.pose_samples import angle_deg, turns_about, uniform_rotati
 from g3r.registration.so3_search import PEAK_MARGIN, peaks, place_around, stack_orientations
 from g3r.registration.template_search import (
     fitted_template,
-    head_volume_mm3,
     nearest_templates,
     place_in_template,
     template_fits,

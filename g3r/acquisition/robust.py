@@ -1,0 +1,40 @@
+"""Robust statistics of residuals: a width from the median, and weights for slices that fit badly."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIGMA_PER_MAD = 1.4826
+"""Standard deviation of normal residuals in units of their median absolute value."""
+
+MAX_DROPPED_SHARE, DROPPED_WEIGHT = 0.2, 0.1
+"""At most this share of the slices may weigh less than `DROPPED_WEIGHT`; where more fit badly, poses are at fault."""
+
+
+def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: float = 1e-6) -> float:
+    """A number of robust standard deviations (1.4826 MAD) of residuals with median zero, plus a floor.
+
+    Args:
+        residual: of any shape.
+        n_sigma: how many standard deviations.
+        floor: added, so that a perfect fit does not divide by zero.
+    """
+    return n_sigma * SIGMA_PER_MAD * float(np.median(np.abs(residual))) + floor
+
+
+def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weight of each slice [K], lower where its mean robust loss stands out.
+
+    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
+    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices.
+    """
+    median = np.median(loss)
+    spread = robust_width(loss - median, floor=0.0) + 0.05 * median + 1e-12
+    excess = np.maximum(0.0, (loss - median) / spread - 2.0)
+    weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
+    n_dropped = int(MAX_DROPPED_SHARE * len(weight))
+    by_weight = np.argsort(weight, kind="stable")
+    kept = by_weight[n_dropped:]
+    weight[kept] = np.maximum(weight[kept], DROPPED_WEIGHT)
+    return weight

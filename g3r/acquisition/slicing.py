@@ -1,0 +1,116 @@
+"""From stacks to slices: cut to the masks and normalised; slice spacing and head volume by the headers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.geometry.grid import bounding_box
+
+MIN_SLICE_PIXELS = 12
+"""Slices with fewer masked pixels carry no pose and little image; they are skipped and named in run.json."""
+
+
+def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
+    """Cut stacks into slices, each cropped to the bounding box of its mask.
+
+    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels are skipped.
+
+    Raises:
+        InputError: no stack, or none with a usable slice.
+    """
+    if not stacks:
+        raise InputError("no stack given; pass at least one")
+    rotation, center, spacing, shape, psf = [], [], [], [], []
+    values, masks, stack_id, slice_index, thickness = [], [], [], [], []
+    for number, stack in enumerate(stacks):
+        axes = stack.affine[:3, :3] / stack.spacing_mm
+        # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
+        frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+        left, _, right = np.linalg.svd(frame)
+        frame = left @ right
+        for k in range(stack.image.shape[2]):
+            inside = stack.mask[:, :, k]
+            if inside.sum() < MIN_SLICE_PIXELS:
+                continue
+            box = bounding_box(inside)
+            middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
+            rotation.append(frame)
+            center.append(stack.grid.world(middle))
+            spacing.append(stack.spacing_mm[:2])
+            shape.append(inside[box].shape)
+            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm))
+            values.append(stack.image[:, :, k][box].ravel())
+            masks.append(inside[box].ravel())
+            stack_id.append(number)
+            slice_index.append(k)
+            thickness.append(stack.thickness_mm)
+    if not rotation:
+        raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
+    planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
+    return Slices(
+        planes,
+        np.concatenate(values).astype(np.float32),
+        np.concatenate(masks),
+        np.array(stack_id, dtype=np.int64),
+        np.array(slice_index, dtype=np.int64),
+        np.array(thickness),
+        planes.pose,
+    )
+
+
+def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
+    """Slices at their header poses with the 99th percentile of the masked values at 1.
+
+    Returns:
+        The slices, and the intensity that they were divided by.
+
+    Raises:
+        InputError: stacks that cannot be used, or intensities that are not positive.
+    """
+    slices = slices_from_stacks(stacks)
+    scale = float(np.percentile(slices.masked_value, 99))
+    if not scale > 0:
+        raise InputError(f"99th percentile inside the masks is {scale:g}; expected a positive intensity")
+    return slices.scaled(1 / scale), scale
+
+
+def slice_spacing_mm(stack: Slices) -> float:
+    """Median distance between neighbouring slices of one stack by the header; the thickness of a single slice."""
+    if len(stack) < 2:
+        return float(stack.thickness_mm[0])
+    normal = stack.header_pose.rotation[0, :, 2]
+    along = stack.header_pose.translation_mm @ normal
+    return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
+
+
+def head_volume_mm3(slices: Slices) -> float:
+    """Median over stacks of masked area times slice spacing (mm^3)."""
+    volumes = []
+    for stack in np.unique(slices.stack_id):
+        one = slices.take(slices.stack_id == stack)
+        area = np.bincount(one.pixel_plane, minlength=len(one)) * one.planes.spacing_mm.prod(1)
+        volumes.append(area.sum() * slice_spacing_mm(one))
+    return float(np.median(volumes))
+
+
+def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
+    """A line for each stack some of whose slices are not used, for want of masked pixels.
+
+    Args:
+        stacks: as they were given.
+        slices: `slices_from_stacks` of them.
+    """
+    lines = []
+    for n, stack in enumerate(stacks):
+        masked = np.flatnonzero(stack.mask.any((0, 1)))
+        missing = sorted(set(masked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
+        if missing:
+            numbers = ", ".join(map(str, missing))
+            lines.append(f"{stack.name}: slices {numbers} left out, fewer than {MIN_SLICE_PIXELS} masked pixels")
+    return lines

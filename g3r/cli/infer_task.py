@@ -1,0 +1,163 @@
+"""From the options of `g3r-infer` to a task: inputs read and checked, settings and deadlines decided."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from g3r.acquisition.stacks import Stack
+    from g3r.output.record import Inputs, RunRecord
+    from g3r.planning.memory_limit import MemoryPlan
+    from g3r.planning.plan import Plan
+    from g3r.planning.presets import ReconstructionSettings
+    from g3r.reconstruct import GaussianReconstructor
+
+STARTED_S = time.monotonic()
+"""When the command began; what Python itself needs before is a few hundredths of a second."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What the command is to do, once its input has proved good.
+
+    Attributes:
+        stacks: to reconstruct.
+        settings: that were asked for.
+        memory: the settings that stay below the memory limit.
+        reconstructor: with its networks loaded.
+        inputs: hashes of all files.
+        n_threads: in use.
+        plan: settings and deadlines of the run.
+        warnings: what differs from the run that --config names.
+    """
+
+    stacks: list[Stack]
+    settings: ReconstructionSettings
+    memory: MemoryPlan
+    reconstructor: GaussianReconstructor
+    inputs: Inputs
+    n_threads: int
+    plan: Plan
+    warnings: list[str]
+
+
+def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
+    """Refuse what can be seen without reading an image."""
+    from g3r.checkpoints.archive import check_archive
+    from g3r.output.files import OUTPUT_NAMES
+    from g3r.run.output_folder import check_output_folder
+
+    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
+    check_output_folder(folder, OUTPUT_NAMES, replace=replaces, inputs=inputs)
+    for kind, path in networks.items():
+        if path:
+            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
+    if options.tensorboard:
+        from g3r.output.tensorboard import check_tensorboard
+
+        check_tensorboard(Path(options.tensorboard))
+
+
+def prepared(options: argparse.Namespace) -> Task:
+    """Read and check everything that the run needs.
+
+    Raises:
+        InputError: something in the files or options cannot be used.
+    """
+    earlier = _earlier(options)
+    stacks = _load(options, earlier)
+    from g3r.planning.memory_limit import plan_for_stacks
+    from g3r.reconstruct import GaussianReconstructor
+    from g3r.run.machine import use_threads
+
+    command = earlier.command if earlier else None
+    n_threads = use_threads(options.threads or (command.threads if command else None))
+    settings = earlier.settings if earlier else _settings(options)
+    reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+    inputs = _inputs(options, reconstructor)
+    memory = plan_for_stacks(stacks, settings, options.max_memory)
+    return Task(
+        stacks=stacks,
+        settings=settings,
+        memory=memory,
+        reconstructor=reconstructor,
+        inputs=inputs,
+        n_threads=n_threads,
+        plan=_plan(options, memory.settings, earlier),
+        warnings=earlier.differences(inputs) if earlier else [],
+    )
+
+
+def _earlier(options: argparse.Namespace) -> RunRecord | None:
+    """The run that --config names."""
+    if not options.config:
+        return None
+    from g3r.output.record import RunRecord
+
+    earlier = RunRecord.read(options.config)
+    if earlier.partial:
+        raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a whole result")
+    n_then, n_now = len(earlier.stacks), len(options.stacks)
+    if n_then != n_now and not options.thickness:
+        raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
+    return earlier
+
+
+def _load(options: argparse.Namespace, earlier: RunRecord | None) -> list[Stack]:
+    from g3r.acquisition.stacks import load_stacks
+
+    thickness = options.thickness or ([stack.thickness_mm for stack in earlier.stacks] if earlier else None)
+    if thickness and len(thickness) == 1:
+        thickness = thickness * len(options.stacks)
+    return load_stacks(options.stacks, options.masks, thickness)
+
+
+def _settings(options: argparse.Namespace) -> ReconstructionSettings:
+    from g3r.planning.presets import PRESETS
+
+    preset = PRESETS[options.preset]
+    if options.time_budget is not None:
+        preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
+    registration = replace(preset.registration, standard_orientation=options.space == "standard", seed=options.seed)
+    return replace(
+        preset,
+        registration=registration,
+        resolution_mm=options.resolution,
+        prior_voxel_mm=options.prior_voxel,
+        seed=options.seed,
+        use_prior=not options.no_prior,
+    )
+
+
+def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
+    from g3r.output.record import Inputs
+    from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
+    from g3r.run.provenance import FileHash
+
+    return Inputs(
+        stacks=tuple(map(FileHash.of, options.stacks)),
+        masks=tuple(map(FileHash.of, options.masks or [])),
+        prior=FileHash.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
+        pose_network=FileHash.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+    )
+
+
+def _plan(options: argparse.Namespace, settings: ReconstructionSettings, earlier: RunRecord | None) -> Plan:
+    """What is left of a time budget that began with the command, the earlier run's once more, or fixed settings."""
+    from g3r.planning.plan import FixedPlan, RepeatedBudget
+    from g3r.planning.time_budget import TimeBudget
+
+    if earlier and earlier.time_budget:
+        if options.resume:
+            raise InputError(f"{options.config}: --resume: a run with a time budget keeps no stages; leave it out")
+        return RepeatedBudget(settings, earlier.time_budget)
+    if options.time_budget is not None:
+        return TimeBudget.of(settings, options.time_budget, time.monotonic() - STARTED_S)
+    return FixedPlan(settings)

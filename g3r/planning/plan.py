@@ -1,0 +1,122 @@
+"""The plan of a run: its settings, and when its loops have to end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.planning.presets import ReconstructionSettings
+from g3r.run.deadline import Deadline, LoopRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetRecord:
+    """What a time budget chose; fields are None where the run ended before the choice.
+
+    Attributes:
+        seconds: that were given.
+        registration, fit: names of the presets that registration and the fit follow.
+        prior_views: views of the prior.
+        step_s: measured seconds of one optimiser step.
+        n_gaussians_timed: Gaussians in that step.
+        reserve_s: seconds kept for what follows the fit.
+        left_s: seconds for the fit.
+        loops: for each loop of the run, in order, the fraction of its schedule at each step.
+    """
+
+    seconds: float
+    registration: str | None = None
+    prior_views: int | None = None
+    fit: str | None = None
+    step_s: float | None = None
+    n_gaussians_timed: int | None = None
+    reserve_s: float | None = None
+    left_s: float | None = None
+    loops: list[list[float]] = field(default_factory=list)
+
+
+class Plan(Protocol):
+    """The settings of a run, and when its loops have to end."""
+
+    settings: ReconstructionSettings
+
+    def for_registration(self) -> Deadline | None:
+        """Decide how registration searches; returns when it has to end."""
+
+    def for_prior(self, coarse_s: float) -> None:
+        """Decide the number of views; `coarse_s` is what V_coarse and V_sharp took."""
+
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline | None:
+        """Decide Gaussians and steps of both stages of the fit; returns when the first has to end."""
+
+    def for_fit_to_slices(self) -> Deadline | None:
+        """When the second stage of the fit has to end."""
+
+    def record(self) -> BudgetRecord | None:
+        """What was decided; None where nothing was."""
+
+
+@dataclass
+class FixedPlan:
+    """Settings that hold to the end, and no deadline."""
+
+    settings: ReconstructionSettings
+
+    def for_registration(self) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def for_prior(self, coarse_s: float) -> None:
+        """Nothing to decide."""
+
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def for_fit_to_slices(self) -> Deadline | None:
+        """No deadline."""
+        return None
+
+    def record(self) -> BudgetRecord | None:
+        """Nothing was decided."""
+        return None
+
+
+class RepeatedBudget(FixedPlan):
+    """A run with a time budget once more, without a clock: settings are known, loops do what they did.
+
+    Args:
+        settings: as they were used in that run.
+        earlier: what it recorded.
+    """
+
+    def __init__(self, settings: ReconstructionSettings, earlier: BudgetRecord) -> None:
+        super().__init__(settings)
+        self.earlier = earlier
+        self.deadline = Deadline(loop_record=LoopRecord(earlier.loops, repeating=True))
+
+    def for_registration(self) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
+
+    def for_fit_to_prior(
+        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
+    ) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
+
+    def for_fit_to_slices(self) -> Deadline:
+        """Repeat the loops."""
+        return self.deadline
+
+    def record(self) -> BudgetRecord:
+        """What the earlier run decided."""
+        return self.earlier
