@@ -34,7 +34,7 @@ install: $(STAMP) ## make .venv with g3r and everything it needs
 
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e '.[train,test]'
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e '.[dev]'
 	touch $@
 
 demo: install ## simulate a moving 30-week brain, reconstruct it, score it: a volume and a picture in demo/
@@ -52,8 +52,12 @@ demo: install ## simulate a moving 30-week brain, reconstruct it, score it: a vo
 
 test: install ## lint, types and all quick tests
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest
+
+coverage: install ## the quick tests, and which lines they reach
+	$(BIN)/pytest --cov --cov-report=term:skip-covered
 
 test-slow: install ## the tests that take minutes
 	$(BIN)/pytest -m slow

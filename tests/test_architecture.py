@@ -11,73 +11,24 @@ from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-
-# What each room may import of ours. The errors, the version and deadlines are open to all.
-BELOW_FITTING = {"geometry", "acquisition", "gaussians", "motion", "prior"}
-ALLOWED = {
-    "errors": set(),
-    "_version": set(),
-    "pace": set(),
-    "_kernel_cache": set(),
-    "geometry": set(),
-    "acquisition": {"geometry"},
-    "gaussians": {"geometry", "acquisition"},
-    "motion": {"geometry", "acquisition", "gaussians"},
-    "prior": {"geometry", "acquisition", "gaussians"},
-    "fitting": BELOW_FITTING,
-    "trust": {"geometry", "acquisition", "gaussians", "fitting"},
-    "evaluation": {"geometry", "acquisition"},
-    "report": BELOW_FITTING | {"fitting"},
-    "presets": BELOW_FITTING | {"fitting"},
-}
-OPEN_TO_ALL = {"errors", "_version", "pace"}
-ALLOWED["interruption"] = set()
-ALLOWED["unfinished"] = set()
-ALLOWED["stage_file"] = set()
-ALLOWED["start"] = BELOW_FITTING
-ALLOWED["memory"] = BELOW_FITTING | {"fitting", "presets", "start"}
-ALLOWED["budget"] = BELOW_FITTING | {"fitting", "presets", "start"}
-ALLOWED["run_record"] = BELOW_FITTING | {"fitting", "memory", "presets"}
-ALLOWED["rerun"] = {"presets"}
-ALLOWED["stages"] = BELOW_FITTING | {"fitting", "run_record", "stage_file", "start"}
-ROOMS = {*ALLOWED, "result", "finish", "reconstruct", "bench", "cli"}
-ALLOWED["result"] = ROOMS - {"finish", "reconstruct", "bench", "cli", "result"}
-ALLOWED["finish"] = ROOMS - {"reconstruct", "bench", "cli", "finish"}
-ALLOWED["reconstruct"] = ROOMS - {"bench", "cli", "reconstruct"}
-ALLOWED["bench"] = ROOMS - {"cli", "bench"}  # it measures the whole way of the data
-ALLOWED["cli"] = ROOMS - {"cli"}
-DATA_SYNTH_MAY = {"geometry", "acquisition", "unfinished"} | OPEN_TO_ALL
+from tests.rooms import (
+    DATA_SYNTH_MAY_IMPORT,
+    DOCUMENT,
+    FRONT_DOOR,
+    MAY_IMPORT,
+    REPOSITORY,
+    allowed,
+    imported_modules,
+    room_of,
+    rooms_imported,
+    with_table,
+)
 
 SOURCES = sorted(
     path for folder in ("g3r", "data_synth", "studies", "tests") for path in (REPOSITORY / folder).rglob("*.py")
 )
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".txt", ".yaml", ".yml", ".cff", ".cfg", ".sh", ".json", ""}
 IGNORED_FOLDERS = {"runs", "lightning_logs", "out", "demo", "build", "dist"}
-
-
-def imported_modules(path: Path) -> set[str]:
-    """Dotted names of everything a file imports, wherever in the file."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    package = path.relative_to(REPOSITORY).with_suffix("").parts[:-1]
-    names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            module = ".".join((*base, *([node.module] if node.module else [])))
-            names.update(f"{module}.{alias.name}" for alias in node.names)
-    return names
-
-
-def rooms_imported(path: Path) -> set[str]:
-    """The rooms of g3r that a file imports from."""
-    return {name.split(".")[1] for name in imported_modules(path) if name.startswith("g3r.")}
-
-
-def room_of(path: Path) -> str:
-    return path.relative_to(REPOSITORY / "g3r").with_suffix("").parts[0]
 
 
 def relative(path: Path) -> str:
@@ -88,34 +39,61 @@ def in_package(name: str) -> list[Path]:
     return [path for path in SOURCES if path.is_relative_to(REPOSITORY / name)]
 
 
-@pytest.mark.parametrize("path", in_package("g3r"), ids=relative)
-def test_imports_go_downwards(path: Path) -> None:
-    room = room_of(path)
-    if room == "__init__":
-        pytest.skip("the front door may name every room; that it stays lazy is tested below")
-    assert room in ALLOWED, f"{room} is a new room: say in ALLOWED what it may import"
-    forbidden = (rooms_imported(path) & ROOMS) - ALLOWED[room] - OPEN_TO_ALL - {room}
-    assert not forbidden, f"{relative(path)} ({room}) imports from {sorted(forbidden)}"
+def test_imports_go_downwards_and_every_allowance_is_used() -> None:
+    used: dict[str, set[str]] = {room: set() for room in MAY_IMPORT}
+    for path in in_package("g3r"):
+        if room_of(path) != FRONT_DOOR:  # may name every room; that it stays lazy is tested below
+            used[room_of(path)] |= rooms_imported(path) - {room_of(path)}
+    assert used == {room: allowed(room) for room in MAY_IMPORT}, "say in tests/rooms.py what a room imports"
+
+
+def test_no_room_imports_one_that_is_above_it() -> None:
+    order = list(MAY_IMPORT)
+    for room in order:
+        assert all(order.index(other) < order.index(room) for other in allowed(room)), room
+
+
+def test_every_folder_and_loose_module_is_a_room() -> None:
+    assert {room_of(path) for path in in_package("g3r")} - {FRONT_DOOR} == set(MAY_IMPORT)
+
+
+def test_the_table_of_rooms_in_contributing_is_the_one_that_is_held() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert with_table(text) == text, "run `python -m tests.rooms`"
+
+
+def test_only_the_pretrain_command_knows_lightning() -> None:
+    users = {
+        relative(path)
+        for path in in_package("g3r")
+        if any(name.split(".")[0] in ("lightning", "torchio") for name in imported_modules(path))
+    }
+    assert all(user.startswith("g3r/training/") or user == "g3r/cli/pretrain.py" for user in users)
+    trainers = {relative(path) for path in in_package("g3r/cli") if "training" in rooms_imported(path)}
+    assert trainers == {"g3r/cli/pretrain.py"}
 
 
 @pytest.mark.parametrize("path", in_package("data_synth"), ids=relative)
 def test_data_synth_uses_only_the_lower_rooms(path: Path) -> None:
-    forbidden = rooms_imported(path) - DATA_SYNTH_MAY
-    assert not forbidden, f"{relative(path)} imports g3r.{sorted(forbidden)}"
+    assert rooms_imported(path) <= DATA_SYNTH_MAY_IMPORT, relative(path)
 
 
 def test_g3r_does_not_know_data_synth() -> None:
-    users = {
-        relative(path)
-        for path in in_package("g3r")
-        if any(name.split(".")[0] == "data_synth" for name in imported_modules(path))
-    }
-    assert users <= {"data_synth/cli.py"}
+    for path in in_package("g3r"):
+        assert not any(name.split(".")[0] == "data_synth" for name in imported_modules(path)), relative(path)
 
 
-def test_nothing_installed_knows_the_benchmarks() -> None:
+def test_nothing_installed_knows_the_studies() -> None:
     for path in [*in_package("g3r"), *in_package("data_synth")]:
         assert not any(name.split(".")[0] == "studies" for name in imported_modules(path)), relative(path)
+
+
+MAX_LINES = 300
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=relative)
+def test_no_file_is_long(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
 def modules_after(statement: str, *wanted: str) -> set[str]:
@@ -144,9 +122,13 @@ def test_the_pipeline_needs_no_training_packages() -> None:
     assert modules_after("import g3r.reconstruct", "lightning", "torchio", "pytorch_lightning") == set()
 
 
-@pytest.mark.parametrize("command", ["infer", "simulate", "evaluate", "pretrain", "export", "bench"])
-def test_help_is_light(command: str) -> None:
-    statement = f"import g3r.cli.{command} as c; c.main(['--help'])"
+COMMANDS = [f"g3r.cli.{name}" for name in ("infer", "evaluate", "pretrain", "export", "bench")] + ["data_synth.cli"]
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_and_version_are_light(command: str, option: str) -> None:
+    statement = f"import {command} as c; c.main([{option!r}])"
     assert modules_after(statement, *HEAVY, "numba", "scipy", "numpy") == set()
 
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from g3r._version import __version__
 from g3r.errors import G3RError
 
 COMMANDS = {
@@ -27,6 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=f"commands (each has its own --help):\n{lines}\n\nexit codes: 0 done, 2 usage, 3 bad input",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help=", ".join(COMMANDS))
     return parser
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r._version import __version__
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
     parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)")
     parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 
@@ -105,6 +106,8 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
     """Write the scores, whole or not at all."""
     from dataclasses import asdict
 
+    from g3r.run.atomic_file import write_text
+
     record: dict[str, object] = asdict(comparison.scores)
     if comparison.alignment:
         record["alignment"] = {
@@ -113,10 +116,8 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
         }
     if pose_error:
         record["poses"] = pose_error.figures()
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-        os.replace(beside, path)
+        write_text(path, json.dumps(record, indent=2) + "\n")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None
 

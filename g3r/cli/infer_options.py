@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from g3r._version import __version__
+
 PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
 
 DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
@@ -54,7 +56,6 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="in place of --preset: the best that can be done from the start of the command to its files",
     )
-    parser.add_argument("--device", choices=("auto", "cpu"), default="auto", help="where to compute (CPU)")
     parser.add_argument(
         "--config",
         metavar="RUN.json",
@@ -74,6 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
     return parser
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g3r.errors import cannot_be_written
+from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,8 +184,8 @@ def _draw(
                 _letter(panel, view.letters)
         box = panels[row][0].get_position()
         middle = (box.y0 + box.y1) / 2
-        _beside(figure, 0.16 / width, middle, one.name, color=INK, fontsize=11)
-        _beside(figure, 0.38 / width, middle, one.caption, color=FAINT_INK, fontsize=7.5)
+        _side_text(figure, 0.16 / width, middle, one.name, color=INK, fontsize=11)
+        _side_text(figure, 0.38 / width, middle, one.caption, color=FAINT_INK, fontsize=7.5)
         if one.is_map:
             last = panels[row][-1].get_position()
             bar = figure.add_axes(
@@ -202,7 +203,7 @@ def _draw(
     return figure
 
 
-def _beside(figure: Figure, x: float, y: float, text: str, *, color: str, fontsize: float) -> None:
+def _side_text(figure: Figure, x: float, y: float, text: str, *, color: str, fontsize: float) -> None:
     """Write a line upwards, left of a row."""
     figure.text(x, y, text, rotation=90, color=color, fontsize=fontsize, ha="center", va="center")
 
@@ -243,11 +244,8 @@ def _scale_bar(panel: Axes) -> None:
 def _write(figure: Figure, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    beside = path.with_name(f".{path.name}.{os.getpid()}.png")
     try:
-        FigureCanvasAgg(figure).print_png(beside)
-        os.replace(beside, path)
+        with atomic_path(path) as temporary:
+            FigureCanvasAgg(figure).print_png(temporary)
     except OSError as error:
         raise cannot_be_written(path, error) from None
-    finally:
-        beside.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from g3r.acquisition.images import load_volume
 from g3r.errors import InputError
 from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
 from g3r.gaussians import GaussianCloud
-from g3r.output.result import OUTPUT_NAMES, SLICE_COLUMNS
+from g3r.output.files import OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.reconstruct import DEFAULT_CHECKPOINT
 
@@ -133,12 +133,12 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
     assert all(seconds >= 0 for seconds in record["seconds"].values())
     assert record["peak_memory_bytes"] > 1e7
     assert record["command"]["preset"] == "draft"
-    for key in ("versions", "warnings", "notes", "loss", "motion", "registration"):
+    for key in ("versions", "warnings", "notes", "loss", "inactive_terms", "registration"):
         assert key in record
-    assert record["registration"]["trusted"] is True
-    assert record["motion"]["orientation"] in ("standard", "scanner")
+    assert record["registration"]["reliable"] is True
+    assert record["registration"]["space"] in ("standard", "scanner")
     for stack in record["stacks"]:
-        assert stack["pose_confidence"]["sure"] is True
+        assert stack["quality"]["reliable"] is True
         assert stack["interleave"] in ((None,) if stack["n_segments"] == 1 else (1, 2, 3))
         assert 1 <= stack["n_segments"] <= stack["n_slices"]
 
@@ -191,8 +191,8 @@ def test_one_registration_serves_several_fits(subject: Path):
     motion = reconstructor.register_stacks(stacks)
     whole, again = reconstructor.reconstruct(stacks), reconstructor.reconstruct(stacks, motion)
     np.testing.assert_array_equal(again.volume, whole.volume)
-    assert any("motion was given" in note for note in again.record["notes"])
-    with pytest.raises(InputError, match="motion of"):
+    assert any("registration was given" in note for note in again.record.notes)
+    with pytest.raises(InputError, match="registration of"):
         reconstructor.reconstruct(stacks[:2], motion)
 
 
@@ -216,13 +216,13 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
     settings = quick_settings()
     settings = replace(settings, registration=replace(settings.registration, standard_orientation=standard))
     result = GaussianReconstructor(settings=settings).reconstruct([stack])
-    assert any("single stack" in note for note in result.record["notes"])
+    assert any("single stack" in note for note in result.record.notes)
     motion = result.slices.world_from_header()
     relative = motion.take([0]).inverse() @ motion if standard else motion
     np.testing.assert_allclose(relative.translation_mm, 0, atol=1e-6)
     np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=1e-7)
-    assert result.record["motion"]["orientation"] == ("standard" if standard else "scanner")
-    assert result.record["stacks"][0]["pose_confidence"]["held_out_correlation"] is None
+    assert result.record.registration.space == ("standard" if standard else "scanner")
+    assert result.record.stacks[0].quality.held_out_correlation is None
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].std() > 0
 
@@ -236,11 +236,11 @@ def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Pa
     settings = replace(settings, resolution_mm=2.5, motion=motion)
     result = GaussianReconstructor(settings=settings).reconstruct([replace(stacks[0], mask=few), stacks[1], stacks[2]])
     record = result.record
-    assert [one["n_slices"] > 0 for one in record["stacks"]] == [False, True, True]
-    assert record["stacks"][0]["interleave"] is None
-    assert record["stacks"][0]["pose_confidence"]["sure"] is False
-    assert record["stacks"][2]["n_segments"] == 1
-    assert any(stacks[0].name in line for line in record["warnings"])
+    assert [one.n_slices > 0 for one in record.stacks] == [False, True, True]
+    assert record.stacks[0].interleave is None
+    assert record.stacks[0].quality.reliable is False
+    assert record.stacks[2].n_segments == 1
+    assert any(stacks[0].name in line for line in record.warnings)
 
 
 def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):

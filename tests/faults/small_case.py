@@ -8,16 +8,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from g3r.output.earlier_run import FileHash, Inputs
-
 from data_synth.cli import main as simulate
-from g3r._version import __version__
 from g3r.cli.infer import main as infer
+from g3r.output.record import CommandRecord, Inputs, RunRecord, StackRecord
 from g3r.planning.presets import PRESETS
+from g3r.run.provenance import FileHash
 
 FOLDER = Path(__file__).parent
 
@@ -84,17 +83,14 @@ def make_small_case(folder: Path) -> SmallCase:
     )  # a fraction of a second; the poses do not matter here
     settings = replace(draft, registration=registration, resolution_mm=2.0, use_prior=False)
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
-    inputs = Inputs(*(tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask")))
-    record = {
-        "g3r": __version__,
-        "partial": False,
-        "settings": asdict(settings),
-        "inputs": inputs.record(),
-        "stacks": [{"thickness_mm": 4.0}] * 3,
-        "command": {"threads": 1},
-        "time_budget": None,
-    }
-    case.config.write_text(json.dumps(record))
+    stacks, masks = (tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask"))
+    record = RunRecord(
+        settings=settings,
+        inputs=Inputs(stacks=stacks, masks=masks),
+        stacks=[StackRecord(name=stack.name, thickness_mm=4.0) for stack in stacks],
+        command=CommandRecord(stacks=[], preset=None, seed=0, threads=1, space="scanner"),
+    )
+    case.config.write_text(record.to_json())
     assert case.run(folder / "out") == 0
     return replace(case, volume=(folder / "out" / "volume.nii.gz").read_bytes())
 

@@ -215,7 +215,7 @@ USAGE = [
     ["--resolution", "fine"],
     ["--preset", "best"],
     ["--space", "outer"],
-    ["--device", "tpu"],
+    ["--device", "cpu"],
     ["--time-budget", "0"],
     ["--time-budget", "inf"],
     ["--max-memory", "lots"],

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -64,7 +65,7 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
                 assert "No space left on device" in line
                 assert "MB are free" in line
                 assert names(small_disk) <= {"out.unfinished"}
-                assert not (small_disk / "out.unfinished" / "whole").exists()
+                assert not (small_disk / "out.unfinished" / "new").exists()
                 # somebody makes room
                 line = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
                 subprocess.run(line, check=True, capture_output=True)
@@ -109,7 +110,7 @@ def test_a_write_that_fails_leaves_the_earlier_result(
     with tally.case():
         monkeypatch.undo()
         assert case.run(out, "--force", "--resume") == 0
-        assert len(json.loads((out / "run.json").read_text())["resumed"]) == 4
+        assert len(json.loads((out / "run.json").read_text())["resumed"]) == 5
         assert names(out) == WHOLE
         assert names(tmp_path) == {"out"}
 
@@ -187,3 +188,57 @@ def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally:
     assert codes[0] == 4
     assert codes.count(4) >= len(codes) // 2
     assert codes[-1] == 0
+
+
+def test_an_empty_mount_point_is_written_and_an_earlier_result_in_it_replaced(
+    case: SmallCase, small_disk: Path, tally: Tally
+) -> None:
+    assert mounted(small_disk, ENOUGH)
+    with tally.case():
+        assert case.run(small_disk) == 0
+        assert names(small_disk) == WHOLE
+        assert (small_disk / "volume.nii.gz").read_bytes() == case.volume
+    with tally.case() as one:
+        assert case.run(small_disk) == 3
+        one.refused()
+    with tally.case():
+        (small_disk / "notes").write_text("mine")
+        (small_disk / "volume.nii.gz").write_text("old")
+        assert case.run(small_disk, "--force") == 0
+        assert names(small_disk) == WHOLE | {"notes"}
+        assert (small_disk / "volume.nii.gz").read_bytes() == case.volume
+
+
+@pytest.mark.parametrize("moved", range(7))
+def test_a_run_killed_while_files_move_onto_a_mount_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally, moved: int
+) -> None:
+    """Whatever was moved: afterwards the earlier result is there, or the new one, and nothing of the other."""
+    from g3r.run.output_folder import OutputFolder
+
+    monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
+    result = {"run.json", "volume", "mask"}
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in (*result, "notes"):
+        (out / name).write_text("old")
+    rename, done = os.rename, []
+
+    def killed(source: Path, target: Path) -> None:
+        if len(done) == moved:
+            raise KeyboardInterrupt
+        done.append(target)
+        rename(source, target)
+
+    folder = OutputFolder(out, result)
+    with tally.case(), folder:
+        with suppress(KeyboardInterrupt), monkeypatch.context() as patch, folder.result() as staged:
+            for name in result:
+                (staged / name).write_text("new")
+            patch.setattr("os.rename", killed)
+            patch.setattr(folder, "_clean", lambda: None)  # a dead process cleans nothing
+        assert len(done) == moved
+        folder._clean()  # the next one does
+        assert names(out) - {".unfinished"} == result | {"notes"}
+        assert {(out / name).read_text() for name in result} == {"old"}
+        assert (out / "notes").read_text() == "old"

@@ -17,13 +17,17 @@ import torch
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
+from g3r.planning.stages import Stage, stage_rng
+from g3r.reconstruct import STORED_RECORDS
+from g3r.run.context import RunContext
 from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
-from g3r.run.stage_store import NAMES, RECORDS, Stages, stage_rng
+from g3r.run.stage_store import StageStore
 from tests.faults.small_case import SmallCase, names
 from tests.faults.tally import Tally
 
-STAGES = ("motion", "prior", "fit-to-prior", "fit-to-slices")
+NAMES = ("registration", "coarse volume", "prior", "fit to prior", "fit to slices")
+STAGES = tuple(name.replace(" ", "-") for name in NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +37,11 @@ def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("g3r.output.result.ReconstructionResult.save", lambda *a, **b: (_ for _ in ()).throw(MemoryError))
         assert case.run(folder / "out") == 4
-    assert names(folder / "out.unfinished" / "stages") == {"made_of.json", *(f"{s}.npz" for s in STAGES)}
+    assert names(folder / "out.unfinished" / "stages") == {"provenance.json", *(f"{s}.npz" for s in STAGES)}
     return folder / "out.unfinished"
 
 
-@pytest.mark.parametrize("n_stages", range(5))
+@pytest.mark.parametrize("n_stages", range(6))
 def test_the_same_bytes_from_any_number_of_finished_stages(
     case: SmallCase, kept: Path, tmp_path: Path, tally: Tally, n_stages: int
 ):
@@ -49,7 +53,7 @@ def test_the_same_bytes_from_any_number_of_finished_stages(
         assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
         record = json.loads((tmp_path / "out" / "run.json").read_text())
         assert record["resumed"] == list(NAMES[:n_stages])
-        assert set(record["seconds"]) >= {"motion", "coarse", "prior", "fit to prior", "fit to slices"}
+        assert set(record["seconds"]) >= set(NAMES)
         assert names(tmp_path) == {"out"}
 
 
@@ -67,7 +71,7 @@ def test_a_stage_that_was_cut_off_is_made_again(
         assert "fit to prior" not in record["resumed"]
 
 
-@pytest.mark.parametrize(("key", "n_stages"), [("seed", 4), ("distillation", 4)])
+@pytest.mark.parametrize(("key", "n_stages"), [("seed", 5), ("distillation", 5)])
 def test_stages_of_another_run_are_refused_by_name(
     case: SmallCase, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally, key, n_stages
 ):
@@ -96,12 +100,12 @@ def test_nothing_of_a_living_run_is_touched(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
 ):
     with tally.case() as one, OutputFolder(tmp_path / "out") as living:
-        (living.folder / "stages").mkdir()
-        (living.folder / "stages" / "registration.npz").write_text("mine")
+        (living.staging / "stages").mkdir()
+        (living.staging / "stages" / "registration.npz").write_text("mine")
         assert case.run(tmp_path / "out") == 3
         assert f"another run is writing it (process {os.getpid()})" in capsys.readouterr().err
-        assert names(living.folder) == {"lock", "stages"}
-        assert (living.folder / "stages" / "registration.npz").read_text() == "mine"
+        assert names(living.staging) == {"lock", "process", "stages"}
+        assert (living.staging / "stages" / "registration.npz").read_text() == "mine"
         one.refused()
 
 
@@ -127,16 +131,16 @@ def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tal
 def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, tally: Tally):
     out, unfinished = tmp_path / "out", tmp_path / "out.unfinished"
     with tally.case():  # killed between two renames: the earlier result comes back
-        (unfinished / "earlier").mkdir(parents=True)
-        (unfinished / "whole").mkdir()
-        (unfinished / "earlier" / "volume").write_text("old")
+        (unfinished / "backup").mkdir(parents=True)
+        (unfinished / "new").mkdir()
+        (unfinished / "backup" / "volume").write_text("old")
         with OutputFolder(out, ["volume"]):
             assert (out / "volume").read_text() == "old"
         assert names(tmp_path) == {"out"}
     with tally.case():  # killed after them: what is not of a result is brought over
-        (unfinished / "earlier").mkdir(parents=True)
-        (unfinished / "earlier" / "volume").write_text("older")
-        (unfinished / "earlier" / "notes").write_text("mine")
+        (unfinished / "backup").mkdir(parents=True)
+        (unfinished / "backup" / "volume").write_text("older")
+        (unfinished / "backup" / "notes").write_text("mine")
         with OutputFolder(out, ["volume"]):
             pass
         assert (out / "volume").read_text() == "old"
@@ -161,8 +165,8 @@ def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path):
     strided = rng.normal(size=(6, 8))[::2, ::2]
     value = (pose, cloud, {"a": [1, 2.5, None, "x", True]}, (0.1, np.float64(1 / 3)), strided, strided[:0])
     write_stage(tmp_path / "one.npz", value)
-    back = read_stage(tmp_path / "one.npz", RECORDS)
-    same = as_stored(value, RECORDS)
+    back = read_stage(tmp_path / "one.npz", STORED_RECORDS)
+    same = as_stored(value)
     for one in (back, same):
         np.testing.assert_array_equal(one[0].rotation, pose.rotation)
         assert torch.equal(one[1].quaternion_wxyz, cloud.quaternion_wxyz)
@@ -178,19 +182,19 @@ def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path):
 
 
 def test_stages_draw_their_own_numbers():
-    first, again, other = (stage_rng(3, name).random() for name in (NAMES[2], NAMES[2], NAMES[3]))
+    stages = (Stage.FIT_TO_PRIOR, Stage.FIT_TO_PRIOR, Stage.FIT_TO_SLICES)
+    first, again, other = (stage_rng(3, stage).random() for stage in stages)
     assert first == again != other
-    assert stage_rng(4, NAMES[2]).random() != first
+    assert stage_rng(4, Stage.FIT_TO_PRIOR).random() != first
 
 
 def test_seconds_of_a_stage_are_those_that_it_took(tmp_path: Path):
-    def work(stages: Stages) -> float:
-        with stages.clock("motion"):
-            time.sleep(0.03)
+    def work() -> float:
+        time.sleep(0.03)
         return 1.0
 
     for resume in (False, True):
-        stages = Stages(None, tmp_path / "stages", {"a": "b"}, resume=resume)
-        assert stages.once("motion", lambda: work(stages)) == 1.0  # noqa: B023
-        assert stages.clock.seconds["motion"] >= 0.03
-        assert stages.resumed == ["motion"] * resume
+        run = RunContext(store=StageStore(tmp_path / "stages", {"a": "b"}, resume=resume))
+        assert run.stage(Stage.REGISTRATION, work) == 1.0
+        assert run.clock.seconds["registration"] >= 0.03
+        assert run.store.resumed == ["registration"] * resume

@@ -34,7 +34,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         def bars(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
             yield progress
 
-        monkeypatch.setattr("g3r.cli.infer._bars", bars)
+        monkeypatch.setattr("g3r.cli.infer.progress_bars", bars)
 
     return choose
 
@@ -43,7 +43,7 @@ def test_before_there_is_a_volume_nothing_is_written(
     case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
 ):
     with tally.case():
-        interrupt_at("motion", 0)
+        interrupt_at("registration", 0)
         assert case.run(tmp_path / "deep" / "out") == 130
         assert capsys.readouterr().err.endswith("g3r-infer: interrupted; nothing was written\n")
         assert names(tmp_path) == set()
@@ -63,7 +63,7 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
         assert names(out) == WHOLE - {"uncertainty.nii.gz"}
         record = json.loads((out / "run.json").read_text())
         assert record["partial"] is True
-        assert record["interrupted"] == {"stage": "fit to slices", "step": 21, "n_steps": N_STEPS}
+        assert record["stopped_at"] == {"stage": "fit to slices", "step": 21, "n_steps": N_STEPS}
         assert len(record["loss"]["fit to slices"]) == 21
         volume = load_volume(out / "volume.nii.gz").data
         (tmp_path / "whole.nii.gz").write_bytes(case.volume)
@@ -74,7 +74,12 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
         interrupt_at("nothing", 0)
         assert case.run(out, "--resume") == 0
         assert (out / "volume.nii.gz").read_bytes() == case.volume
-        assert json.loads((out / "run.json").read_text())["resumed"] == ["motion", "prior", "fit to prior"]
+        assert json.loads((out / "run.json").read_text())["resumed"] == [
+            "registration",
+            "coarse volume",
+            "prior",
+            "fit to prior",
+        ]
         assert names(tmp_path) == {"out", "whole.nii.gz"}
 
 
@@ -83,7 +88,7 @@ def test_before_the_fit_to_slices_the_prior_is_the_volume(case: SmallCase, inter
         out = tmp_path / "out"
         interrupt_at("fit to prior", 3)
         assert case.run(out) == 130
-        assert json.loads((out / "run.json").read_text())["interrupted"]["stage"] == "fit to prior"
+        assert json.loads((out / "run.json").read_text())["stopped_at"]["stage"] == "fit to prior"
         volume, prior, mask = (load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask"))
         np.testing.assert_array_equal(volume, prior * mask)
         assert len(GaussianCloud.load(out / "gaussians.npz")) == 0

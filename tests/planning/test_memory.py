@@ -18,11 +18,12 @@ from g3r.acquisition.stacks import Stack, load_stack
 from g3r.bench.command_run import CommandRun, run_infer
 from g3r.cli import infer
 from g3r.errors import InputError
-from g3r.fitting.initial_volumes import FitStart
+from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.planning.memory_estimate import estimate_memory
 from g3r.planning.memory_limit import MIN_PROJECTION_BYTES, PLANNED_HALO_VOXELS, plan_memory
 from g3r.planning.memory_size import gigabytes, parsed_size
 from g3r.planning.presets import PRESETS
+from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
 
 DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
@@ -112,10 +113,10 @@ def test_more_of_anything_needs_more(slices: Slices):
     assert peak() > peak(use_prior=False) > PROCESS
     few = slices.take(np.arange(0, len(slices), 2))
     assert (
-        estimate_memory(few, DRAFT, 1, PROCESS).stages["motion"]
-        < estimate_memory(slices, DRAFT, 1, PROCESS).stages["motion"]
+        estimate_memory(few, DRAFT, 1, PROCESS).stages[Stage.REGISTRATION]
+        < estimate_memory(slices, DRAFT, 1, PROCESS).stages[Stage.REGISTRATION]
     )
-    threads = [estimate_memory(slices, DRAFT, n, PROCESS).stages["motion"] for n in (1, 2, 4, 64)]
+    threads = [estimate_memory(slices, DRAFT, n, PROCESS).stages[Stage.REGISTRATION] for n in (1, 2, 4, 64)]
     assert threads == sorted(threads)
     assert threads[2] == threads[3]  # scattering takes four at most
 
@@ -199,38 +200,38 @@ def test_a_small_limit_is_refused_in_one_line(subject: Path, tmp_path: Path, cap
 
 def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRun, np.ndarray]):
     run, _ = unlimited
-    said = run.record["memory"]
-    assert said["limit_bytes"] is None
-    assert said["changes"] == []
-    assert run.peak_bytes <= said["stated_bytes"] <= 1.5 * run.peak_bytes
+    said = run.record.memory
+    assert said.limit_bytes is None
+    assert said.changes == []
+    assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
 
 
 def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path
 ):
     run, volume = unlimited
-    limit = round(0.93 * run.record["memory"]["stated_bytes"])
+    limit = round(0.93 * run.record.memory.stated_bytes)
     output = tmp_path / "out"
     less = run_infer(arguments(subject, output, *QUIETLY, "--max-memory", str(limit)), output)
     assert less.peak_bytes < limit
-    said = less.record["memory"]
-    assert said["limit_bytes"] == limit
-    assert said["stated_bytes"] <= limit
-    assert said["changes"]
-    assert set(said["changes"]) <= set(less.record["notes"])
+    said = less.record.memory
+    assert said.limit_bytes == limit
+    assert said.stated_bytes <= limit
+    assert said.changes
+    assert set(said.changes) <= set(less.record.notes)
     difference = np.abs(volume_in(output) - volume)
     assert difference.max() < 1e-3 * volume.max()
 
 
 def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path):
-    limit = round(0.93 * unlimited[0].record["memory"]["stated_bytes"])
+    limit = round(0.93 * unlimited[0].record.memory.stated_bytes)
     output = tmp_path / "out"
     given = arguments(subject, output, "--time-budget", "0.1", "--threads", "1", "--quiet")
     run = run_infer([*given, "--max-memory", str(limit)], output)
     assert run.peak_bytes < limit
-    assert run.record["memory"]["stated_bytes"] <= limit
-    assert run.record["memory"]["changes"]
-    assert run.record["time_budget"]["seconds"] == 0.1
+    assert run.record.memory.stated_bytes <= limit
+    assert run.record.memory.changes
+    assert run.record.time_budget.seconds == 0.1
 
 
 def test_a_time_budget_keeps_what_was_planned(slices: Slices):
@@ -243,10 +244,11 @@ def test_a_time_budget_keeps_what_was_planned(slices: Slices):
         slice_stage=replace(DRAFT.slice_stage, projection_bytes=30 * MB),
     )
     ones = np.ones(len(slices))
-    start = FitStart.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
-    budget = TimeBudget.of(30.0)
-    settings, _ = budget.for_registration(planned)
-    settings = budget.for_prior(settings, 0.1)
-    settings, _, _ = budget.for_fit(settings, start, start.sharp, 0.1, 1000, np.random.default_rng(0))
+    start = InitialVolumes.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
+    budget = TimeBudget.of(planned, 30.0)
+    budget.for_registration()
+    budget.for_prior(0.1)
+    budget.for_fit_to_prior(start, start.sharp, 0.1, 1000)
+    settings = budget.settings
     assert settings.prior_stage.projection_bytes == settings.slice_stage.projection_bytes == 30 * MB
     assert (settings.prior_whole_voxels, settings.prior_tile_voxels) == (0, 32)

@@ -9,7 +9,7 @@ import pytest
 
 from data_synth.cli import main as simulate
 from g3r.acquisition.stacks import Stack, load_stack
-from g3r.planning.presets import PRESETS
+from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
 from g3r.run.deadline import Deadline
@@ -34,24 +34,24 @@ def stacks(tmp_path_factory: pytest.TempPathFactory) -> list[Stack]:
     return [load_stack(folder / f"stack-{n}.nii.gz", folder / f"mask-{n}.nii.gz", 4.0) for n in range(3)]
 
 
-def budget(seconds: float) -> TimeBudget:
-    return TimeBudget(Deadline.after(seconds, Clock()), seconds)
+def budget(seconds: float, settings: ReconstructionSettings = SETTINGS) -> TimeBudget:
+    return TimeBudget(settings, Deadline.after(seconds, Clock()), seconds)
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_is_a_positive_number(seconds: float):
     with pytest.raises(ValueError, match="expected a positive number"):
-        TimeBudget.of(seconds)
+        TimeBudget.of(SETTINGS, seconds)
 
 
 def test_what_was_spent_before_counts():
-    assert 6.5 < TimeBudget.of(10.0, spent_s=3.0).deadline.remaining_s <= 7.0
+    assert 6.5 < TimeBudget.of(SETTINGS, 10.0, spent_s=3.0).deadline.remaining_s <= 7.0
 
 
 @pytest.mark.parametrize(("late_s", "missed"), [(-1.0, False), (2.9, False), (3.1, True)])
 def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool):
     clock = Clock()
-    one = TimeBudget(Deadline.after(10.0, clock), 10.0)
+    one = TimeBudget(SETTINGS, Deadline.after(10.0, clock), 10.0)
     clock.now += 10.0 + late_s
     assert one.missed is missed
 
@@ -61,8 +61,8 @@ def test_more_time_never_means_a_shorter_registration():
     chosen = []
     for seconds in (1, 10, 21, 22, 39, 40, 100, 120, 1000):
         one = budget(seconds)
-        one.for_registration(SETTINGS)
-        chosen.append(order.index(one.choices["motion"]))
+        one.for_registration()
+        chosen.append(order.index(one.choices["registration"]))
     assert chosen == sorted(chosen)
     assert chosen[0] == 0
     assert chosen[-1] == len(order) - 1
@@ -70,14 +70,18 @@ def test_more_time_never_means_a_shorter_registration():
 
 def test_registration_keeps_the_space_and_the_seed_that_were_asked_for():
     registration = replace(SETTINGS.registration, standard_orientation=False, seed=7)
-    settings, deadline = budget(60.0).for_registration(replace(SETTINGS, registration=registration))
-    assert settings.registration.seed == 7
-    assert not settings.registration.standard_orientation
+    one = budget(60.0, replace(SETTINGS, registration=registration))
+    deadline = one.for_registration()
+    assert one.settings.registration.seed == 7
+    assert not one.settings.registration.standard_orientation
     assert 0 < deadline.remaining_s < 60
 
 
 def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is():
-    views = [budget(s).for_prior(SETTINGS, 1.0).prior_views for s in (0.1, 10, 20, 40, 1e4)]
+    budgets = [budget(seconds) for seconds in (0.1, 10, 20, 40, 1e4)]
+    for one in budgets:
+        one.for_prior(1.0)
+    views = [one.settings.prior_views for one in budgets]
     assert views == sorted(views)
     assert views[0] == 1
     assert views[-1] == PRESETS["accurate"].prior_views
@@ -89,20 +93,21 @@ def test_presets_cost_more_one_after_the_other():
 
 
 def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list[Stack]):
-    result = GaussianReconstructor(settings=SETTINGS).reconstruct(stacks, budget=TimeBudget.of(0.01))
+    result = GaussianReconstructor(settings=SETTINGS).reconstruct(stacks, plan=TimeBudget.of(SETTINGS, 0.01))
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].mean() > 0
-    record = result.record["time_budget"]
-    assert record["seconds"] == 0.01
-    assert (record["motion"], record["fit"], record["prior_views"]) == ("draft", "draft", 1)
-    assert len(result.record["loss"]["fit to slices"]) == 1
+    record = result.record.time_budget
+    assert record is not None
+    assert record.seconds == 0.01
+    assert (record.registration, record.fit, record.prior_views) == ("draft", "draft", 1)
+    assert len(result.record.loss["fit to slices"]) == 1
 
 
 def test_with_time_enough_every_step_is_made(stacks: list[Stack]):
-    """The motion is given, so that the test is quick."""
+    """The registration is given, so that the test is quick."""
     reconstructor = GaussianReconstructor(settings=SETTINGS)
-    motion = reconstructor.register_stacks(stacks)
-    result = reconstructor.reconstruct(stacks, motion, TimeBudget.of(600.0))
-    assert result.record["time_budget"]["fit"] == "accurate"
-    assert len(result.record["loss"]["fit to slices"]) == PRESETS["accurate"].slice_stage.n_steps
-    assert result.record["settings"]["adaptive"] is not None
+    registration = reconstructor.register_stacks(stacks)
+    result = reconstructor.reconstruct(stacks, registration, plan=TimeBudget.of(SETTINGS, 600.0))
+    assert result.record.time_budget.fit == "accurate"
+    assert len(result.record.loss["fit to slices"]) == PRESETS["accurate"].slice_stage.n_steps
+    assert result.record.settings.adaptive is not None

@@ -11,7 +11,7 @@ import pytest
 from g3r.run import kernel_cache as _kernel_cache
 from g3r.run.kernel_cache import ensure_kernel_cache, may_write
 
-PACKAGE = Path(_kernel_cache.__file__).parent
+PACKAGE = Path(_kernel_cache.__file__).parents[1]
 
 RUN = """
 import numpy as np

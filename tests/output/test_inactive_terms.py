@@ -21,17 +21,17 @@ def slices_of(stacks: list[int]) -> Slices:
 
 
 def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:
-    return {entry["term"]: entry["reason"] for entry in inactive_terms(slices, settings, counts or {})}
+    return {one.term: one.reason for one in inactive_terms(slices, settings, counts or {})}
 
 
 def test_two_stacks_of_slices_determine_everything():
     assert terms(slices_of([0, 0, 1, 1])) == {}
 
 
-def test_a_single_slice_has_neither_gain_nor_shading():
+def test_a_single_slice_has_neither_gain_nor_bias_field():
     found = terms(slices_of([0]))
-    assert set(found) == {"gain of the slice", "shading"}
-    assert "peaks" in found["gain of the slice"]
+    assert set(found) == {"gain of the slice", "bias field"}
+    assert "amplitudes" in found["gain of the slice"]
 
 
 def test_settings_and_a_missing_prior_are_named():
@@ -40,7 +40,7 @@ def test_settings_and_a_missing_prior_are_named():
         base, use_prior=False, slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_bias_field=False)
     )
     found = terms(slices_of([0, 1]), still)
-    assert set(found) == {"shading", "poses in the fit", "distance to the prior"}
+    assert set(found) == {"bias field", "poses in the fit", "distance to the prior"}
     assert "drifts" in terms(slices_of([0, 0]), still)["poses in the fit"]
     assert "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
 

@@ -1,0 +1,96 @@
+"""Which room of g3r may import which: read by tests/test_architecture.py, written into CONTRIBUTING.md.
+
+`python -m tests.rooms` writes the table between the markers of CONTRIBUTING.md.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCUMENT = REPOSITORY / "CONTRIBUTING.md"
+BEGIN, END = "<!-- rooms -->", "<!-- /rooms -->"
+
+OPEN_TO_ALL = {"errors", "_version"}
+
+MAY_IMPORT = {
+    "errors": "",
+    "_version": "",
+    "geometry": "",
+    "run": "",
+    "acquisition": "geometry",
+    "checkpoints": "",
+    "gaussians": "geometry acquisition",
+    "prior": "acquisition checkpoints",
+    "pose_network": "geometry acquisition checkpoints",
+    "training": "geometry prior pose_network",
+    "registration": "geometry run acquisition",
+    "fitting": "geometry run acquisition gaussians registration",
+    "uncertainty": "geometry acquisition gaussians fitting",
+    "planning": "run acquisition gaussians prior registration fitting",
+    "evaluation": "geometry acquisition",
+    "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
+    "reconstruct": "geometry run acquisition gaussians prior pose_network registration fitting planning output",
+    "bench": "geometry acquisition gaussians registration fitting planning evaluation output reconstruct",
+    "cli": "run acquisition checkpoints prior pose_network training planning evaluation output reconstruct",
+}
+"""From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""
+
+DATA_SYNTH_MAY_IMPORT = {"geometry", "acquisition", "run"}
+
+FRONT_DOOR = "__init__"
+
+
+def allowed(room: str) -> set[str]:
+    """Rooms that a room may import."""
+    return set(MAY_IMPORT[room].split())
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Dotted names of everything a file imports, wherever in the file."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = path.relative_to(REPOSITORY).with_suffix("").parts[:-1]
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*base, *([node.module] if node.module else [])))
+            names.update(f"{module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def rooms_imported(path: Path) -> set[str]:
+    """The rooms of g3r that a file imports from, those open to all apart."""
+    found = {name.split(".")[1] for name in imported_modules(path) if name.startswith("g3r.")}
+    return (found & set(MAY_IMPORT)) - OPEN_TO_ALL
+
+
+def room_of(path: Path) -> str:
+    """The room of g3r that a file is in."""
+    return path.relative_to(REPOSITORY / "g3r").with_suffix("").parts[0]
+
+
+def table() -> str:
+    """The rooms from the bottom up, with the first line of their docstrings."""
+    lines = ["| room | holds | may import |", "|---|---|---|"]
+    for room, may in MAY_IMPORT.items():
+        folder = REPOSITORY / "g3r" / room
+        path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        name = f"`{room}/`" if folder.is_dir() else f"`{room}.py`"
+        holds = docstring.splitlines()[0].split(": ", 1)[-1].rstrip(".")
+        lines.append(f"| {name} | {holds} | {', '.join(may.split()) or 'nothing of ours'} |")
+    return "\n".join(lines)
+
+
+def with_table(text: str) -> str:
+    """A document with the table between its markers."""
+    before, rest = text.split(BEGIN)
+    return f"{before}{BEGIN}\n{table()}\n{END}{rest.split(END)[1]}"
+
+
+if __name__ == "__main__":
+    DOCUMENT.write_text(with_table(DOCUMENT.read_text(encoding="utf-8")), encoding="utf-8")
