@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g3r.geometry.rigid import RigidPose
+
 
 @dataclass(frozen=True)
 class VolumeGrid:
@@ -46,6 +48,12 @@ class VolumeGrid:
         affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
         affine[:3, 3] = (low + high) / 2 - (shape - 1) / 2 * spacing_mm
         return cls((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+    def moved(self, pose: RigidPose) -> VolumeGrid:
+        """The same voxels after a rigid motion of the world (one pose)."""
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = pose.rotation[0], pose.translation_mm[0]
+        return VolumeGrid(self.shape, motion @ self.affine)
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 from g3r.run.stage_store import NAMES, RECORDS, Stages, stage_rng
 from tests.faults.small_case import SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 STAGES = ("motion", "prior", "fit-to-prior", "fit-to-slices")
 

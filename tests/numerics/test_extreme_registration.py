@@ -12,7 +12,7 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.normal_equations import correlation
 from g3r.registration.slice_rounds import SliceRounds, refine_slices, slice_weights
-from studies.numerics.fits import slices_of_small_head
+from tests.numerics.fits import slices_of_small_head
 
 ROUNDS = SliceRounds(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6, max_pixels=400_000)
 
