@@ -27,6 +27,7 @@ Row = dict[str, Any]
 Record = dict[str, Any]
 
 FOLDER = Path("runs") / "studies"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ class Study:
         about: for --help.
         tasks: the measurements, from the options.
         tables: from the record, Markdown by the name of the markers in the document.
+        document: in docs/, where --publish puts the tables.
+        picture: in docs/images/, the figure of --publish.
         shared: those of `SHARED` that it takes.
         options: its own, as arguments of `add_argument` by their name.
         settings: what rows depend on beside the preset, weights, threads, jobs and --development.
@@ -90,6 +93,8 @@ class Study:
     about: str
     tasks: Callable[[argparse.Namespace], Iterable[Task]]
     tables: Callable[[Record], Mapping[str, str]]
+    document: str
+    picture: str | None = None
     shared: tuple[str, ...] = FITS
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     settings: Callable[[argparse.Namespace], Record] | None = None
@@ -114,6 +119,7 @@ class Study:
         parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
         if self.figure:
             parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw it")
+        parser.add_argument("--publish", action="store_true", help=f"tables and figure into docs/{self.document}")
         return parser
 
     def main(self, argv: Sequence[str] | None = None) -> int:
@@ -131,8 +137,14 @@ class Study:
 
     def run(self, options: argparse.Namespace) -> int:
         """Measure what the record does not hold; write record, tables and figure; returns the exit code."""
+        if options.publish:
+            options.docs = options.docs or DOCS / self.document
+            if self.picture:
+                options.figure = options.figure or DOCS / "images" / self.picture
         if options.docs and getattr(options, "development", False):
-            raise InputError("--docs: the published table needs seeds not looked at; leave out --development")
+            raise InputError(
+                "--docs, --publish: the published table needs seeds not looked at; leave out --development"
+            )
         settings = self._settings(options)
         tasks = list(self.tasks(options))
         path = options.output / f"{self.name.split('.')[-1]}.json"
@@ -195,7 +207,7 @@ def resumed(path: Path, new: Record, renewed: set[str]) -> Record:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         rows = {key: row for key, row in found["rows"].items() if key not in renewed and "skipped" not in row}
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a record of a study ({error}); choose another --output") from None
     if not rows:
         return new

@@ -127,6 +127,8 @@ STUDY = Study(
     name="lesions.kept",
     about="Put bright and dark spheres of 6 mm and an enlarged ventricle into heads that no training has seen, "
     "slice them, reconstruct with and without prior, and measure how much of each lesion is kept.",
+    document="prior.md",
+    picture="lesions.png",
     shared=(*FITS, "--development"),
     options={
         "--subjects": {"type": positive, "default": 3, "metavar": "N", "help": "heads, week after week"},

@@ -84,6 +84,7 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="motion.bias",
     about="Reconstruct subjects with weak and strong shading, with the shading estimated and not.",
+    document="motion.md",
     shared=(*FITS, "--cache"),
     options={
         "--repeats": {"type": positive, "default": 1, "metavar": "N", "help": "subjects of each volume"},

@@ -129,6 +129,8 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="motion.layers",
     about="Pose errors after each layer of registration, and the volume with a layer left out, on the cases.",
+    document="motion.md",
+    picture="motion-tre.png",
     shared=(*FITS, "--cases"),
     options={"--no-without": {"action": "store_true", "help": "skip the runs with a layer left out"}},
     settings=lambda options: {"without": not options.no_without},

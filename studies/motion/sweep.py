@@ -169,6 +169,7 @@ EACH: dict[str, Cell] = {
 STUDY = Study(
     name="motion.sweep",
     about="Simulate random subjects at each level of motion and measure how well they are registered.",
+    document="motion.md",
     shared=(*FITS, "--jobs", "--cache", "--development"),
     options={
         "--levels": {"nargs": "+", "choices": LEVELS, "default": list(LEVELS), "help": "of motion"},

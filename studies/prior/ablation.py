@@ -182,6 +182,8 @@ STUDY = Study(
     name="prior.ablation",
     about="Reconstruct subjects that no training has seen from one, two and three stacks, without prior, "
     "with the prior as the start, and with distillation.",
+    document="prior.md",
+    picture="prior-ablation.png",
     shared=(*FITS, "--jobs", "--cache", "--development"),
     options={
         "--subjects": {"nargs": "+", "metavar": "WORD", "default": [""], "help": "names that contain one"},

@@ -158,6 +158,7 @@ STUDY = Study(
     name="prior.alone",
     about="The prior volume against V_coarse at the true poses of the cases, from the first stack and from all; "
     "and the seconds it takes.",
+    document="prior.md",
     shared=(*FITS, "--cases", "--cache"),
     options={"--no-speed": {"action": "store_true", "help": "skip seconds and tiles"}},
     settings=lambda options: {"n_views": PRESETS[options.preset].prior_views},

@@ -56,6 +56,7 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="prior.cases",
     about="Every variant of studies.prior.ablation on the cases, with all their stacks.",
+    document="prior.md",
     shared=(*FITS, "--cases"),
     tasks=tasks,
     line=line,

@@ -249,6 +249,8 @@ STUDY = Study(
     name="prior.networks",
     about="Train variants of the prior network for the same number of steps on the same subjects and seed, and "
     "compare them on the validation volumes. Interrupted trainings go on where they stopped.",
+    document="prior.md",
+    picture="prior-networks.png",
     shared=("--threads", "--cache"),
     options={
         "--steps": {"type": positive, "default": 384, "metavar": "N", "help": "of the optimiser, to whole epochs"},

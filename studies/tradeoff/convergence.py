@@ -118,6 +118,7 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="tradeoff.convergence",
     about="Fit subjects with more and more steps, in several ways, after one registration that all share.",
+    document="tradeoff.md",
     shared=(*FITS, "folders"),
     tasks=tasks,
     tables=tables,

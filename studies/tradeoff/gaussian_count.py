@@ -222,6 +222,8 @@ def measure(name: str, voxel_mm: float) -> Row:
 STUDY = Study(
     name="tradeoff.gaussian_count",
     about="How many Gaussians a volume needs: PSNR against their number, by error bound and on a uniform lattice.",
+    document="tradeoff.md",
+    picture="gaussian-count.png",
     shared=("--threads",),
     options={
         "--subjects": {"nargs": "*", "choices": SUBJECTS, "default": [], "metavar": "NAME", "help": "(none: all)"},

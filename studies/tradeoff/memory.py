@@ -158,6 +158,7 @@ STUDY = Study(
     name="tradeoff.memory",
     about="Memory as g3r-infer states it against what its process held, and runs below limits, on phantoms. "
     "Ends with 1 where a statement, or a limit, is below what was held, or too much is stated.",
+    document="tradeoff.md",
     shared=(),
     options={
         "--part": {"choices": ("all", "statement", "limits"), "default": "all", "help": "of the tables"},

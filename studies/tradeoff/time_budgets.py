@@ -89,6 +89,7 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="tradeoff.time_budgets",
     about="Run g3r-infer with rising time budgets, as a user would.",
+    document="tradeoff.md",
     shared=("folders",),
     options={
         "--thickness": {"type": float, "metavar": "MM", "help": "of slices (None: simulation.json)"},

@@ -1,4 +1,4 @@
-"""`python -m studies.uncertainty.calibration fit` and `check`: the calibration of uncertainty.nii.gz."""
+"""`python -m studies.uncertainty.calibration`: fit and check the calibration of uncertainty.nii.gz."""
 
 from __future__ import annotations
 
@@ -120,6 +120,8 @@ STUDY = Study(
     about="fit: fit the coefficients of uncertainty.nii.gz to simulated subjects of the validation atlas and "
     "write them into the package. check: compare stated uncertainty and error on subjects left out. "
     "Subjects and their registrations are kept in --cache.",
+    document="prior.md",
+    picture="uncertainty-calibration.png",
     shared=(*FITS, "--cache"),
     options={
         "task": {"choices": ("fit", "check")},
