@@ -77,7 +77,7 @@ class Study:
         about: for --help.
         tasks: the measurements, from the options.
         tables: from the record, Markdown by the name of the markers in the document.
-        document: in docs/, where --publish puts the tables.
+        document: in docs/, where --publish puts the tables; None publishes nothing.
         picture: in docs/images/, the figure of --publish.
         shared: those of `SHARED` that it takes.
         options: its own, as arguments of `add_argument` by their name.
@@ -93,7 +93,7 @@ class Study:
     about: str
     tasks: Callable[[argparse.Namespace], Iterable[Task]]
     tables: Callable[[Record], Mapping[str, str]]
-    document: str
+    document: str | None = None
     picture: str | None = None
     shared: tuple[str, ...] = FITS
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -119,7 +119,8 @@ class Study:
         parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
         if self.figure:
             parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw it")
-        parser.add_argument("--publish", action="store_true", help=f"tables and figure into docs/{self.document}")
+        where = f"tables and figure into docs/{self.document}" if self.document else "nothing: in no document"
+        parser.add_argument("--publish", action="store_true", help=where)
         return parser
 
     def main(self, argv: Sequence[str] | None = None) -> int:
@@ -137,7 +138,7 @@ class Study:
 
     def run(self, options: argparse.Namespace) -> int:
         """Measure what the record does not hold; write record, tables and figure; returns the exit code."""
-        if options.publish:
+        if options.publish and self.document:
             options.docs = options.docs or DOCS / self.document
             if self.picture:
                 options.figure = options.figure or DOCS / "images" / self.picture

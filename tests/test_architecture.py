@@ -113,7 +113,7 @@ def test_g3r_does_not_know_data_synth() -> None:
     assert users <= {"data_synth/cli.py"}
 
 
-def test_nothing_installed_knows_the_benchmarks() -> None:
+def test_nothing_installed_knows_the_studies() -> None:
     for path in [*in_package("g3r"), *in_package("data_synth")]:
         assert not any(name.split(".")[0] == "studies" for name in imported_modules(path)), relative(path)
 

@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.peer_phantom`: a small phantom case of the size that other methods were timed on.
+"""A small phantom case of the size that other methods were timed on: `python -m studies.tradeoff.peer_phantom`.
 
 A truth of 64^3 voxels of 0.8 mm and three stacks of 58 x 58 x 18 pixels of 0.8 x 0.8 x 2.4 mm, every slice at
 a pose of its own: the built-in phantom, shrunk until it fits.

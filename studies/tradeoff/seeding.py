@@ -60,7 +60,6 @@ def tables(record: Record) -> dict[str, str]:
 STUDY = Study(
     name="tradeoff.seeding",
     about="The lattice against error bounds in the whole reconstruction: PSNR to the truth, Gaussians, CPU seconds.",
-    document="tradeoff.md",
     shared=(*FITS, "folders"),
     options={"--bounds": {"nargs": "*", "type": float, "default": [0.03, 0.05, 0.08], "help": "to compare"}},
     tasks=tasks,
