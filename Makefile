@@ -12,10 +12,11 @@ ATLAS ?=
 PRETRAIN_ARGS ?=
 POSE_ARGS ?=
 BENCH_ARGS ?=
+STUDY_ARGS ?=
 # of `make bench`: folders of g3r-simulate; phantoms are made when empty
 CASES ?=
 PHANTOM_CASES := runs/bench/phantom-cases
-# of `make ablate-networks`: small patches of subjects that all variants share
+# of `make study-prior.networks`: small patches of subjects that all variants share
 SHORT_TRAINING ?= --data.num_workers=0 --data.patch_size=32 --data.batch_size=2 --data.distinct_epochs=2 \
 	--model.warmup_steps=60 --trainer.check_val_every_n_epoch=2
 PRIOR ?= runs/prior.pt
@@ -25,10 +26,13 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench-motion bench-layers bench-bias bench-prior bench-ablation bench-cases ablate-networks fit-uncertainty bench-uncertainty bench-lesions bench-gaussians bench-convergence bench-budgets bench bench-phantom bench-memory clean
+.PHONY: help install demo test test-slow test-numerics test-faults lint types pretrain tensorboard bench bench-phantom fit-uncertainty clean
 
 help: ## show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-15s %s\n", $$1, $$2}'
+	@echo "studies, for make study-NAME:"
+	@grep -rhoE '^"""`python -m studies\.[a-z._]+`: .*' studies | sed -E 's/^[^`]*`python -m studies\.([a-z._]+)`: (.*[^."]).*$$/\1\t\2/' \
+		| sort | awk -F'\t' '{printf "  %-24s %s\n", $$1, $$2}'
 
 install: $(STAMP) ## make .venv with g3r and everything it needs
 
@@ -83,51 +87,19 @@ pretrain: install ## train both networks on the phantom, or on ATLAS=DIR, and ex
 tensorboard: install ## watch the training runs
 	$(BIN)/tensorboard --logdir runs
 
-bench-motion: install ## registration of 30 random subjects (G3R_TEST_DATA): the table of docs/motion.md
-	$(BIN)/python -m studies.motion.sweep --docs docs/motion.md $(BENCH_ARGS)
+study-%: install ## measure what a table of docs/ shows, and write it there (most need G3R_TEST_DATA; STUDY_ARGS=--fresh)
+	$(BIN)/python -m studies.$* --publish $(STUDY_ARGS) $(STUDY_MORE)
 
-bench-layers: install ## what each layer of registration brings, on the cases (G3R_TEST_DATA)
-	$(BIN)/python -m studies.motion.layers --docs docs/motion.md --figure docs/images/motion-tre.png $(BENCH_ARGS)
+study-prior.ablation: STUDY_MORE = --jobs 2
+study-prior.networks: STUDY_MORE = -- $(SHORT_TRAINING)
 
-bench-bias: install ## poses and volume under shading (G3R_TEST_DATA)
-	$(BIN)/python -m studies.motion.bias --docs docs/motion.md $(BENCH_ARGS)
-
-bench-prior: install ## the prior volume alone at true poses, and its seconds (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m studies.prior.alone --docs docs/prior.md $(BENCH_ARGS)
-
-bench-ablation: install ## with and without the prior, 1 to 3 stacks, 8 subjects (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m studies.prior.ablation --jobs 2 --docs docs/prior.md \
-		--figure docs/images/prior-ablation.png $(BENCH_ARGS)
+study-uncertainty.calibration: install
+	$(BIN)/python -m studies.uncertainty.calibration check --no-prior $(STUDY_ARGS)
+	$(BIN)/python -m studies.uncertainty.calibration check --publish $(STUDY_ARGS)
 
 fit-uncertainty: install ## coefficients of uncertainty.nii.gz, with and without prior (G3R_TEST_DATA), about 10 min
-	$(BIN)/python -m studies.uncertainty.calibration fit $(BENCH_ARGS)
-	$(BIN)/python -m studies.uncertainty.calibration fit --no-prior $(BENCH_ARGS)
-
-bench-uncertainty: install ## stated uncertainty against error, on subjects left out (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m studies.uncertainty.calibration check --no-prior $(BENCH_ARGS)
-	$(BIN)/python -m studies.uncertainty.calibration check --docs docs/prior.md \
-		--figure docs/images/uncertainty-calibration.png $(BENCH_ARGS)
-
-bench-gaussians: install ## PSNR against number of Gaussians, by bound and on a lattice (G3R_TEST_DATA for the atlas)
-	$(BIN)/python -m studies.tradeoff.gaussian_count --docs docs/tradeoff.md \
-		--figure docs/images/gaussian-count.png
-
-bench-convergence: install ## optimiser steps to within 0.1 dB of the end (G3R_TEST_DATA): docs/tradeoff.md
-	$(BIN)/python -m studies.tradeoff.convergence "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --docs docs/tradeoff.md $(BENCH_ARGS)
-
-bench-budgets: install ## whether --time-budget is kept, and what more time brings (G3R_TEST_DATA): docs/tradeoff.md
-	$(BIN)/python -m studies.tradeoff.time_budgets "$${G3R_TEST_DATA:?names the data}"/cases/sta30-moderate --thickness 2.2 \
-		--docs docs/tradeoff.md $(BENCH_ARGS)
-
-bench-lesions: install ## how much of lesions is kept, with and without prior (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m studies.lesions.kept --docs docs/prior.md --figure docs/images/lesions.png $(BENCH_ARGS)
-
-bench-cases: install ## with and without the prior on the cases (G3R_TEST_DATA): docs/prior.md
-	$(BIN)/python -m studies.prior.cases --docs docs/prior.md $(BENCH_ARGS)
-
-ablate-networks: install ## train variants of the prior network alike and compare them (G3R_TEST_DATA); an hour or more
-	$(BIN)/python -m studies.prior.networks --docs docs/prior.md \
-		--figure docs/images/prior-networks.png $(BENCH_ARGS) -- $(SHORT_TRAINING)
+	$(BIN)/python -m studies.uncertainty.calibration fit $(STUDY_ARGS)
+	$(BIN)/python -m studies.uncertainty.calibration fit --no-prior $(STUDY_ARGS)
 
 bench: install ## kernels, scaling and speed against accuracy, on phantoms or on CASES="DIR ..." (BENCH_ARGS=--sweeps)
 	$(if $(CASES),,$(BIN)/g3r-simulate --phantom 30 --resolution 0.8 --thickness 3 --seed 61002 --force --output $(PHANTOM_CASES)/phantom-30)
@@ -140,9 +112,6 @@ bench: install ## kernels, scaling and speed against accuracy, on phantoms or on
 bench-phantom: install ## a small phantom of the size that other methods were timed on: seconds of `fast`
 	$(BIN)/python -m studies.tradeoff.peer_phantom --force --output $(PHANTOM_CASES)/small
 	$(BIN)/g3r-bench trade $(PHANTOM_CASES)/small --presets fast --output runs/bench/phantom $(BENCH_ARGS)
-
-bench-memory: install ## memory as stated and as held, runs below limits, on phantoms, about 20 min: docs/tradeoff.md
-	$(BIN)/python -m studies.tradeoff.memory --docs docs/tradeoff.md $(BENCH_ARGS)
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,1 +1,1 @@
-"""What measures the whole: scripts that need data from outside, run by hand or by `make bench-*`."""
+"""What measures for the documents: a folder per page. `python -m studies.PAGE.NAME`, or `make study-NAME`."""

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
-from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase
-from g3r.evaluation.compare import compare
+from g3r.evaluation.compare import Comparison, compare
 from g3r.evaluation.metrics import Scores
 from g3r.evaluation.pose_error import PoseError
-from g3r.geometry import RigidPose
+from g3r.geometry import RigidPose, VolumeGrid
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.reconstruct import GaussianReconstructor
+from g3r.registration import Registration
 from g3r.registration.quality import pose_warnings, stack_qualities
+from studies.subjects import read_case
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Run:
     """What one subject gave.
 
@@ -72,7 +75,13 @@ class Run:
 
 
 def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
-    """Registration alone, as the reconstruction begins with it."""
+    """Registration alone, as the reconstruction begins with it.
+
+    Args:
+        case: the subject.
+        settings: of the reconstruction.
+        checkpoint: of the prior; None takes the one shipped.
+    """
     reconstructor = GaussianReconstructor(checkpoint, settings)
     wall, cpu = time.perf_counter(), time.process_time()
     motion = reconstructor.register_stacks(case.stacks)
@@ -80,35 +89,54 @@ def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint
     confidences = stack_qualities(motion, len(case.stacks))
     warnings = tuple(pose_warnings(motion, confidences, case.stacks))
     error = case.pose_error(motion.slices)
-    return Run(error, seconds, cpu_seconds, warnings, orientation_deg=orientation_deg(case, error.common))
+    return Run(
+        error=error,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+        warnings=warnings,
+        orientation_deg=orientation_deg(case, error.common),
+    )
 
 
 def reconstructed(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
-    """The whole reconstruction, its volume scored after rigid alignment."""
+    """The whole reconstruction, its volume scored after rigid alignment; arguments as of `registered`."""
     reconstructor = GaussianReconstructor(checkpoint, settings)
     wall, cpu = time.perf_counter(), time.process_time()
     result = reconstructor.reconstruct(case.stacks)
     seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
     error = case.pose_error(result.slices)
-    # the volume may stand in another orientation than the truth, further than alignment reaches
-    volume = Volume(result.volume, _moved(error.common, result.grid.affine), case.name)
-    scores = compare(volume, case.truth, case.truth_mask, align=True).scores
     return Run(
-        error,
-        seconds,
-        cpu_seconds,
-        tuple(result.record.warnings),
-        scores,
-        result.record.seconds,
-        orientation_deg(case, error.common),
+        error=error,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+        warnings=tuple(result.record.warnings),
+        scores=aligned(case, result.volume, result.grid, error.common).scores,
+        stage_seconds=result.record.seconds,
+        orientation_deg=orientation_deg(case, error.common),
     )
 
 
-def _moved(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """An affine whose world is moved by one pose."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation[0], pose.translation_mm[0]
-    return matrix @ affine
+def aligned(
+    case: SimulatedCase, data: NDArray[np.float32], grid: VolumeGrid, truth_from_volume: RigidPose
+) -> Comparison:
+    """A volume compared with the truth after rigid alignment.
+
+    The volume may stand in another orientation than the truth, further than alignment reaches: the common
+    motion of the slices brings it near first. `alignment` of the comparison starts from there.
+
+    Args:
+        case: with the truth.
+        data: [I, J, K] of the volume.
+        grid: of the data.
+        truth_from_volume: the common motion of the slices (`PoseError.common`).
+    """
+    volume = Volume(data, grid.moved(truth_from_volume).affine, case.name)
+    return compare(volume, case.truth, case.truth_mask, align=True)
+
+
+def figures(scores: Scores) -> dict[str, float]:
+    """What the tables show of scores, as plain numbers."""
+    return {"psnr_db": round(scores.psnr_db, 4), "ssim": round(scores.ssim, 5)}
 
 
 def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
@@ -118,12 +146,13 @@ def orientation_deg(case: SimulatedCase, truth_from_result: RigidPose) -> float:
     return float(np.rad2deg(np.linalg.norm(turn.rotvec_rad())))
 
 
-def preset_settings(name: str) -> ReconstructionSettings:
-    """The settings of a preset.
+@functools.lru_cache(maxsize=1)
+def registered_once(folder: Path, preset: str, checkpoint: str | None) -> Registration:
+    """The registration that all fits of a case share.
 
-    Raises:
-        InputError: no such preset.
+    Args:
+        folder: of the case.
+        preset: its settings.
+        checkpoint: of the prior; None takes the one shipped.
     """
-    if name not in PRESETS:
-        raise InputError(f"--preset {name}; expected one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    return GaussianReconstructor(checkpoint, PRESETS[preset]).register_stacks(read_case(folder).stacks)

@@ -1,11 +1,13 @@
-"""Simulated subjects of the benchmarks: an atlas volume, stretched, sliced as it moves; kept in a folder."""
+"""What studies measure on: simulated subjects, kept in a folder, and the cases of the test data."""
 
 from __future__ import annotations
 
 import json
 import logging
 import os
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from data_synth.atlas import TruthVolume, cropped, find_subjects, load_subject
 from data_synth.export import save_simulation
 from data_synth.simulator import orthogonal_settings, simulate_stacks
 from g3r.errors import InputError
+from g3r.evaluation.case import SimulatedCase, load_case
 
 logger = logging.getLogger(__name__)
 
@@ -27,13 +30,20 @@ STRETCH = 0.05
 
 RECORD_NAME = "simulation.json"
 
+THICKNESS_MM = {"sb28-mild-gap": 3.0}
+"""Cases whose slices are thinner than their distance and that have no simulation.json to say so."""
 
-@dataclass(frozen=True)
+ORDER = ("*-none", "*-mild*", "*-moderate", "*-severe", "*-single")
+
+USUAL_CASE = "sta30-moderate"
+
+
+@dataclass(frozen=True, kw_only=True)
 class SubjectSpec:
     """All that decides a simulated subject.
 
     Args:
-        name: folder in the cache.
+        name: folder in the cache; by default motion, seed and the last part of the volume.
         volume: subject of the atlas tree, as in `find_subjects`.
         motion: mild, moderate or severe.
         seed: of the stretch and of the simulation.
@@ -42,7 +52,7 @@ class SubjectSpec:
         turned: whether the head lies in a random orientation instead of the atlas's.
     """
 
-    name: str
+    name: str = ""
     volume: str
     motion: str
     seed: int
@@ -50,21 +60,59 @@ class SubjectSpec:
     stretch: float = STRETCH
     turned: bool = False
 
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", f"{self.motion}-{self.seed}-{self.volume.rsplit('/', 1)[-1]}")
 
-def test_data_folder() -> Path:
-    """The folder that holds `atlas/` and `cases/`: `G3R_TEST_DATA`, or `shared/data` beside the repository.
+
+def data_folder(part: str) -> Path:
+    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` beside the repository.
 
     Raises:
         InputError: there is none.
     """
-    folder = Path(os.environ.get("G3R_TEST_DATA", REPOSITORY.parent / "shared" / "data"))
+    folder = Path(os.environ.get("G3R_TEST_DATA", REPOSITORY.parent / "shared" / "data")) / part
     if not folder.is_dir():
         raise InputError(f"{folder}: no test data; set G3R_TEST_DATA to the folder with atlas/ and cases/")
     return folder
 
 
+def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path]:
+    """The cases of the test data whose name has a part that matches a pattern, from no motion to much.
+
+    Raises:
+        InputError: none matches.
+    """
+    root = root or data_folder("cases")
+    found = [f for f in sorted(root.glob("*")) if f.is_dir() and any(fnmatch(f.name, f"*{p}*") for p in patterns)]
+    if not found:
+        raise InputError(f"{root}: no case named {' or '.join(patterns)}; change --cases or G3R_TEST_DATA")
+    return sorted(found, key=lambda f: next((n for n, p in enumerate(ORDER) if fnmatch(f.name, p)), len(ORDER)))
+
+
+def chosen_folders(folders: Sequence[Path]) -> Sequence[Path]:
+    """The folders that were given, or the case of the test data that stands for all."""
+    return folders or [data_folder("cases") / USUAL_CASE]
+
+
+def read_case(folder: Path, n_stacks: int | None = None) -> SimulatedCase:
+    """A case with its first stacks (None: all), with the thickness of its slices where no file says it."""
+    case = load_case(folder, THICKNESS_MM.get(folder.name))
+    return replace(case, stacks=case.stacks[:n_stacks])
+
+
+def simulated_case(spec: SubjectSpec, cache: Path, n_stacks: int | None = None) -> SimulatedCase:
+    """A subject of the test data's atlas with its first stacks (None: all), simulated if the cache lacks it."""
+    return read_case(simulated_subject(spec, data_folder("atlas"), cache), n_stacks)
+
+
 def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
     """The folder of a subject, simulated if the cache does not hold it.
+
+    Args:
+        spec: the subject.
+        atlas: folder of the atlas.
+        cache: folder of simulated subjects.
 
     Raises:
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
@@ -73,23 +121,29 @@ def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
     record = asdict(spec)
     if folder.is_dir():
         path = folder / RECORD_NAME
-        found = json.loads(path.read_text(encoding="utf-8")).get("recipe") if path.is_file() else None
+        found = json.loads(path.read_text(encoding="utf-8")).get("spec") if path.is_file() else None
         if found != record:
-            raise InputError(f"{folder}: made by another recipe; remove it or choose another --cache")
+            raise InputError(f"{folder}: made by another specification; remove it or choose another --cache")
         return folder
     chosen = find_subjects(atlas, include=[spec.volume])
     rng = np.random.default_rng(spec.seed)
-    truth = _stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), spec, rng)
+    truth = stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), spec, rng)
     settings = orthogonal_settings(3, spec.motion, bias=spec.bias)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}
-    save_simulation(folder, truth, stacks, {"recipe": record, **extra})
+    save_simulation(folder, truth, stacks, {"spec": record, **extra})
     logger.info("%s: simulated", spec.name)
     return folder
 
 
-def _stretched(truth: TruthVolume, spec: SubjectSpec, rng: np.random.Generator) -> TruthVolume:
-    """The volume with other voxel sizes (no resampling, no loss), centred, turned at random if asked."""
+def stretched(truth: TruthVolume, spec: SubjectSpec, rng: np.random.Generator) -> TruthVolume:
+    """The volume with other voxel sizes (no resampling, no loss), centred, in a random orientation if asked.
+
+    Args:
+        truth: the volume of the atlas.
+        spec: the subject.
+        rng: of the stretch, and of the orientation.
+    """
     factor = 1 + rng.uniform(-spec.stretch, spec.stretch, 3)
     turn = np.eye(3)
     if spec.turned:

@@ -12,6 +12,8 @@ import pytest
 # ten times as long; commands that tests start choose their own number
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+pytest_plugins = ["tests.tally"]
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 

@@ -15,7 +15,7 @@ from g3r.evaluation.compare import compare
 from g3r.evaluation.metrics import score
 from g3r.evaluation.pose_error import PoseTable, read_poses, target_registration_error
 from g3r.gaussians import GaussianCloud, render
-from g3r.geometry import RigidPose
+from g3r.geometry import RigidPose, VolumeGrid
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,8 @@ def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.f
     motion of the slices brings it near first.
     """
     error = target_registration_error(case.points_mm, case.true, poses)
-    comparison = compare(
-        Volume(data, moved_affine(error.common, affine), case.name), case.truth, case.truth_mask, align=True
-    )
+    grid = VolumeGrid(data.shape, affine).moved(error.common)
+    comparison = compare(Volume(data, grid.affine, case.name), case.truth, case.truth_mask, align=True)
     assert comparison.alignment is not None
     scores = comparison.scores
     return Quality(scores.psnr_db, scores.ssim, error.median_mm, comparison.alignment.volume_from_reference)
@@ -81,10 +80,3 @@ def cloud_psnr_db(
     pixels = render(cloud, planes, cutoff_sigma=cutoff_sigma).numpy()
     volume = volume_from_pixels(pixels, case.truth.grid)
     return float(score(volume, case.truth.data, case.truth_mask).psnr_db)
-
-
-def moved_affine(pose: RigidPose, affine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """An affine whose world is moved by one pose."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation[0], pose.translation_mm[0]
-    return matrix @ affine

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import affine_transform
 
+from g3r.geometry.rigid import RigidPose
+
 
 @dataclass(frozen=True)
 class VolumeGrid:
@@ -60,6 +62,12 @@ class VolumeGrid:
         if np.isclose(self.spacing_mm[0], spacing_mm, rtol=1e-6):
             return self
         return VolumeGrid.isotropic(self.world([0, 0, 0]), self.world(np.array(self.shape) - 1), spacing_mm)
+
+    def moved(self, pose: RigidPose) -> VolumeGrid:
+        """The same voxels after a rigid motion of the world (one pose)."""
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = pose.rotation[0], pose.translation_mm[0]
+        return VolumeGrid(self.shape, motion @ self.affine)
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:

@@ -1,9 +1,8 @@
-"""The figure of the lesion test: sections through one lesion of each kind, truth and reconstructions."""
+"""The figure of the lesion study: sections through one lesion of each kind, truth and reconstructions."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from g3r.geometry import VolumeGrid
 from studies.lesions.volumes import with_lesions
+from studies.tables import new_figure, save_figure, stacks
 
 if TYPE_CHECKING:
     from studies.lesions.runs import LesionRun
@@ -19,53 +19,60 @@ if TYPE_CHECKING:
 HALF_WIDTH_MM = {"bright": 20.0, "dark": 20.0, "ventricle": 38.0}
 """Shown around a lesion's middle."""
 
-KINDS = tuple(HALF_WIDTH_MM)
 PANEL_INCHES = 1.75
+GREY = "#c8c8c8"
+TRUTH = "truth"
 
 
-def draw_lesions_kept(runs: Sequence[LesionRun], variants: Sequence[str], path: Path) -> None:
+def save_sections(run: LesionRun, path: Path) -> None:
+    """Keep what the figure shows of a run: sections and shares by kind and volume, and the white point."""
+    subject = run.subject
+    truth = with_lesions(subject.healthy, subject.lesions).data
+    kept: dict[str, Any] = {"white": np.percentile(truth[subject.healthy.mask], 99.7)}
+    for kind, half_mm in HALF_WIDTH_MM.items():
+        # of several spheres the first: no choice by how well it came out
+        number = next(k for k, lesion in enumerate(subject.lesions) if lesion.kind == kind)
+        for name, volume in {TRUTH: truth, **run.volumes}.items():
+            center_mm = subject.lesions[number].center_mm
+            kept[f"{kind}/{name}"] = _section(volume, subject.grid, center_mm, half_mm)
+            kept[f"{kind}/{name}/kept"] = run.kept[name][number] if name in run.kept else np.nan
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **kept)
+
+
+def draw_lesions_kept(subject: str, sections: Mapping[int, Path], variants: Sequence[str], path: Path) -> None:
     """A row for the truth and each variant, a column for each kind of lesion and number of stacks.
 
     Args:
-        runs: of one head.
+        subject: name of the head.
+        sections: by number of stacks, files of `save_sections`.
         variants: rows below the truth.
         path: PNG to write, whole or not at all.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    n_columns = len(runs) * len(KINDS)
-    size = ((n_columns + 0.4) * PANEL_INCHES, (len(variants) + 1.35) * PANEL_INCHES)
-    figure = Figure(figsize=size, facecolor="black", layout="constrained", dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    panels = figure.subplots(len(variants) + 1, n_columns, squeeze=False)
-    for block, run in enumerate(runs):
-        truth = with_lesions(run.subject.healthy, run.subject.lesions).data
-        high = float(np.percentile(truth[run.subject.healthy.mask], 99.7))
-        for column, kind in enumerate(KINDS):
-            # of several spheres the first: no choice by how well it came out
-            number = next(k for k, lesion in enumerate(run.subject.lesions) if lesion.kind == kind)
-            lesion = run.subject.lesions[number]
-            rows = [("truth", truth, "")]
-            rows += [(name, run.volumes[name], f"{run.kept[name][number]:.2f}") for name in variants]
-            for row, (name, volume, kept) in enumerate(rows):
-                panel = panels[row, block * len(KINDS) + column]
-                shown = _section(volume, run.subject.grid, lesion.center_mm, HALF_WIDTH_MM[kind])
-                panel.imshow(shown.T, cmap="gray", vmin=0, vmax=high, origin="lower", interpolation="bilinear")
-                _quiet(panel)
-                panel.text(0.03, 0.03, kept, transform=panel.transAxes, color="#e8b04a", fontsize=10, va="bottom")
-                if row == 0:
-                    stacks = f"{run.n_stacks} stack{'s' * (run.n_stacks > 1)}"
-                    panel.set_title(f"{kind}, {stacks}", color="#c8c8c8", fontsize=10)
-                if block == column == 0:
-                    panel.set_ylabel(name, color="#c8c8c8", fontsize=11)
-    figure.suptitle(
-        f"{runs[0].subject.name}: share of the lesion's contrast that is kept", color="#c8c8c8", fontsize=11
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.png")
-    canvas.print_png(beside)
-    os.replace(beside, path)
+    names = (TRUTH, *variants)
+    n_columns = len(sections) * len(HALF_WIDTH_MM)
+    size = ((n_columns + 0.4) * PANEL_INCHES, (len(names) + 0.35) * PANEL_INCHES)
+    figure = new_figure(size, facecolor="black")
+    panels = figure.subplots(len(names), n_columns, squeeze=False)
+    columns = [(n, np.load(file), kind) for n, file in sections.items() for kind in HALF_WIDTH_MM]
+    for column, (n, shown, kind) in enumerate(columns):
+        for row, name in enumerate(names):
+            panel = panels[row, column]
+            section, kept = shown[f"{kind}/{name}"], float(shown[f"{kind}/{name}/kept"])
+            panel.imshow(
+                section.T, cmap="gray", vmin=0, vmax=float(shown["white"]), origin="lower", interpolation="bilinear"
+            )
+            panel.set(xticks=[], yticks=[])
+            panel.spines[:].set_visible(False)
+            if name != TRUTH:
+                text = f"{kept:.2f}"
+                panel.text(0.03, 0.03, text, transform=panel.transAxes, color="#e8b04a", fontsize=10, va="bottom")
+            if row == 0:
+                panel.set_title(f"{kind}, {stacks(n)}", color=GREY, fontsize=10)
+            if column == 0:
+                panel.set_ylabel(name, color=GREY, fontsize=11)
+    figure.suptitle(f"{subject}: share of the lesion's contrast that is kept", color=GREY, fontsize=11)
+    save_figure(figure, path, dpi=100)
 
 
 def _section(
@@ -76,10 +83,3 @@ def _section(
     reach = np.ceil(half_mm / grid.spacing_mm).astype(int)
     plane = np.pad(volume[:, :, center[2]], ((reach[0], reach[0]), (reach[1], reach[1])))
     return plane[center[0] : center[0] + 2 * reach[0] + 1, center[1] : center[1] + 2 * reach[1] + 1]
-
-
-def _quiet(panel: Any) -> None:
-    panel.set_xticks([])
-    panel.set_yticks([])
-    for side in panel.spines.values():
-        side.set_visible(False)

@@ -22,7 +22,7 @@ from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from studies.lesions.volumes import Lesion, draw_lesions, kept, load_labels, with_lesions
-from studies.subjects import BRIGHT, SubjectSpec, _stretched
+from studies.subjects import BRIGHT, SubjectSpec, stretched
 
 MARGIN_VOXELS = 4
 MOTION = "mild"
@@ -77,26 +77,22 @@ class LesionRun:
             for k, lesion in enumerate(self.subject.lesions)
         ]
 
-    def line(self) -> str:
-        """Shares kept, for the terminal."""
-        parts = []
-        for k, lesion in enumerate(self.subject.lesions):
-            shares = "/".join(f"{of_all[k]:.2f}" for of_all in self.kept.values())
-            parts.append(f"{lesion.kind} {shares}")
-        return f"{'/'.join(self.kept)}: {', '.join(parts)}"
-
 
 def lesion_subject(volume: str, seed: int, atlas: Path) -> LesionSubject:
     """A head of the atlas, stretched, with lesions at places that the seed decides; sliced with and without.
 
+    Args:
+        volume: of the atlas.
+        seed: of stretch, lesions and slices.
+        atlas: its folder.
+
     Raises:
         InputError: the atlas lacks the volume or its label map.
     """
-    name = f"{MOTION}-{seed}-{volume.rsplit('/', 1)[-1]}"
     chosen = find_subjects(atlas, include=[volume])[0]
-    spec = SubjectSpec(name, volume, MOTION, seed)
+    spec = SubjectSpec(volume=volume, motion=MOTION, seed=seed)
     head = cropped(load_subject(chosen, spacing_mm=None), MARGIN_VOXELS)
-    healthy = _stretched(head, spec, np.random.default_rng(seed))
+    healthy = stretched(head, spec, np.random.default_rng(seed))
     labels = load_labels(chosen.image, chosen.mask, MARGIN_VOXELS).data
     lesions = draw_lesions(healthy, labels, BRIGHT, np.random.default_rng([seed, 1]))
     stacks = {
@@ -110,7 +106,7 @@ def lesion_subject(volume: str, seed: int, atlas: Path) -> LesionSubject:
         )
         for which, head in (("healthy", healthy), ("lesions", with_lesions(healthy, lesions)))
     }
-    return LesionSubject(name, healthy, tuple(lesions), stacks)
+    return LesionSubject(spec.name, healthy, tuple(lesions), stacks)
 
 
 def lesion_run(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_synth.motion import acquisition_order
 from g3r.evaluation.pose_error import PoseTable, SliceKey
+from studies.tables import new_figure, save_figure
 
 INTERLEAVE = 2
 """Of all cases: every other slice first."""
@@ -52,7 +53,13 @@ def places_in_time(n_slices: int, interleave: int = INTERLEAVE) -> NDArray[np.in
 def jerk_slices(
     true: PoseTable, points_mm: Mapping[SliceKey, NDArray[np.float64]], interleave: int = INTERLEAVE
 ) -> list[list[int]]:
-    """Stack and place in time of each first slice after a sudden movement, by the true poses."""
+    """Stack and place in time of each first slice after a sudden movement, by the true poses.
+
+    Args:
+        true: the true poses.
+        points_mm: [P, 3] points of each slice.
+        interleave: of the stacks.
+    """
     jerks = []
     for stack in sorted({n for n, _ in true.keys}):
         rows = {k: row for row, (n, k) in enumerate(true.keys) if n == stack}
@@ -67,13 +74,15 @@ def jerk_slices(
 
 
 def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = INTERLEAVE) -> None:
-    """Draw a panel per case of what `studies.motion.layers` measured, and write it as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    """Draw a panel per case of what `studies.motion.layers` measured, and write it as PNG.
 
+    Args:
+        cases: rows of its record.
+        path: PNG to write.
+        interleave: of the stacks.
+    """
     n_rows = (len(cases) + 1) // 2
-    figure = Figure(figsize=(12, 2.9 * n_rows + 0.7), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure((12, 2.9 * n_rows + 0.7))
     axes = figure.subplots(n_rows, min(2, len(cases)), squeeze=False, sharey=True)
     legend: dict[str, Any] = {}
     for axis, (name, case) in zip(axes.flat, cases.items(), strict=False):
@@ -111,8 +120,7 @@ def draw_slice_errors(cases: Mapping[str, Any], path: Path, interleave: int = IN
     figure.legend(
         legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False, markerscale=2
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _stack_starts(n_slices: Sequence[int]) -> list[int]:
@@ -126,7 +134,3 @@ def _dots(
     place = [places_in_time(n, interleave) for n in n_slices]
     x = [start[int(n)] + place[int(n)][int(k)] for n, k, _ in per_slice_mm]
     return np.array(x, dtype=np.float64), np.array([error for *_, error in per_slice_mm])
-
-
-if __name__ == "__main__":
-    raise SystemExit("run: python -m studies.motion.layers --figure PNG")

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from fnmatch import fnmatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
-from g3r.errors import InputError
-from studies.command import parser_of, run_command
-
-if TYPE_CHECKING:
-    from g3r.evaluation.case import SimulatedCase
-    from g3r.planning.presets import ReconstructionSettings
-    from studies.runs import Run
+from g3r.planning.presets import PRESETS, changed
+from studies.harness import FITS, Record, Row, Study, Task
+from studies.motion.figure import draw_slice_errors, jerk_slices
+from studies.runs import Run, reconstructed, registered
+from studies.subjects import case_folders, read_case
+from studies.tables import table
 
 Options = Mapping[str, Any]
-
 
 _ONE_START = {
     "registration.template": False,
@@ -69,109 +65,25 @@ WITHOUT: dict[str, Options] = {
 }
 """What is switched off, one at a time, in a whole reconstruction."""
 
-THICKNESS_MM = {"sb28-mild-gap": 3.0}
-"""Cases whose slices are thinner than their distance and that have no simulation.json to say so."""
 
-ORDER = ("*-none", "*-mild*", "*-moderate", "*-severe", "*-single")
-
-DEFAULT_FOLDER = Path("runs") / "bench" / "motion-layers"
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = parser_of(
-        "motion_layers",
-        "Pose errors after each layer of registration, and the volume with a layer left out, on "
-        "the cases in the folder that G3R_TEST_DATA names.",
-        DEFAULT_FOLDER,
-    )
-    parser.add_argument("--cases", nargs="+", metavar="GLOB", default=["*"], help="which of them")
-    parser.add_argument("--no-without", action="store_true", help="skip the runs with a layer left out")
-    parser.add_argument("--keep", action="store_true", help="keep cases that layers.json holds already")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw the error of every slice")
-    return parser
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """A measurement per case."""
+    for folder in case_folders(options.cases):
+        yield Task(folder.name, measure, (folder, options))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    options = build_parser().parse_args(argv)
-    return run_command("motion_layers", _run, options)
-
-
-def _run(options: argparse.Namespace) -> int:
-    from g3r.bench.record import available_cores, machine, use_threads
-    from g3r.evaluation.case import load_case
-    from studies.runs import preset_settings
-    from studies.subjects import test_data_folder
-
-    folders = case_folders(test_data_folder() / "cases", options.cases)
-    settings = preset_settings(options.preset)
-    threads = options.threads or available_cores()
-    use_threads(threads)
-    path = options.output / "layers.json"
-    record: dict[str, Any] = {"preset": options.preset, "threads": threads, "machine": machine(), "cases": {}}
-    if options.keep and path.is_file():
-        import json
-
-        record["cases"] = json.loads(path.read_text(encoding="utf-8"))["cases"]
-    for folder in folders:
-        if folder.name not in record["cases"]:
-            case = load_case(folder, THICKNESS_MM.get(folder.name))
-            without = {} if options.no_without else WITHOUT
-            record["cases"][folder.name] = measure_case(case, settings, without, options.ckpt)
-            write_json(path, record)
-    text = layer_tables(record)
-    write_text(options.output / "layers.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, "layers", text)
-    if options.figure:
-        from studies.motion.figure import draw_slice_errors
-
-        draw_slice_errors(record["cases"], options.figure)
-    return 0
-
-
-def case_folders(root: Path, patterns: Sequence[str]) -> list[Path]:
-    """The cases' folders, from no motion to much.
-
-    Raises:
-        InputError: none matches.
-    """
-    found = [f for f in sorted(root.glob("*")) if f.is_dir() and any(fnmatch(f.name, p) for p in patterns)]
-    if not found:
-        raise InputError(f"{root}: no case named {' or '.join(patterns)}; change --cases or G3R_TEST_DATA")
-
-    def rank(folder: Path) -> int:
-        return next((n for n, p in enumerate(ORDER) if fnmatch(folder.name, p)), len(ORDER))
-
-    return sorted(found, key=rank)
-
-
-def measure_case(
-    case: SimulatedCase, settings: ReconstructionSettings, without: Mapping[str, Options], ckpt: str | None
-) -> dict[str, Any]:
+def measure(folder: Path, options: argparse.Namespace) -> Row:
     """Errors after each layer, and scores with everything and with a layer left out."""
-    from g3r.planning.presets import changed
-    from studies.motion.figure import jerk_slices
-    from studies.runs import reconstructed, registered
-
+    case, settings = read_case(folder), PRESETS[options.preset]
     header = case.header_error()
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
-    everything: Run | None = None
     for layer in LAYERS:
-        changed_settings = changed(settings, layer.options)
-        if layer.full:
-            run = everything = reconstructed(case, changed_settings, ckpt)
-        else:
-            run = registered(case, changed_settings, ckpt)
+        run = (reconstructed if layer.full else registered)(case, changed(settings, layer.options), options.ckpt)
         layers[layer.name] = {**run.record(), "per_slice_mm": _listed(run.error.per_slice_mm)}
         print(_line(case.name, f"after {layer.name}", run), flush=True)
-    if everything is None:
-        everything = reconstructed(case, settings, ckpt)
-    runs = {"everything": everything}
-    for name, options in without.items():
-        runs[name] = reconstructed(case, changed(settings, options), ckpt)
+    runs = {"everything": run}  # the last layer is the product
+    for name, without in ({} if options.no_without else WITHOUT).items():
+        runs[name] = reconstructed(case, changed(settings, without), options.ckpt)
         print(_line(case.name, f"without {name}", runs[name]), flush=True)
     return {
         "layers": layers,
@@ -191,45 +103,41 @@ def _line(case: str, what: str, run: Run) -> str:
     return f"{case}, {what}: TRE {error.median_mm:.2f} / {error.p90_mm:.2f} mm{psnr}, {run.seconds:.0f} s"
 
 
-def layer_tables(record: Mapping[str, Any]) -> str:
-    """Two tables in Markdown: errors after each layer, volumes with a layer left out."""
-    cases: Mapping[str, Any] = record["cases"]
-    names = list(dict.fromkeys(name for case in cases.values() for name in case["layers"]))
-    errors = [
-        [case, *(_cell(figures["layers"].get(n), "{median_mm:.2f} / {p90_mm:.2f}") for n in names)]
-        for case, figures in cases.items()
+def tables(record: Record) -> dict[str, str]:
+    """Errors and seconds after each layer, volumes with a layer left out."""
+    rows = [{"case": case, **row} for case, row in record["rows"].items()]
+    layers = list(dict.fromkeys(name for row in rows for name in row["layers"]))
+    variants = list(dict.fromkeys(name for row in rows for name in row["without"]))
+
+    def cells(part: str, form: str, heads: Mapping[str, str]) -> str:
+        of = {head: form.replace("{", f"{{{part}[{name}]") for name, head in heads.items()}
+        return table(rows, {"case": "{case}", **of})
+
+    titles = {name: name if name == "everything" else f"without {name}" for name in variants}
+    parts = [
+        f"Preset `{record['preset']}`, {record['threads']} threads. "
+        "TRE after each layer, median / 90th percentile over slices in mm:",
+        cells("layers", "{[median_mm]:.2f} / {[p90_mm]:.2f}", {name: name for name in layers}),
+        "Wall seconds from the stacks to the end of that layer (of the last: to the volume):",
+        cells("layers", "{[seconds]:.0f}", {name: name for name in layers[1:]}),
+        "PSNR of the volume in dB (and median TRE in mm) with everything, and with one thing left out:",
+        cells("without", "{[psnr_db]:.2f} ({[median_mm]:.2f})", titles),
     ]
-    seconds = [
-        [case, *(_cell(figures["layers"].get(n), "{seconds:.0f}") for n in names[1:])]
-        for case, figures in cases.items()
-    ]
-    variants = list(dict.fromkeys(name for case in cases.values() for name in case["without"]))
-    volumes = [
-        [case, *(_cell(figures["without"].get(n), "{psnr_db:.2f} ({median_mm:.2f})") for n in variants)]
-        for case, figures in cases.items()
-    ]
-    titles = [name if name == "everything" else f"without {name}" for name in variants]
-    return "\n".join(
-        [
-            f"Preset `{record['preset']}`, {record['threads']} threads. "
-            "TRE after each layer, median / 90th percentile over slices in mm:",
-            "",
-            markdown_table(["case", *names], errors),
-            "",
-            "Wall seconds from the stacks to the end of that layer (of the last: to the volume):",
-            "",
-            markdown_table(["case", *names[1:]], seconds),
-            "",
-            "PSNR of the volume in dB (and median TRE in mm) with everything, and with one thing left out:",
-            "",
-            markdown_table(["case", *titles], volumes),
-        ]
-    )
+    return {"layers": "\n\n".join(parts)}
 
 
-def _cell(figures: Mapping[str, Any] | None, form: str) -> str:
-    return form.format(**figures) if figures else ""
-
+STUDY = Study(
+    name="motion.layers",
+    about="Pose errors after each layer of registration, and the volume with a layer left out, on the cases.",
+    document="motion.md",
+    picture="motion-tre.png",
+    shared=(*FITS, "--cases"),
+    options={"--no-without": {"action": "store_true", "help": "skip the runs with a layer left out"}},
+    settings=lambda options: {"without": not options.no_without},
+    tasks=tasks,
+    tables=tables,
+    figure=lambda record, options: draw_slice_errors(record["rows"], options.figure),
+)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(STUDY.main())

@@ -4,92 +4,64 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
-from studies.command import parser_of, run_command
-from studies.motion.layers import THICKNESS_MM
-from studies.prior.ablation import BASELINE, VARIANTS, measure
+from studies.harness import FITS, Record, Row, Study, Task
+from studies.prior.ablation import BASELINE, VARIANTS, line, measure
+from studies.subjects import case_folders, read_case
+from studies.tables import Cell, marked, table
 
 MAX_LOSS_DB = 0.1
 """From several stacks the prior may not cost more than this."""
 
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = parser_of(
-        "prior_cases",
-        "Every variant of studies.prior.ablation on the cases, with all their stacks.",
-        Path("runs") / "bench" / "prior-cases",
-    )
-    parser.add_argument("--cases", nargs="+", metavar="WORD", default=[""], help="names that contain one")
-    return parser
+PRODUCT = VARIANTS[-1]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return run_command("prior_cases", _run, build_parser().parse_args(argv))
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """A measurement per case."""
+    for folder in case_folders(options.cases):
+        yield Task(folder.name, measure_case, (folder, options))
 
 
-def _run(options: argparse.Namespace) -> int:
-    from g3r.bench.record import available_cores, machine, use_threads
-    from g3r.evaluation.case import load_case
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
-    from studies.prior.volumes import file_digest
-    from studies.runs import preset_settings
-    from studies.subjects import test_data_folder
+def measure_case(folder: Path, options: argparse.Namespace) -> Row:
+    """Every variant on one case, with all its stacks."""
+    case = read_case(folder)
+    return {"n_stacks": len(case.stacks), **measure(case, options)}
 
-    threads = options.threads or available_cores()
-    use_threads(threads)
-    settings = preset_settings(options.preset)
-    rows: dict[str, Any] = {}
-    record = {
-        "preset": options.preset,
-        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
-        "threads": threads,
-        "machine": machine(),
-        "cases": rows,
+
+def gain(row: Row) -> str:
+    """What the prior brings; a loss is marked (!)."""
+    value = row["scores"][PRODUCT]["psnr_db"] - row["scores"][BASELINE]["psnr_db"]
+    return marked(f"{value:+.2f}", value >= -MAX_LOSS_DB)
+
+
+def tables(record: Record) -> dict[str, str]:
+    """A row per case: dB of every variant, what the prior brings, median TRE."""
+    columns: dict[str, Cell] = {
+        "case": "{case}",
+        "stacks": "{n_stacks}",
+        **{name: f"{{scores[{name}][psnr_db]:.2f}}" for name in VARIANTS},
+        "prior brings": gain,
+        "SSIM": f"{{scores[{PRODUCT}][ssim]:.3f}}",
+        "TRE, mm": f"{{median_mm[{PRODUCT}]:.2f}}",
     }
-    for folder in sorted((test_data_folder() / "cases").iterdir()):
-        if not any(word in folder.name for word in options.cases):
-            continue
-        case = load_case(folder, THICKNESS_MM.get(folder.name))
-        rows[folder.name] = {"n_stacks": len(case.stacks), **measure(case, settings, options.ckpt)}
-        print(folder.name, rows[folder.name], flush=True)
-        write_json(options.output / "cases.json", record)
-    text = cases_table(record)
-    write_text(options.output / "cases.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, "cases", text)
-    return 0
+    text = table(({"case": case, **row} for case, row in record["rows"].items()), columns)
+    return {
+        "cases": f"dB; preset `{record['preset']}`, weights {record['weights']}. (!) marks a loss of more than "
+        f"{MAX_LOSS_DB:g} dB.\n\n{text}"
+    }
 
 
-def cases_table(record: Mapping[str, Any]) -> str:
-    """A row per case: dB of every variant, what the prior brings, median TRE; a loss is marked (!)."""
-    rows = []
-    for name, row in record["cases"].items():
-        psnr = {variant: row["scores"][variant]["psnr_db"] for variant in VARIANTS}
-        gain = psnr[VARIANTS[-1]] - psnr[BASELINE]
-        mark = " (!)" if gain < -MAX_LOSS_DB else ""
-        rows.append(
-            [
-                name,
-                row["n_stacks"],
-                *(f"{psnr[variant]:.2f}" for variant in VARIANTS),
-                f"{gain:+.2f}{mark}",
-                f"{row['scores'][VARIANTS[-1]]['ssim']:.3f}",
-                f"{row['median_mm'][VARIANTS[-1]]:.2f}",
-            ]
-        )
-    head = ["case", "stacks", *VARIANTS, "prior brings", "SSIM", "TRE, mm"]
-    return (
-        f"dB; preset `{record['preset']}`, weights {record['weights']}. (!) marks a loss of more than "
-        f"{MAX_LOSS_DB:g} dB.\n\n{markdown_table(head, rows)}"
-    )
-
+STUDY = Study(
+    name="prior.cases",
+    about="Every variant of studies.prior.ablation on the cases, with all their stacks.",
+    document="prior.md",
+    shared=(*FITS, "--cases"),
+    tasks=tasks,
+    line=line,
+    tables=tables,
+)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(STUDY.main())

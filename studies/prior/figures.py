@@ -1,37 +1,34 @@
-"""Figures of the prior's benchmarks."""
+"""Figures of the studies of the prior."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from studies.tables import new_figure, save_figure, stacks
+
 COLOURS = ("#9a9a9a", "#c58a3a", "#2f9e6e", "#4a4a4a", "#5b8fd6", "#c0392b", "#8e5bb5", "#17a2b8")
 SIDEWAYS = 0.05
 """Points of different lines stand this far beside each other, in numbers of stacks."""
 
 
-def draw_ablation(rows: Mapping[str, Any], variants: Sequence[str], baseline: str, path: Path) -> None:
+def draw_ablation(rows: Sequence[Mapping[str, Any]], variants: Sequence[str], baseline: str, path: Path) -> None:
     """PSNR and SSIM by the number of stacks, a line per variant with its spread, and the paired difference.
 
     Args:
-        rows: subject -> number of stacks (as text) -> `scores` -> variant -> `psnr_db`, `ssim`.
+        rows: `n_stacks` and `scores` -> variant -> `psnr_db`, `ssim`.
         variants: lines, in the order of the legend.
         baseline: what the paired differences are taken to.
         path: PNG to write, whole or not at all.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    numbers = sorted({int(n) for of in rows.values() for n in of})
-    figure, panels = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+    numbers = sorted({row["n_stacks"] for row in rows})
+    figure = new_figure((13, 4.2))
+    panels = figure.subplots(1, 3)
     for place, variant in enumerate(variants):
-        of_number = [[of[str(n)]["scores"] for of in rows.values() if str(n) in of] for n in numbers]
+        of_number = [[row["scores"] for row in rows if row["n_stacks"] == n] for n in numbers]
         shift = SIDEWAYS * (place - (len(variants) - 1) / 2)
         psnr = [[one[variant]["psnr_db"] for one in found] for found in of_number]
         ssim = [[one[variant]["ssim"] for one in found] for found in of_number]
@@ -68,8 +65,7 @@ def draw_ablation(rows: Mapping[str, Any], variants: Sequence[str], baseline: st
         panel.grid(alpha=0.25)
     panels[2].axhline(0, color=COLOURS[3], linewidth=1)
     panels[0].legend(fontsize=8, loc="best")
-    _save(figure, path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def draw_networks(record: Mapping[str, Any], path: Path) -> None:
@@ -79,27 +75,24 @@ def draw_networks(record: Mapping[str, Any], path: Path) -> None:
         record: of `studies.prior.networks`.
         path: PNG to write, whole or not at all.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    coarse, variants = record["baselines"]["V_coarse"], record["variants"]
-    scores = {"V_sharp": record["baselines"]["V_sharp"]} | {n: one["scores"] for n, one in variants.items()}
+    scores = {name: row["scores"] for name, row in record["rows"].items()}
+    coarse = scores.pop("V_coarse")
     numbers = [n for n in coarse if n != "all"]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.4), layout="constrained", width_ratios=(3, 2))
+    figure = new_figure((12, 4.4))
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     rows = np.arange(len(scores))
     thick = 0.8 / len(numbers)
     for place, n in enumerate(numbers):
         gain = [of[n]["psnr_db"] - coarse[n]["psnr_db"] if n in of else 0.0 for of in scores.values()]
-        label = f"{n} stack{'s' * (n != '1')}"
-        left.barh(rows + thick * place - 0.4, gain, thick, align="edge", color=COLOURS[4 - place], label=label)
+        left.barh(rows + thick * place - 0.4, gain, thick, align="edge", color=COLOURS[4 - place], label=stacks(int(n)))
     left.set_yticks(rows, list(scores), fontsize=9)
     left.invert_yaxis()
     left.set_title("PSNR gained over V_coarse (dB)", fontsize=10)
     left.legend(fontsize=8)
     left.grid(alpha=0.25, axis="x")
-    sizes = sorted((one["seconds"], one["scores"]["all"]["l1"], n) for n, one in variants.items() if one["is_size"])
+    sizes = sorted(
+        (one["seconds"], one["scores"]["all"]["l1"], n) for n, one in record["rows"].items() if one.get("is_size")
+    )
     right.plot([s for s, _, _ in sizes], [error for _, error, _ in sizes], "o-", color=COLOURS[5])
     for seconds, error, name in sizes:
         right.annotate(name, (seconds, error), textcoords="offset points", xytext=(6, 6), fontsize=8)
@@ -108,16 +101,8 @@ def draw_networks(record: Mapping[str, Any], path: Path) -> None:
     right.set_xlabel(f"seconds for a 36-week brain, {record['threads']} threads")
     right.set_ylabel("mean absolute error in the mask")
     right.grid(alpha=0.25)
-    _save(figure, path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def _deviation(values: Sequence[float]) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-
-def _save(figure: Any, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    figure.savefig(beside, dpi=110)
-    os.replace(beside, path)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
+
+import yaml
 
 from g3r.errors import InputError
 
@@ -26,14 +29,24 @@ REPEATS = 3
 EXPORTED = "prior.pt"
 
 
-def validation_volumes(
-    source: Path, cache: Path, val_subjects: int, config: Mapping[str, Any]
-) -> list[dict[str, Tensor]]:
-    """The volumes that every variant is compared on: those that its training validated on."""
+BASELINES = {"V_coarse": "coarse", "V_sharp": "sharp"}
+"""What the network starts from, by its name in a validation volume."""
+
+
+@functools.cache
+def validation_volumes(source: Path, cache: Path, val_subjects: int, config: Path) -> list[dict[str, Tensor]]:
+    """The volumes that every variant is compared on: those that its training validated on.
+
+    Args:
+        source: folder of the atlas.
+        cache: folder of synthetic subjects.
+        val_subjects: number of volumes.
+        config: of the training.
+    """
     from data_synth.prior_data import StackSynthesisDataModule
 
     settings = {
-        **config["data"]["init_args"],
+        **yaml.safe_load(config.read_text(encoding="utf-8"))["data"]["init_args"],
         "source": str(source),
         "cache": str(cache),
         "val_subjects": val_subjects,
@@ -44,7 +57,13 @@ def validation_volumes(
 
 
 def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
-    """Export a variant and score it: errors by number of stacks, seconds for a whole brain, its size."""
+    """Export a variant and score it: errors by number of stacks, seconds for a whole brain, its size.
+
+    Args:
+        checkpoint: of the training.
+        run: folder of the variant.
+        volumes: to score it on.
+    """
     import torch
 
     from g3r.cli import export
@@ -83,14 +102,6 @@ def inference_seconds(exported: Path) -> float:
         estimate_prior(network, *inputs)
         seconds.append(time.perf_counter() - start)
     return round(min(seconds), 2)
-
-
-def baseline_scores(volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
-    """What the network starts from, scored alike."""
-    return {
-        name: scores_by_stacks([one[key] for one in volumes], volumes)
-        for name, key in (("V_coarse", "coarse"), ("V_sharp", "sharp"))
-    }
 
 
 def scores_by_stacks(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, dict[str, float]]:

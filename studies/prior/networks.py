@@ -7,29 +7,32 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from g3r.bench.record import markdown_table, put_between_markers, write_json, write_text
+import yaml
+
+from g3r.bench.record import available_cores, machine
 from g3r.errors import InputError
-from studies.command import parser_of, run_command
+from studies.harness import Record, Row, Study, Task, positive
+from studies.prior.figures import draw_networks
 from studies.prior.network_scores import (
+    BASELINES,
     EXPORTED,
     LEFT_OUT,
     SPEED_SHAPE,
     VALIDATED_ON,
-    baseline_scores,
     evaluate,
     inference_seconds,
+    scores_by_stacks,
     validation_volumes,
 )
+from studies.subjects import REPOSITORY, data_folder
+from studies.tables import Cell, stacks, table
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-CONFIG = Path(__file__).resolve().parents[2] / "lightning_configs" / "prior.yaml"
+CONFIG = REPOSITORY / "lightning_configs" / "prior.yaml"
 
 
 @dataclass(frozen=True)
@@ -62,109 +65,66 @@ VARIANTS = (
     Variant("size-32-64-96", "channels 32, 64, 96", {"channels": [32, 64, 96]}, is_size=True),
     Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
 )
-
-DEFAULT_FOLDER = Path("runs") / "bench" / "prior-networks"
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = parser_of(
-        "prior_networks",
-        "Train variants of the prior network for the same number of steps on the same subjects and seed, and "
-        "compare them on the validation volumes. Finished ones are kept, interrupted ones go on. Needs "
-        "the atlas in the folder that G3R_TEST_DATA names, or --source.",
-        DEFAULT_FOLDER,
-    )
-    parser.add_argument("--steps", type=int, default=384, metavar="N", help="of the optimiser, to whole epochs")
-    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help=", ".join(names(VARIANTS)))
-    parser.add_argument("--source", type=Path, help="atlas folder (None: the one of the test data)")
-    parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="synthetic subjects")
-    parser.add_argument("--val-subjects", type=int, default=9, metavar="N", help="volumes to compare on")
-    parser.add_argument("--no-train", action="store_true", help="only the table and the figure")
-    parser.add_argument("--retime", action="store_true", help="measure all seconds again, on a quiet machine")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw errors and seconds")
-    parser.add_argument(
-        "train_args", nargs="*", metavar="-- ARG", help="more arguments of g3r-pretrain, such as --data.batch_size=2"
-    )
-    return parser
+NAMES = tuple(variant.name for variant in VARIANTS)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    parser = build_parser()
-    options = parser.parse_args(argv)
-    unknown = set(options.only) - set(names(VARIANTS))
-    if unknown:
-        parser.error(f"--only {' '.join(sorted(unknown))}; expected {', '.join(names(VARIANTS))}")
-    if options.steps < 1:
-        parser.error(f"--steps {options.steps}; expected at least 1")
-    return run_command("prior_networks", _run, options)
+def configuration() -> dict[str, Any]:
+    """The training that the variants differ from."""
+    return dict(yaml.safe_load(CONFIG.read_text(encoding="utf-8")))
 
 
-def names(variants: Iterable[Variant]) -> list[str]:
-    """Their names."""
-    return [variant.name for variant in variants]
+def settings(options: argparse.Namespace) -> Record:
+    """What all variants share; a table made later takes it from the record."""
+    if options.no_train:
+        return {}
+    epochs = epochs_of(options.steps, configuration(), options.train_args)
+    return {"epochs": epochs, "arguments": options.train_args}
 
 
-def _run(options: argparse.Namespace) -> int:
-    import yaml
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """What the network starts from, and the variants."""
+    if options.no_train:
+        return
+    config = configuration()
+    source = options.source or data_folder("atlas")
+    data = (source, options.cache, options.val_subjects)
+    for name in BASELINES:
+        yield Task(name, baseline, (name, data))
+    n_epochs = epochs_of(options.steps, config, options.train_args)
+    for variant in distinct_variants(config):
+        if variant.name in options.only:
+            yield Task(variant.name, measure, (variant, n_epochs, data, options))
 
-    from g3r.bench.record import available_cores, machine, use_threads
-    from studies.subjects import test_data_folder
 
-    config = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
-    threads = options.threads or available_cores()
-    path = options.output / "networks.json"
-    record: dict[str, Any] = {"threads": threads, "machine": machine(), "baselines": {}, "variants": {}}
-    if path.is_file():
-        record |= json.loads(path.read_text(encoding="utf-8"))
-    use_threads(threads)
-    if not options.no_train:
-        source = options.source or test_data_folder() / "atlas"
-        data = data_arguments(source, options.cache, options.val_subjects)
-        record["arguments"] = options.train_args
-        n_epochs = epochs_of(options.steps, config, options.train_args)
-        volumes: list[dict[str, Tensor]] = []
-        for variant in distinct_variants(config):
-            if options.only and variant.name not in options.only:
-                continue
-            kept = record["variants"].get(variant.name, {})
-            if kept.get("epochs") == n_epochs and kept.get("options") == dict(variant.options):
-                print(f"{variant.name}: kept")
-                continue
-            run = options.output / variant.name
-            checkpoint, seconds = train(variant, run, n_epochs, [*data, *options.train_args])
-            if checkpoint is None:
-                print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
-                continue
-            volumes = volumes or validation_volumes(source, options.cache, options.val_subjects, config)
-            record["baselines"] = record["baselines"] or baseline_scores(volumes)
-            record["variants"][variant.name] = {
-                "what": variant.what,
-                "options": dict(variant.options),
-                "is_size": variant.is_size,
-                "epochs": n_epochs,
-                "train_seconds": round(seconds),
-                **evaluate(checkpoint, run, volumes),
-            }
-            write_json(path, record)
-    if not record["variants"]:
-        raise InputError(f"{path}: holds no trained variant; leave out --no-train")
+def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
+    """Scores of one of the volumes that the network starts from."""
+    volumes = validation_volumes(*data, CONFIG)
+    return {"scores": scores_by_stacks([one[BASELINES[name]] for one in volumes], volumes)}
+
+
+def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], options: argparse.Namespace) -> Row | None:
+    """Train and score one variant."""
+    run = options.output / variant.name
+    checkpoint, seconds = train(variant, run, n_epochs, [*data_arguments(*data), *options.train_args])
+    if checkpoint is None:
+        print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
+        return None
+    return {
+        "what": variant.what,
+        "options": dict(variant.options),
+        "is_size": variant.is_size,
+        "train_seconds": round(seconds),
+        **evaluate(checkpoint, run, validation_volumes(*data, CONFIG)),
+    }
+
+
+def finish(record: Record, options: argparse.Namespace) -> None:
+    """Measure the seconds of all variants again, if asked."""
     if options.retime:
-        record |= {"threads": threads, "machine": machine()}
-        for name, one in record["variants"].items():
-            one["seconds"] = inference_seconds(options.output / name / EXPORTED)
-        write_json(path, record)
-    text = network_tables(record)
-    write_text(options.output / "networks.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, "networks", text)
-    if options.figure:
-        from studies.prior.figures import draw_networks
-
-        draw_networks(record, options.figure)
-    return 0
+        record |= {"threads": options.threads or available_cores(), "machine": machine()}
+        for name, row in record["rows"].items():
+            if "seconds" in row:
+                row["seconds"] = inference_seconds(options.output / name / EXPORTED)
 
 
 def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
@@ -195,7 +155,13 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
 
 
 def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
-    """What all variants are told about their data."""
+    """What all variants are told about their data.
+
+    Args:
+        source: folder of the atlas.
+        cache: folder of synthetic subjects.
+        val_subjects: number of volumes of validation.
+    """
     listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
     return [
         f"--data.source={source}",
@@ -208,19 +174,19 @@ def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
 def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
     """Train a variant in a process of its own, going on where an earlier one stopped.
 
+    Args:
+        variant: to be trained.
+        run: its folder.
+        n_epochs: of training.
+        arguments: of g3r-pretrain.
+
     Returns:
         Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
     """
     run.mkdir(parents=True, exist_ok=True)
     last = newest_checkpoint(run)
     command = [
-        sys.executable,
-        "-m",
-        "g3r.cli.pretrain",
-        "fit",
-        "--config",
-        str(CONFIG),
-        *arguments,
+        *(sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(CONFIG), *arguments),
         *(f"--model.{name}={json.dumps(value)}" for name, value in variant.options.items()),
         f"--trainer.max_epochs={n_epochs}",
         "--trainer.max_time=null",
@@ -232,7 +198,7 @@ def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) 
     print(f"{variant.name}: {'going on' if last else 'training'}, {n_epochs} epochs", flush=True)
     start = time.perf_counter()
     with (run / "train.log").open("ab") as log:
-        done = subprocess.run(command, cwd=CONFIG.parents[2], stdout=log, stderr=log, check=False)
+        done = subprocess.run(command, cwd=REPOSITORY, stdout=log, stderr=log, check=False)
     seconds = time.perf_counter() - start
     return (newest_checkpoint(run) if done.returncode == 0 else None), seconds
 
@@ -243,44 +209,64 @@ def newest_checkpoint(run: Path) -> Path | None:
     return found[-1] if found else None
 
 
-def network_tables(record: Mapping[str, Any]) -> str:
-    """A row per variant in Markdown, those it starts from first."""
-    variants: Mapping[str, Any] = record["variants"]
-    ordered = [name for name in names(VARIANTS) if name in variants]
-    numbers = sorted(n for n in variants[ordered[0]]["scores"] if n != "all")
-    head = ["", "differs by", "L1", *(f"{n} stack{'s' * (n != '1')}, dB" for n in numbers), "all, dB", "SSIM"]
-    head += ["weights", "s per brain", "steps", "trained, min"]
-    rows = [[name, "", *_score_cells(scores, numbers), "", "", "", ""] for name, scores in record["baselines"].items()]
-    for name in ordered:
-        one = variants[name]
-        rows.append(
-            [
-                name,
-                one["what"],
-                *_score_cells(one["scores"], numbers),
-                f"{one['parameters'] / 1e6:.2f} M",
-                f"{one['seconds']:.1f}",
-                one["steps"],
-                f"{one['train_seconds'] / 60:.0f}",
-            ]
-        )
+def tables(record: Record) -> dict[str, str]:
+    """A row per variant, those it starts from first.
+
+    Raises:
+        InputError: no variant has been trained.
+    """
+    ordered = [{"name": name, **record["rows"][name]} for name in (*BASELINES, *NAMES) if name in record["rows"]]
+    if not any("what" in row for row in ordered):
+        raise InputError("the record holds no trained variant; leave out --no-train")
+    numbers = sorted({n for row in ordered for n in row["scores"] if n != "all"})
+    columns: dict[str, Cell] = {
+        "": "{name}",
+        "differs by": "{what}",
+        "L1": "{scores[all][l1]:.4f}",
+        **{f"{stacks(int(n))}, dB": _psnr(n) for n in numbers},
+        "all, dB": "{scores[all][psnr_db]:.2f}",
+        "SSIM": "{scores[all][ssim]:.3f}",
+        "weights": lambda row: f"{row['parameters'] / 1e6:.2f} M" if "parameters" in row else "",
+        "s per brain": "{seconds:.1f}",
+        "steps": "{steps}",
+        "trained, min": lambda row: f"{row['train_seconds'] / 60:.0f}" if "train_seconds" in row else "",
+    }
     size = " x ".join(map(str, SPEED_SHAPE))
-    return "\n".join(
-        [
-            "Mean over the validation volumes, in the mask, in normalised intensities (PSNR: range 1); "
-            f"seconds for one view of {size} voxels on {record['threads']} threads. Trained with "
-            f"`{' '.join(record.get('arguments', [])) or 'the configuration as it is'}`.",
-            "",
-            markdown_table(head, rows),
-        ]
+    head = (
+        "Mean over the validation volumes, in the mask, in normalised intensities (PSNR: range 1); "
+        f"seconds for one view of {size} voxels on {record['threads']} threads. Trained with "
+        f"`{' '.join(record.get('arguments', [])) or 'the configuration as it is'}`."
     )
+    return {"networks": f"{head}\n\n{table(ordered, columns)}"}
 
 
-def _score_cells(scores: Mapping[str, Any], numbers: Sequence[str]) -> list[str]:
-    every = scores["all"]
-    of_number = [f"{scores[n]['psnr_db']:.2f}" if n in scores else "" for n in numbers]
-    return [f"{every['l1']:.4f}", *of_number, f"{every['psnr_db']:.2f}", f"{every['ssim']:.3f}"]
+def _psnr(n: str) -> Cell:
+    # no format: in its brackets a number is the place in a list
+    return lambda row: f"{row['scores'][n]['psnr_db']:.2f}" if n in row["scores"] else ""
 
+
+STUDY = Study(
+    name="prior.networks",
+    about="Train variants of the prior network for the same number of steps on the same subjects and seed, and "
+    "compare them on the validation volumes. Interrupted trainings go on where they stopped.",
+    document="prior.md",
+    picture="prior-networks.png",
+    shared=("--threads", "--cache"),
+    options={
+        "--steps": {"type": positive, "default": 384, "metavar": "N", "help": "of the optimiser, to whole epochs"},
+        "--only": {"nargs": "+", "choices": NAMES, "metavar": "NAME", "default": NAMES, "help": "of the variants"},
+        "--source": {"type": Path, "help": "atlas folder (None: the one of the test data)"},
+        "--val-subjects": {"type": positive, "default": 9, "metavar": "N", "help": "volumes to compare on"},
+        "--no-train": {"action": "store_true", "help": "only the table and the figure"},
+        "--retime": {"action": "store_true", "help": "measure all seconds again, on a quiet machine"},
+        "train_args": {"nargs": "*", "metavar": "-- ARG", "help": "more of g3r-pretrain: --data.batch_size=2"},
+    },
+    settings=settings,
+    tasks=tasks,
+    finish=finish,
+    tables=tables,
+    figure=lambda record, options: draw_networks(record, options.figure),
+)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(STUDY.main())

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from g3r.bench.record import machine, markdown_table, put_between_markers, write_json, write_text
 from g3r.bench.scores import quality
-from g3r.evaluation.case import load_case, pose_table
-from g3r.planning.presets import changed
+from g3r.evaluation.case import pose_table
+from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
-from studies.command import parser_of, run_command
-from studies.runs import preset_settings
+from studies.harness import FITS, Record, Row, Study, Task
+from studies.runs import registered_once
+from studies.subjects import chosen_folders, read_case
+from studies.tables import table
 
 STEPS = (10, 20, 40, 80, 160, 320)
 """Each is a fit of its own, so that its step sizes fall to their end."""
@@ -56,91 +58,71 @@ def steps_to_near(steps: Sequence[int], psnr_db: Sequence[float], goal_db: float
     return None
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = parser_of(
-        "fit_convergence",
-        "Fit subjects with more and more steps, in several ways, after one registration that all share.",
-        Path("runs") / "bench" / "fit-convergence",
-    )
-    parser.add_argument("cases", nargs="+", type=Path, metavar="CASE", help="folder written by g3r-simulate")
-    return parser
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return run_command("fit_convergence", _run, build_parser().parse_args(argv))
-
-
-def _run(options: argparse.Namespace) -> int:
-    settings = preset_settings(options.preset)
-    record: dict[str, Any] = {"preset": options.preset, "machine": machine(), "cases": {}}
-    for folder in options.cases:
-        case = load_case(folder)
-        motion = GaussianReconstructor(options.ckpt, settings).register_stacks(case.stacks)
-        rows = record["cases"].setdefault(case.name, {})
-        for name, options_of_way in WAYS.items():
-            rows[name] = []
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """Every number of steps of every way, case by case."""
+    for folder in chosen_folders(options.folders):
+        for way in WAYS:
             for n_steps in STEPS:
-                own = changed(settings, {**options_of_way, "slice_stage.n_steps": n_steps})
-                result = GaussianReconstructor(options.ckpt, own).reconstruct(case.stacks, motion)
-                found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
-                seconds = result.record.cpu_seconds
-                rows[name].append(
-                    {
-                        "steps": n_steps,
-                        "n_gaussians": len(result.cloud),
-                        **found.record(),
-                        "cpu_s": seconds["fit to prior"] + seconds["fit to slices"],
-                    }
-                )
-                print(case.name, name, rows[name][-1], flush=True)
-                write_json(options.output / "convergence.json", record)
-    text = convergence_table(record)
-    write_text(options.output / "convergence.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, "convergence", text)
-    return 0
+                yield Task(f"{folder.name}, {way}, {n_steps} steps", measure, (folder, way, n_steps, options))
 
 
-def convergence_table(record: Mapping[str, Any]) -> str:
+def measure(folder: Path, way: str, n_steps: int, options: argparse.Namespace) -> Row:
+    """One fit, after a registration that all of a case share."""
+    case = read_case(folder)
+    motion = registered_once(folder, options.preset, options.ckpt)
+    own = changed(PRESETS[options.preset], {**WAYS[way], "slice_stage.n_steps": n_steps})
+    result = GaussianReconstructor(options.ckpt, own).reconstruct(case.stacks, motion)
+    found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
+    seconds = result.record.cpu_seconds
+    return {
+        "case": case.name,
+        "way": way,
+        "steps": n_steps,
+        "n_gaussians": len(result.cloud),
+        **found.record(),
+        "cpu_s": seconds["fit to prior"] + seconds["fit to slices"],
+    }
+
+
+def tables(record: Record) -> dict[str, str]:
     """For each case and way: dB by steps, and steps and CPU seconds to within 0.1 dB of the best of all."""
+    entries = list(record["rows"].values())
+    best = {case: max(e["psnr_db"] for e in entries if e["case"] == case) for case in {e["case"] for e in entries}}
     rows = []
-    for case, ways in record["cases"].items():
-        best = max(entry["psnr_db"] for entries in ways.values() for entry in entries)
-        for name, entries in ways.items():
-            steps = [entry["steps"] for entry in entries]
-            psnr = [entry["psnr_db"] for entry in entries]
-            own, common = steps_to_near(steps, psnr, max(psnr)), steps_to_near(steps, psnr, best)
-            seconds = None
-            if common is not None:
-                seconds = float(np.interp(np.log(common), np.log(steps), [e["cpu_s"] for e in entries]))
-            rows.append(
-                [
-                    case,
-                    name,
-                    entries[-1]["n_gaussians"],
-                    *(f"{value:.2f}" for value in psnr),
-                    f"{own:.0f}",
-                    "never" if common is None else f"{common:.0f}",
-                    "" if seconds is None else f"{seconds:.1f}",
-                ]
-            )
-    head = [
-        "case",
-        "fit",
-        "Gaussians",
-        *(f"{n} steps, dB" for n in STEPS),
-        "steps to its own best",
-        "to the best of all",
-        "CPU s of both stages for it",
-    ]
-    return (
-        f"Preset `{record['preset']}`; steps of the slice stage to within {NEAR_DB:g} dB, interpolated on "
-        f"their logarithm.\n\n{markdown_table(head, rows)}"
+    for case, way in dict.fromkeys((e["case"], e["way"]) for e in entries):
+        of = sorted((e for e in entries if (e["case"], e["way"]) == (case, way)), key=lambda e: e["steps"])
+        steps, psnr = [e["steps"] for e in of], [e["psnr_db"] for e in of]
+        row: Row = {"case": case, "way": way, "n_gaussians": of[-1]["n_gaussians"]}
+        row |= {f"{e['steps']} steps": e["psnr_db"] for e in of} | {"own": steps_to_near(steps, psnr, max(psnr))}
+        common = steps_to_near(steps, psnr, best[case])
+        if common is not None:
+            seconds = float(np.interp(np.log(common), np.log(steps), [e["cpu_s"] for e in of]))
+            row |= {"common": common, "cpu_s": seconds}
+        rows.append(row)
+    columns: dict[str, Any] = {
+        "case": "{case}",
+        "fit": "{way}",
+        "Gaussians": "{n_gaussians}",
+        **{f"{n} steps, dB": f"{{{n} steps:.2f}}" for n in STEPS},
+        "steps to its own best": "{own:.0f}",
+        "to the best of all": lambda row: f"{row['common']:.0f}" if "common" in row else "never",
+        "CPU s of both stages for it": "{cpu_s:.1f}",
+    }
+    head = (
+        f"Preset `{record['preset']}`; steps of the slice stage to within {NEAR_DB:g} dB, interpolated on their "
+        "logarithm."
     )
+    return {"convergence": f"{head}\n\n{table(rows, columns)}"}
 
+
+STUDY = Study(
+    name="tradeoff.convergence",
+    about="Fit subjects with more and more steps, in several ways, after one registration that all share.",
+    document="tradeoff.md",
+    shared=(*FITS, "folders"),
+    tasks=tasks,
+    tables=tables,
+)
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(STUDY.main())

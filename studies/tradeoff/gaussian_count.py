@@ -1,14 +1,12 @@
-"""How many Gaussians a volume needs: PSNR against their number, by error bound and on a uniform lattice."""
+"""`python -m studies.tradeoff.gaussian_count`: how many Gaussians a volume needs, by error bound and on a lattice."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +14,15 @@ from numpy.typing import NDArray
 
 from data_synth.atlas import find_subjects, load_subject
 from data_synth.phantom import fetal_brain_phantom
-from g3r.bench.record import machine, markdown_table, put_between_markers, write_json
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior, solve_amplitudes_on
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
-from studies.command import run_command
-from studies.subjects import REPOSITORY, test_data_folder
+from studies.harness import Record, Row, Study, Task
+from studies.subjects import data_folder
+from studies.tables import new_figure, save_figure, table
 
 Subject = tuple[NDArray[np.float32], NDArray[np.bool_], VolumeGrid]
 
@@ -64,7 +62,7 @@ def atlas(voxel_mm: float) -> Subject:
     Raises:
         InputError: no test data.
     """
-    found = find_subjects(test_data_folder() / "atlas", include=[ATLAS_SUBJECT])
+    found = find_subjects(data_folder("atlas"), include=[ATLAS_SUBJECT])
     truth = load_subject(found[0], spacing_mm=voxel_mm)
     return truth.data, truth.mask, VolumeGrid(truth.data.shape, truth.affine)
 
@@ -88,7 +86,15 @@ def psnr_db(cloud: GaussianCloud, target: VolumeTarget) -> float:
 def lattice_cloud(
     subject: Subject, spacing_mm: float, n_steps: int, amplitude_iterations: int, seed: int
 ) -> GaussianCloud:
-    """A uniform lattice with as many optimiser and conjugate-gradient steps as the adaptive cloud had."""
+    """A uniform lattice with as many optimiser and conjugate-gradient steps as the adaptive cloud had.
+
+    Args:
+        subject: volume [I, J, K], mask and grid.
+        spacing_mm: of the lattice.
+        n_steps: of the optimiser.
+        amplitude_iterations: of conjugate gradients.
+        seed: of the planes that steps look at.
+    """
     volume, mask, grid = subject
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     stage = replace(STAGE, n_steps=n_steps, amplitude_iterations=amplitude_iterations)
@@ -104,7 +110,14 @@ ADAPTIVE = AdaptiveSettings()
 
 
 def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
-    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds."""
+    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds.
+
+    Args:
+        subject: volume [I, J, K], mask and grid.
+        name: of the subject, which decides bounds and spacings.
+        voxel_mm: of its grid.
+        seed: of the fits.
+    """
     volume, mask, grid = subject
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     finest = FINEST_MM.get(name, 2.5 * voxel_mm)
@@ -141,46 +154,31 @@ def uniform_number(rows: Sequence[dict[str, Any]], psnr: float) -> float | None:
     return float(np.exp(np.interp(psnr, level, log_n)))
 
 
-def table(record: dict[str, Any]) -> str:
-    """The rows of the documentation: each adaptive cloud, and the lattice of equal PSNR."""
-    lines = []
-    for name, case in record["subjects"].items():
-        for row in case["adaptive"]:
+def tables(record: Record) -> dict[str, str]:
+    """Each adaptive cloud, and the lattice of equal PSNR."""
+    rows = []
+    for name, case in record["rows"].items():
+        for row in case.get("adaptive", []):
             needed = uniform_number(case["uniform"], row["psnr_db"])
-            lines.append(
-                [
-                    name,
-                    f"{row['bound']:g}",
-                    f"{row['psnr_db']:.1f}",
-                    row["n"],
-                    "outside the curve" if needed is None else f"{needed:.0f}",
-                    "-" if needed is None else f"{100 * row['n'] / needed:.0f} %",
-                    f"{row['n_seeded']} + {row['n_added']} - {row['n_dropped']} - {row['n_merged']}",
-                ]
-            )
-    head = [
-        "volume",
-        "bound",
-        "PSNR, dB",
-        "Gaussians",
-        "uniform, equal PSNR",
-        "ratio",
-        "seeded + added - dropped - merged",
-    ]
-    text = markdown_table(head, lines)
-    for name, reason in record["skipped"].items():
-        text += f"\n\n{name}: left out, {reason}"
-    return text
+            known = {} if needed is None else {"needed": needed, "percent": 100 * row["n"] / needed}
+            rows.append({"name": name, **row, **known})
+    columns: dict[str, Any] = {
+        "volume": "{name}",
+        "bound": "{bound:g}",
+        "PSNR, dB": "{psnr_db:.1f}",
+        "Gaussians": "{n}",
+        "uniform, equal PSNR": lambda row: f"{row['needed']:.0f}" if "needed" in row else "outside the curve",
+        "ratio": lambda row: f"{row['percent']:.0f} %" if "percent" in row else "-",
+        "seeded + added - dropped - merged": "{n_seeded} + {n_added} - {n_dropped} - {n_merged}",
+    }
+    skipped = [f"{name}: left out, {row['skipped']}" for name, row in record["rows"].items() if "skipped" in row]
+    return {"gaussian-count": "\n\n".join([table(rows, columns), *skipped])}
 
 
-def draw(record: dict[str, Any], path: Path) -> None:
+def draw(record: Record, options: argparse.Namespace) -> None:
     """A panel per subject: PSNR against number of Gaussians, both ways."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    cases = record["subjects"]
-    figure = Figure(figsize=(3.1 * len(cases), 3.3), layout="constrained")
-    FigureCanvasAgg(figure)
+    cases = {name: row for name, row in record["rows"].items() if "skipped" not in row}
+    figure = new_figure((3.1 * len(cases), 3.3))
     axes = figure.subplots(1, len(cases), squeeze=False)[0]
     for axis, (name, case) in zip(axes, cases.items(), strict=True):
         for kind, colour, mark in (("adaptive", "#0072b2", "o"), ("uniform", "#d55e00", "s")):
@@ -193,8 +191,7 @@ def draw(record: dict[str, Any], path: Path) -> None:
         axis.set_axisbelow(True)
     axes[0].set_ylabel("PSNR, dB")
     axes[0].legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, options.figure)
 
 
 def _say(name: str, kind: str, row: dict[str, Any]) -> None:
@@ -205,64 +202,38 @@ def _say(name: str, kind: str, row: dict[str, Any]) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> int:
-    """Measure, print the table, write what was asked for."""
-    unknown = sorted(set(options.subjects) - set(SUBJECTS))
-    if unknown:
-        raise InputError(f"--subjects {', '.join(unknown)}; expected some of: {'; '.join(SUBJECTS)}")
-    record: dict[str, Any] = {"machine": machine(), "voxel_mm": options.voxel, "subjects": {}, "skipped": {}}
-    path = options.output / "gaussian-count.json"
-    if options.reuse and path.is_file():
-        record["subjects"] = _finished(path, options.voxel)
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """Both curves of every subject."""
     for name in options.subjects or SUBJECTS:
-        if name in record["subjects"]:
-            continue
-        try:
-            subject = SUBJECTS[name](options.voxel)
-        except InputError as error:
-            if not name.startswith("atlas"):
-                raise
-            record["skipped"][name] = "no test data (set G3R_TEST_DATA to the folder with atlas/)"
-            print(f"gaussian_count: {name}: {error}", file=sys.stderr)
-            continue
-        record["subjects"][name] = curves(subject, name, options.voxel)
-        write_json(path, record)
-    text = table(record)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, "gaussian-count", text)
-    if options.figure:
-        draw(record, options.figure)
-    return 0
+        yield Task(name, measure, (name, options.voxel))
 
 
-def _finished(path: Path, voxel_mm: float) -> dict[str, Any]:
-    """Subjects that an earlier run has measured.
+def measure(name: str, voxel_mm: float) -> Row:
+    """Both curves of a subject; the one of the atlas is left out without test data."""
+    try:
+        subject = SUBJECTS[name](voxel_mm)
+    except InputError:
+        if not name.startswith("atlas"):
+            raise
+        return {"skipped": "no test data (set G3R_TEST_DATA to the folder with atlas/)"}
+    return curves(subject, name, voxel_mm)
 
-    Raises:
-        InputError: it measured them on other voxels.
-    """
-    found = json.loads(path.read_text(encoding="utf-8"))
-    if found["voxel_mm"] != voxel_mm:
-        raise InputError(f"{path}: voxels of {found['voxel_mm']} mm; expected {voxel_mm}; leave --reuse out")
-    return {name: found["subjects"][name] for name in SUBJECTS if name in found["subjects"]}
 
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line of `python -m studies.tradeoff.gaussian_count`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.gaussian_count",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--subjects", nargs="*", default=[], metavar="NAME", help="(none: all)")
-    parser.add_argument("--voxel", type=float, default=1.0, help="of phantoms, ball and atlas, mm")
-    parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "bench", help="for the JSON")
-    parser.add_argument("--reuse", action="store_true", help="take subjects that --output holds already")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw the curves")
-    return run_command("gaussian_count", run, parser.parse_args(argv))
-
+STUDY = Study(
+    name="tradeoff.gaussian_count",
+    about="How many Gaussians a volume needs: PSNR against their number, by error bound and on a uniform lattice.",
+    document="tradeoff.md",
+    picture="gaussian-count.png",
+    shared=("--threads",),
+    options={
+        "--subjects": {"nargs": "*", "choices": SUBJECTS, "default": [], "metavar": "NAME", "help": "(none: all)"},
+        "--voxel": {"type": float, "default": 1.0, "help": "of phantoms, ball and atlas, mm"},
+    },
+    settings=lambda options: {"voxel_mm": options.voxel},
+    tasks=tasks,
+    tables=tables,
+    figure=draw,
+)
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(STUDY.main())

@@ -1,29 +1,27 @@
-"""Memory as g3r-infer states it against what its process held, and runs below limits, on phantoms."""
+"""`python -m studies.tradeoff.memory`: memory as g3r-infer states it against what its process held, on phantoms."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from g3r.bench.command_run import infer_arguments, run_infer
-from g3r.bench.record import machine, machine_line, markdown_table, put_between_markers, write_json
+from g3r.bench.record import machine_line
 from g3r.evaluation.case import SimulatedCase, load_case
-from studies.command import run_command
+from studies.harness import Record, Row, Study, Task
+from studies.tables import table
 from studies.tradeoff.memory_limits import is_kept, limited_rows, limits_table
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 FIRST_SEED = 61200
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """A phantom, how it is scanned, and what is asked for."""
+    """A phantom, how it is scanned, and what is asked for; positional, as the rows of the table."""
 
     weeks: int
     n_stacks: int
@@ -31,6 +29,12 @@ class Configuration:
     voxel_mm: float
     threads: int = 1
     more: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        words = f"{self.weeks} weeks, {self.n_stacks} stacks, {self.preset}, {self.voxel_mm:g} mm"
+        return f"{words}, {self.threads} threads {' '.join(self.more)}".strip()
 
 
 CONFIGURATIONS = (
@@ -52,7 +56,13 @@ LIMITED = (Configuration(30, 3, "draft", 0.8), Configuration(30, 1, "draft", 0.5
 
 
 def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
-    """A simulated subject, made if it is not there."""
+    """A simulated subject, made if it is not there.
+
+    Args:
+        weeks: of gestation.
+        n_stacks: that it is scanned with.
+        folder: of all phantoms.
+    """
     from data_synth import cli as simulate
 
     where = folder / f"phantom-{weeks}-{n_stacks}"
@@ -63,7 +73,13 @@ def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
 
 
 def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
-    """Of g3r-infer."""
+    """Of g3r-infer.
+
+    Args:
+        one: what is asked for.
+        case: the phantom.
+        output: folder to write.
+    """
     return [
         *infer_arguments(case, one.preset, output),
         "--threads",
@@ -74,7 +90,7 @@ def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list
     ]
 
 
-def measured(one: Configuration, folder: Path) -> dict[str, Any]:
+def stated(one: Configuration, folder: Path) -> Row:
     """Stated and measured bytes of one run of the command."""
     case = phantom(one.weeks, one.n_stacks, folder)
     run = run_infer(arguments_for(one, case, folder / "out"), folder / "out")
@@ -93,68 +109,67 @@ def measured(one: Configuration, folder: Path) -> dict[str, Any]:
     }
 
 
-def table(record: dict[str, Any]) -> str:
-    """The record in Markdown."""
-    head = ("phantom", "stacks", "preset", "voxel", "threads", "stated", "most of it in", "measured", "ratio")
-    rows = [
-        (
-            f"{row['weeks']} weeks",
-            row["stacks"],
-            f"{row['preset']} {row['more']}".strip(),
-            f"{row['voxel_mm']:g} mm",
-            row["threads"],
-            f"{row['stated_bytes'] / 1e9:.2f} GB",
-            row["stage"],
-            f"{row['measured_bytes'] / 1e9:.2f} GB",
-            f"{row['stated_bytes'] / row['measured_bytes']:.2f}",
-        )
-        for row in record["rows"]
-    ]
-    return f"{markdown_table(head, rows)}\n\n{machine_line(record['machine'])}"
+def limited(one: Configuration, folder: Path) -> Row:
+    """The command without a limit and below several."""
+    case, output = phantom(one.weeks, one.n_stacks, folder), folder / "out"
+    name = f"{one.weeks} weeks, {one.n_stacks} stacks, {one.preset}, {one.voxel_mm:g} mm"
+    return {"limited": limited_rows(case, name, arguments_for(one, case, output), output)}
 
 
-def run(options: argparse.Namespace) -> int:
-    """Measure, print the tables; 1 if a statement, or a limit, is below what was held, or stated too much."""
-    path = options.output / "memory.json"
-    record: dict[str, Any] = {"machine": machine(2), "rows": [], "limited": []}
-    if options.part != "all" and path.is_file():  # the other part as it was measured before
-        record = json.loads(path.read_text(encoding="utf-8")) | {"machine": machine(2)}
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """The configurations, and those below limits."""
     if options.part != "limits":
-        record["rows"] = []
-        for one in CONFIGURATIONS:
-            print(f"memory: {one}", file=sys.stderr, flush=True)
-            record["rows"].append(measured(one, options.output))
-            write_json(path, record)
+        yield from (Task(one.name, stated, (one, options.output)) for one in CONFIGURATIONS)
     if options.part != "statement":
-        record["limited"] = []
-        for one in LIMITED:
-            print(f"memory: {one}, limited", file=sys.stderr, flush=True)
-            case, output = phantom(one.weeks, one.n_stacks, options.output), options.output / "out"
-            name = f"{one.weeks} weeks, {one.n_stacks} stacks, {one.preset}, {one.voxel_mm:g} mm"
-            record["limited"] += limited_rows(case, name, arguments_for(one, case, output), output)
-            write_json(path, record)
-    for name, text in (("memory", table(record)), ("memory-limits", limits_table(record["limited"]))):
-        print(f"{text}\n")
-        if options.docs:
-            put_between_markers(options.docs, name, text)
-    ratios = [row["stated_bytes"] / row["measured_bytes"] for row in record["rows"]] or [1.0]
-    good = min(ratios) >= 1 and max(ratios) <= options.most and all(map(is_kept, record["limited"]))
-    return 0 if good else 1
+        yield from (Task(f"{one.name}, limited", limited, (one, options.output)) for one in LIMITED)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line of `python -m studies.tradeoff.memory`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m studies.tradeoff.memory",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--output", type=Path, default=REPOSITORY / "runs" / "memory", help="for the record")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
-    parser.add_argument("--part", choices=("all", "statement", "limits"), default="all", help="of the tables")
-    parser.add_argument("--most", type=float, default=1.5, help="largest ratio of stated to measured")
-    return run_command("memory", run, parser.parse_args(argv))
+def parts(record: Record) -> tuple[list[Row], list[Row]]:
+    """Rows of the statements, and rows below limits."""
+    rows = record["rows"].values()
+    return [row for row in rows if "limited" not in row], [one for row in rows for one in row.get("limited", [])]
 
+
+def tables(record: Record) -> dict[str, str]:
+    """Statements against measurements, and runs below limits; each where it was measured."""
+    columns: dict[str, Any] = {
+        "phantom": "{weeks} weeks",
+        "stacks": "{stacks}",
+        "preset": lambda row: f"{row['preset']} {row['more']}".strip(),
+        "voxel": "{voxel_mm:g} mm",
+        "threads": "{threads}",
+        "stated": lambda row: f"{row['stated_bytes'] / 1e9:.2f} GB",
+        "most of it in": "{stage}",
+        "measured": lambda row: f"{row['measured_bytes'] / 1e9:.2f} GB",
+        "ratio": lambda row: f"{row['stated_bytes'] / row['measured_bytes']:.2f}",
+    }
+    statements, limits = parts(record)
+    texts = {"memory": f"{table(statements, columns)}\n\n{machine_line(record['machine'])}"} if statements else {}
+    return texts | ({"memory-limits": limits_table(limits)} if limits else {})
+
+
+def keeps_its_word(record: Record) -> bool:
+    """Whether no statement, and no limit, is below what was held, and none states too much."""
+    statements, limits = parts(record)
+    ratios = [row["stated_bytes"] / row["measured_bytes"] for row in statements] or [1.0]
+    return min(ratios) >= 1 and max(ratios) <= record["most"] and all(map(is_kept, limits))
+
+
+STUDY = Study(
+    name="tradeoff.memory",
+    about="Memory as g3r-infer states it against what its process held, and runs below limits, on phantoms. "
+    "Ends with 1 where a statement, or a limit, is below what was held, or too much is stated.",
+    document="tradeoff.md",
+    shared=(),
+    options={
+        "--part": {"choices": ("all", "statement", "limits"), "default": "all", "help": "of the tables"},
+        "--most": {"type": float, "default": 1.5, "help": "largest ratio of stated to measured"},
+    },
+    settings=lambda options: {"most": options.most},
+    tasks=tasks,
+    tables=tables,
+    verdict=keeps_its_word,
+)
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(STUDY.main())

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from g3r.bench.command_run import run_infer
-from g3r.bench.record import markdown_table
 from g3r.bench.scores import quality_of_folder
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase
+from studies.tables import table
 
 SHARES = (1.0, 0.9, 0.8, 0.7)
 """Limits, as shares of what is stated without one."""
@@ -61,23 +61,22 @@ def is_kept(row: dict[str, Any]) -> bool:
 
 def limits_table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows in Markdown."""
-    head = ("run", "limit", "stated", "measured", "CPU seconds", "PSNR, dB", "given up")
-    cells = []
-    for row in rows:
-        limit = "none" if row["limit_bytes"] is None else f"{row['limit_bytes'] / GB:.2f} GB"
+
+    def given_up(row: dict[str, Any]) -> str:
         if "refused" in row:
-            cells.append((row["name"], limit, "refused", "", "", "", row["refused"].split(";")[0]))
-            continue
-        changes = "; ".join(change.removeprefix("memory limit: ") for change in row["changes"])
-        cells.append(
-            (
-                row["name"],
-                limit,
-                f"{row['stated_bytes'] / GB:.2f} GB",
-                f"{row['measured_bytes'] / GB:.2f} GB",
-                f"{row['cpu_seconds']:.0f}",
-                f"{row['psnr_db']:.2f}",
-                changes or "nothing",
-            )
-        )
-    return markdown_table(head, cells)
+            return str(row["refused"]).split(";")[0]
+        return "; ".join(change.removeprefix("memory limit: ") for change in row["changes"]) or "nothing"
+
+    def gigabytes(row: dict[str, Any], key: str, otherwise: str) -> str:
+        return f"{row[key] / GB:.2f} GB" if row.get(key) is not None else otherwise
+
+    columns: dict[str, Any] = {
+        "run": "{name}",
+        "limit": lambda row: gigabytes(row, "limit_bytes", "none"),
+        "stated": lambda row: gigabytes(row, "stated_bytes", "refused"),
+        "measured": lambda row: gigabytes(row, "measured_bytes", ""),
+        "CPU seconds": "{cpu_seconds:.0f}",
+        "PSNR, dB": "{psnr_db:.2f}",
+        "given up": given_up,
+    }
+    return table(rows, columns)

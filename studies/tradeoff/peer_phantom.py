@@ -1,4 +1,4 @@
-"""`python -m studies.tradeoff.peer_phantom`: a small phantom case of the size that other methods were timed on.
+"""A small phantom case of the size that other methods were timed on: `python -m studies.tradeoff.peer_phantom`.
 
 A truth of 64^3 voxels of 0.8 mm and three stacks of 58 x 58 x 18 pixels of 0.8 x 0.8 x 2.4 mm, every slice at
 a pose of its own: the built-in phantom, shrunk until it fits.
@@ -19,7 +19,8 @@ from data_synth.atlas import TruthVolume
 from data_synth.export import check_output, save_simulation
 from data_synth.phantom import fetal_brain_phantom
 from data_synth.simulator import SimulatedStack, orthogonal_settings, simulate_stacks
-from studies.command import run_command
+from g3r.errors import G3RError
+from studies.harness import FOLDER
 from studies.subjects import BRIGHT
 
 WEEKS = 18.0
@@ -31,36 +32,43 @@ LENGTH_MM = 42.0
 """Longest axis of the head: it fits the stacks with two pixels to spare."""
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m studies.tradeoff.peer_phantom",
         description=__doc__.splitlines()[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "peer-phantom")
+    parser.add_argument("--output", type=Path, default=FOLDER / "peer-phantom")
     parser.add_argument("--seed", type=int, default=61000)
     parser.add_argument("--force", action="store_true", help="replace an earlier case in --output")
-    return parser
+    options = parser.parse_args(argv)
+    try:
+        write_case(options.output, options.seed, replace_it=options.force)
+    except G3RError as error:
+        print(f"peer_phantom: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return run_command("peer_phantom", _run, build_parser().parse_args(argv))
+def write_case(folder: Path, seed: int, *, replace_it: bool) -> None:
+    """Simulate the subject and write it.
 
-
-def _run(options: argparse.Namespace) -> int:
-    check_output(options.output, replace=options.force)
-    truth = small_head(options.seed)
+    Args:
+        folder: to write.
+        seed: of the phantom and of the motion.
+        replace_it: whether an earlier case there is replaced.
+    """
+    check_output(folder, replace=replace_it)
+    truth = small_head(seed)
     settings = orthogonal_settings(3, "moderate", resolution_mm=PIXEL_MM, thickness_mm=THICKNESS_MM)
-    rng = np.random.default_rng(options.seed)
+    rng = np.random.default_rng(seed)
     taken = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     stacks = [in_shape(one) for one in taken]
-    record = {"phantom": WEEKS, "seed": options.seed, "thickness_mm": THICKNESS_MM, "length_mm": LENGTH_MM}
-    save_simulation(options.output, truth, stacks, record, replace=options.force)
+    record = {"phantom": WEEKS, "seed": seed, "thickness_mm": THICKNESS_MM, "length_mm": LENGTH_MM}
+    save_simulation(folder, truth, stacks, record, replace=replace_it)
     shapes = ", ".join("x".join(map(str, one.stack.image.shape)) for one in stacks)
-    print(f"{options.output}: truth {'x'.join(map(str, truth.data.shape))}, stacks {shapes}")
-    return 0
+    print(f"{folder}: truth {'x'.join(map(str, truth.data.shape))}, stacks {shapes}")
 
 
 def small_head(seed: int) -> TruthVolume:
@@ -92,7 +100,13 @@ def in_shape(one: SimulatedStack) -> SimulatedStack:
 
 
 def _window(data: NDArray, low: Sequence[int], shape: Sequence[int]) -> NDArray:
-    """The box [low, low + shape) of an array, zero where it reaches beyond."""
+    """The box [low, low + shape) of an array, zero where it reaches beyond.
+
+    Args:
+        data: [I, J, K].
+        low: first index of the box, which may be negative.
+        shape: of the box.
+    """
     out = np.zeros(shape, data.dtype)
     inner = [slice(max(0, a), min(n, a + m)) for a, n, m in zip(low, data.shape, shape, strict=True)]
     there = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, low, strict=True))

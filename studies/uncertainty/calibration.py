@@ -1,69 +1,50 @@
-"""`python -m studies.uncertainty.calibration fit` and `check`: the calibration of uncertainty.nii.gz."""
+"""`python -m studies.uncertainty.calibration`: fit and check the calibration of uncertainty.nii.gz."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from g3r.bench.record import put_between_markers, write_json, write_text
-from studies.command import parser_of, run_command
+import numpy as np
 
-if TYPE_CHECKING:
-    from studies.uncertainty.data import Judged
-
-DEFAULT_FOLDER = Path("runs") / "bench" / "uncertainty"
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
-    parser = parser_of(
-        "uncertainty",
-        "fit: fit the coefficients of uncertainty.nii.gz to simulated subjects of the validation atlas and "
-        "write them into the package. check: compare stated uncertainty and error on subjects left out. "
-        "Subjects and their registrations are kept in --cache. Needs the atlas in the folder that "
-        "G3R_TEST_DATA names.",
-        DEFAULT_FOLDER,
-    )
-    parser.add_argument("task", choices=("fit", "check"))
-    parser.add_argument("--no-prior", action="store_true", help="for reconstructions without a prior")
-    parser.add_argument("--subjects", type=int, metavar="N", help="the first N alone (None: all)")
-    parser.add_argument("--cache", type=Path, default=DEFAULT_FOLDER / "subjects", help="simulated subjects")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw error against uncertainty (check)")
-    return parser
+from g3r._version import __version__
+from g3r.planning.presets import PRESETS, changed
+from g3r.reconstruct import GaussianReconstructor
+from g3r.uncertainty.error_model import fit_model, load_calibration, save_calibration, terms
+from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR, calibration
+from studies.harness import FITS, Record, Row, Study, Task, positive, weights
+from studies.uncertainty.data import NO_REGISTRATION, Judged, check_subjects, fit_subjects, judged, unregistered_subject
+from studies.uncertainty.figure import draw_calibration
+from studies.uncertainty.judgement import check_record, check_text
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    options = build_parser().parse_args(argv)
-    return run_command("uncertainty", _run, options)
+def model_name(options: argparse.Namespace) -> str:
+    """Which of the two sets of coefficients is meant."""
+    return WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
 
 
-def _run(options: argparse.Namespace) -> int:
-    from g3r.bench.record import available_cores, use_threads
-    from g3r.planning.presets import changed
-    from g3r.reconstruct import GaussianReconstructor
-    from studies.runs import preset_settings
-    from studies.subjects import test_data_folder
-    from studies.uncertainty.data import NO_REGISTRATION, check_recipes, fit_recipes, judged, unregistered_recipe
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """One: the coefficients, or the judgement of them."""
+    if options.task == "fit":
+        yield Task(f"fit, {model_name(options)}", fit, (options,))
+    else:
+        yield Task(model_name(options), check, (options,))
 
-    atlas = test_data_folder() / "atlas"
-    use_threads(options.threads or available_cores())
-    settings = replace(preset_settings(options.preset), use_prior=not options.no_prior)
+
+def reconstructed(options: argparse.Namespace, *, fitting: bool) -> list[Judged]:
+    """Every subject, voxel by voxel; of the check also one that is not registered."""
+    settings = replace(PRESETS[options.preset], use_prior=not options.no_prior)
     reconstructor = GaussianReconstructor(options.ckpt, settings)
-    fitting = options.task == "fit"
-    chosen = (fit_recipes() if fitting else check_recipes())[: options.subjects]
-    todo = [(*one, reconstructor) for one in chosen]
+    subjects = (fit_subjects() if fitting else check_subjects())[: options.subjects]
+    todo = [(*one, reconstructor) for one in subjects]
     if not fitting and not options.subjects:
         unregistered = GaussianReconstructor(options.ckpt, changed(settings, NO_REGISTRATION))
-        todo.append((*unregistered_recipe(), unregistered))
-    start, found = time.perf_counter(), []
+        todo.append((*unregistered_subject(), unregistered))
+    found = []
     for spec, n_stacks, by in todo:
-        one = judged(spec, n_stacks, by, atlas, options.cache, registered=by is reconstructor)
+        one = judged(spec, n_stacks, by, options.cache, registered=by is reconstructor)
         found.append(one)
         print(
             f"{one.label}: {one.psnr_db:.2f} dB, poses {one.median_mm:.2f} mm, mean error "
@@ -71,26 +52,18 @@ def _run(options: argparse.Namespace) -> int:
             f"(map {one.map_seconds:.1f} s)",
             flush=True,
         )
-    text = _fit(options, found) if fitting else _check(options, found)
-    print(text)
-    print(f"{time.perf_counter() - start:.0f} s")
-    return 0
+    return found
 
 
-def _fit(options: argparse.Namespace, found: list[Judged]) -> str:
+def fit(options: argparse.Namespace) -> Row:
     """Fit the coefficients, every subject counting the same; write them into the package."""
-    import numpy as np
-
-    from g3r._version import __version__
-    from g3r.uncertainty.error_model import fit_model, load_calibration, save_calibration, terms
-    from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR
-
+    found = reconstructed(options, fitting=True)
     of_each = [terms(one.predictors) for one in found]
     samples = {name: np.concatenate([one[name] for one in of_each]) for name in of_each[0]}
     error = np.concatenate([one.error for one in found])
     weight = np.concatenate([np.full(len(one.error), 1 / len(one.error)) for one in found])
     model = fit_model(samples, error, weight)
-    name = WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
+    name = model_name(options)
     models, records = load_calibration(CALIBRATION) if CALIBRATION.is_file() else ({}, {})
     records[name] = {
         "g3r": __version__,
@@ -98,46 +71,69 @@ def _fit(options: argparse.Namespace, found: list[Judged]) -> str:
         "prior": _weights(options),
         "voxels_per_subject": len(found[0].error),
         "subjects": [
-            {"volume": r.volume, "motion": r.motion, "seed": r.seed, "stacks": one.n_stacks}
+            {"volume": one.spec.volume, "motion": one.spec.motion, "seed": one.spec.seed, "stacks": one.n_stacks}
             for one in found
-            for r in [one.spec]
         ],
     }
     save_calibration(CALIBRATION, {**models, name: model}, records)
-    lines = [f"ln u = {model.intercept:.3f}", *(f"  + {b:.3f} {n}" for n, b in model.coefficients.items())]
-    return "\n".join([f"{name}, written to {CALIBRATION.name}:", *lines])
+    return {"intercept": model.intercept, "coefficients": model.coefficients}
 
 
-def _check(options: argparse.Namespace, found: list[Judged]) -> str:
-    """Judge the shipped coefficients; record, table and figure."""
-    import json
+def check(options: argparse.Namespace) -> Row:
+    """Judge the shipped coefficients on subjects left out."""
+    found = reconstructed(options, fitting=False)
+    judgement = check_record(found, calibration()[model_name(options)])
+    return {"preset": options.preset, "weights": _weights(options), **judgement}
 
-    from g3r.uncertainty.estimate import WITH_PRIOR, WITHOUT_PRIOR, calibration
-    from studies.uncertainty.judgement import check_record, check_text
 
-    name = WITHOUT_PRIOR if options.no_prior else WITH_PRIOR
-    path = options.output / "check.json"
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    record[name] = {"preset": options.preset, "weights": _weights(options), **check_record(found, calibration()[name])}
-    write_json(path, record)
-    text = check_text(record)
-    write_text(options.output / "check.md", text)
-    if options.docs:
-        put_between_markers(options.docs, "uncertainty", text)
-    if options.figure:
-        from studies.uncertainty.figure import draw_calibration
+def line(key: str, row: Row) -> str:
+    """The coefficients."""
+    parts = [f"ln u = {row['intercept']:.3f}", *(f"  + {b:.3f} {name}" for name, b in row["coefficients"].items())]
+    written = f", written to {CALIBRATION.name}" if key.startswith("fit") else ""
+    return "\n".join([f"{key}{written}:", *parts])
 
-        draw_calibration(record[name], options.figure)
-    return text
+
+def checked(record: Record) -> dict[str, Row]:
+    """The judgements of the record, with and without prior."""
+    return {name: record["rows"][name] for name in (WITH_PRIOR, WITHOUT_PRIOR) if name in record["rows"]}
+
+
+def tables(record: Record) -> dict[str, str]:
+    """The judgement, where there was one."""
+    found = checked(record)
+    return {"uncertainty": check_text(found)} if found else {}
+
+
+def draw(record: Record, options: argparse.Namespace) -> None:
+    """Error against uncertainty, of the check."""
+    if options.task == "check":
+        draw_calibration(record["rows"][model_name(options)], options.figure)
 
 
 def _weights(options: argparse.Namespace) -> str | None:
     """Which prior the figures belong to."""
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
-    from studies.prior.volumes import file_digest
+    return None if options.no_prior else weights(options.ckpt)
 
-    return None if options.no_prior else file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT))
 
+STUDY = Study(
+    name="uncertainty.calibration",
+    about="fit: fit the coefficients of uncertainty.nii.gz to simulated subjects of the validation atlas and "
+    "write them into the package. check: compare stated uncertainty and error on subjects left out. "
+    "Subjects and their registrations are kept in --cache.",
+    document="prior.md",
+    picture="uncertainty-calibration.png",
+    shared=(*FITS, "--cache"),
+    options={
+        "task": {"choices": ("fit", "check")},
+        "--no-prior": {"action": "store_true", "help": "for reconstructions without a prior"},
+        "--subjects": {"type": positive, "metavar": "N", "help": "the first N alone (None: all)"},
+    },
+    tasks=tasks,
+    line=line,
+    tables=tables,
+    figure=draw,
+    resumes=False,
+)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(STUDY.main())

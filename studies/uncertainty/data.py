@@ -1,4 +1,4 @@
-"""Simulated subjects that calibrate and check uncertainty.nii.gz: evidence and error of each voxel."""
+"""Simulated subjects that calibrate and check uncertainty.nii.gz: predictors and error of each voxel."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
 from g3r.evaluation.align import resample
-from g3r.evaluation.case import SimulatedCase, load_case
+from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.metrics import score
 from g3r.fitting.slice_stage import SliceFit
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from g3r.uncertainty.estimate import collect
-from studies.prior.volumes import refined_pose
-from studies.subjects import SubjectSpec, simulated_subject
+from studies.runs import aligned
+from studies.subjects import SubjectSpec, simulated_case
+from studies.tables import stacks
 
 FIT_VOLUMES = (
     ("spina-bifida/sb26-operated", 3, "mild", 51_200),
@@ -66,7 +67,7 @@ NO_REGISTRATION = {
 VOXELS_PER_SUBJECT = 40_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Judged:
     """One reconstruction, voxel by voxel.
 
@@ -97,46 +98,49 @@ class Judged:
     @property
     def label(self) -> str:
         """Subject and number of stacks."""
-        name = f"{self.spec.name}, {self.n_stacks} stack{'s' * (self.n_stacks > 1)}"
+        name = f"{self.spec.name}, {stacks(self.n_stacks)}"
         return name if self.registered else f"{name}, not registered"
 
 
-def fit_recipes() -> list[tuple[SubjectSpec, int]]:
+def fit_subjects() -> list[tuple[SubjectSpec, int]]:
     """Subjects of the fit with their number of stacks; always the same."""
-    return [_recipe(*one) for one in FIT_VOLUMES]
+    return [_subject(*one) for one in FIT_VOLUMES]
 
 
-def check_recipes() -> list[tuple[SubjectSpec, int]]:
+def check_subjects() -> list[tuple[SubjectSpec, int]]:
     """Subjects of the check with their number of stacks; always the same."""
-    return [_recipe(*one) for one in CHECK_VOLUMES]
+    return [_subject(*one) for one in CHECK_VOLUMES]
 
 
-def unregistered_recipe() -> tuple[SubjectSpec, int]:
+def unregistered_subject() -> tuple[SubjectSpec, int]:
     """The subject that the check leaves unregistered."""
-    return _recipe(*UNREGISTERED)
+    return _subject(*UNREGISTERED)
 
 
-def _recipe(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectSpec, int]:
-    name = f"{motion}-{seed}-{volume.rsplit('/', 1)[-1]}"
-    return SubjectSpec(name, volume, motion, seed), n_stacks
+def _subject(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectSpec, int]:
+    return SubjectSpec(volume=volume, motion=motion, seed=seed), n_stacks
 
 
 def judged(
-    spec: SubjectSpec,
-    n_stacks: int,
-    reconstructor: GaussianReconstructor,
-    atlas: Path,
-    cache: Path,
-    *,
-    registered: bool = True,
+    spec: SubjectSpec, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path, *, registered: bool = True
 ) -> Judged:
-    """Simulate, register (or take that from the cache), reconstruct and compare with the truth."""
-    case = load_case(simulated_subject(spec, atlas, cache))
+    """Simulate, register (or take that from the cache), reconstruct and compare with the truth.
+
+    Args:
+        spec: the subject.
+        n_stacks: of its stacks.
+        reconstructor: with or without prior.
+        cache: folder of simulated subjects and their registrations.
+        registered: False reconstructs from the headers.
+    """
+    case = simulated_case(spec, cache)
     motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
     start = time.perf_counter()
     result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
     pose_error = case.pose_error(result.slices)
-    truth_from_result = refined_pose(result.volume, result.grid, case.truth, case.truth_mask, pose_error.common)
+    alignment = aligned(case, result.volume, result.grid, pose_error.common).alignment
+    assert alignment is not None
+    truth_from_result = alignment.volume_from_reference.inverse() @ pose_error.common
     truth = resample(case.truth, result.grid, truth_from_result)
     mask = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
     both = result.mask & (resample(mask, result.grid, truth_from_result) > 0.5)
@@ -145,16 +149,16 @@ def judged(
     inside = np.flatnonzero(both[result.mask])
     chosen = np.sort(rng.choice(inside, min(VOXELS_PER_SUBJECT, len(inside)), replace=False))
     return Judged(
-        spec,
-        n_stacks,
-        {name: one[chosen] for name, one in predictors_of(result).items()},
-        error[result.mask][chosen],
-        score(result.volume, truth, both).psnr_db,
-        pose_error.median_mm,
-        result.record.registration is not None and result.record.registration.reliable,
-        time.perf_counter() - start,
-        result.record.cpu_seconds["uncertainty"],
-        registered,
+        spec=spec,
+        n_stacks=n_stacks,
+        predictors={name: one[chosen] for name, one in predictors_of(result).items()},
+        error=error[result.mask][chosen],
+        psnr_db=score(result.volume, truth, both).psnr_db,
+        median_mm=pose_error.median_mm,
+        reliable=result.record.registration is not None and result.record.registration.reliable,
+        seconds=time.perf_counter() - start,
+        map_seconds=result.record.cpu_seconds["uncertainty"],
+        registered=registered,
     )
 
 
@@ -165,6 +169,11 @@ def relative_error(
 
     One factor, since the scale of a reconstruction is arbitrary. The gain and offset that `g3r-evaluate` fits
     would hide errors: of a volume that has nothing to do with the truth they leave its mean.
+
+    Args:
+        volume: [I, J, K] of the reconstruction.
+        truth: [I, J, K] on the same grid.
+        mask: [I, J, K] where both are known.
     """
     factor = float(volume[mask].mean()) / float(truth[mask].mean())
     return volume.astype(np.float64) - factor * truth
@@ -189,7 +198,14 @@ def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]
 def cached_registration(
     case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
-    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
+    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept.
+
+    Args:
+        case: the subject.
+        n_stacks: of its stacks.
+        reconstructor: that registers them.
+        cache: folder to keep it in.
+    """
     path = cache / f"{case.name}-{n_stacks}.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:

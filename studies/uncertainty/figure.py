@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from studies.tables import new_figure, save_figure, stacks
 from studies.uncertainty.judgement import LEFT_OUT_SHARES
 
 COLOURS = {1: "#c0392b", 2: "#c58a3a", 3: "#2f6fb0"}
@@ -21,21 +21,13 @@ def draw_calibration(record: Mapping[str, Any], path: Path) -> None:
         record: of `check_record`.
         path: PNG to write, whole or not at all.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     numbers = [int(n) for n in record["by_stacks"]]
-    figure = Figure(figsize=(4.3 * (len(numbers) + 1), 4.3), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure = new_figure((4.3 * (len(numbers) + 1), 4.3))
     panels = figure.subplots(1, len(numbers) + 1)
     for panel, n in zip(panels, numbers, strict=False):
         _calibration(panel, record, n)
     _sparsification(panels[-1], record)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.png")
-    figure.set_dpi(110)
-    canvas.print_png(beside)
-    os.replace(beside, path)
+    save_figure(figure, path)
 
 
 def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
@@ -62,7 +54,7 @@ def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
         axis.set_major_formatter(lambda value, _: f"{value:g}")
         axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "235" else "")
         axis.set_tick_params(which="minor", labelsize=8)
-    panel.set_title(f"{n} stack{'s' * (n > 1)}", fontsize=11)
+    panel.set_title(stacks(n), fontsize=11)
     panel.set_xlabel("stated uncertainty, % of the brightest tissue")
     panel.set_ylabel("error found, %")
     panel.grid(alpha=0.25, which="both", lw=0.5)
@@ -76,7 +68,7 @@ def _sparsification(panel: Any, record: Mapping[str, Any]) -> None:
         colour = COLOURS.get(int(n), "#4a4a4a")
         for key, style, what in (("stated", "-", "by uncertainty"), ("ideal", ":", "by the error itself")):
             kept = np.array(one["sparsification"][key]) / one["mean_error"]
-            panel.plot(left_out, kept, style, color=colour, label=f"{n} stack{'s' * (int(n) > 1)}, {what}")
+            panel.plot(left_out, kept, style, color=colour, label=f"{stacks(int(n))}, {what}")
     panel.axhline(1, color="#444444", ls="--", lw=1, label="at random (a constant)")
     panel.set_xlabel("most uncertain voxels left out, %")
     panel.set_ylabel("mean error of the others / of all")

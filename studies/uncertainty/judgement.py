@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.bench.record import markdown_table
+from studies.tables import Cell, details, table
 
 if TYPE_CHECKING:
     from g3r.uncertainty.error_model import ErrorModel
@@ -97,38 +97,21 @@ def sparsification(by: NDArray[np.float64], size: NDArray[np.float64]) -> NDArra
 
 
 def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
-    """The tables in Markdown: with and without prior, by number of stacks, then every subject."""
-    head = ["calibration", "stacks", "subjects", "mean error %", "stated %", "error / stated", "spread of it"]
-    head += [f"within {factor:g} u" for factor in COVERAGE_FACTORS]
-    head += ["worst bin", "rank correlation", "gain over constant"]
-    rows, each = [], []
+    """The tables in Markdown: with and without prior, by number of stacks, then every subject.
+
+    Args:
+        record: results of `check_record`, with `preset` and `weights`, by calibration.
+    """
+    rows: list[dict[str, Any]] = []
+    each: list[dict[str, Any]] = []
     for name, one in record.items():
         for n, figures in one["by_stacks"].items():
             of_n = [s for s in one["subjects"].values() if s["n_stacks"] == int(n) and s["registered"]]
             ratios = [s["mean_error"] / s["mean_stated"] for s in of_n]
-            rows.append(
-                [
-                    name,
-                    n,
-                    len(of_n),
-                    *_sizes(figures),
-                    f"{min(ratios):.2f}-{max(ratios):.2f}",
-                    *(f"{share:.0%}" for share in figures["coverage"]),
-                    f"{_worst_bin(figures):.2f}",
-                    *_ranks(figures),
-                ]
-            )
-        for label, s in one["subjects"].items():
-            reliable = {True: "yes", False: "no", None: "unknown"}[s["trusted"]]
-            poses = f"{s['poses_mm']:.2f}"
-            each.append([name, label, f"{s['psnr_db']:.1f}", poses, reliable, *_sizes(s), *_ranks(s)])
-    rows.append(
-        ["errors of exponential size", *["-"] * 4, "1.00", "-"]
-        + [f"{share:.0%}" for share in EXPONENTIAL_COVERAGE]
-        + ["1.00", "-", "-"]
-    )
-    each_head = ["calibration", "subject", "PSNR dB", "poses mm", "trusted", "mean error %", "stated %"]
-    each_head += ["error / stated", "rank correlation", "gain over constant"]
+            rows.append({"calibration": name, "n_stacks": n, "ratios": ratios, **figures})
+        each += [{"calibration": name, "subject": label, **s} for label, s in one["subjects"].items()]
+    exponential = ["errors of exponential size", *["-"] * 4, "1.00", "-"]
+    exponential += [*(f"{share:.0%}" for share in EXPONENTIAL_COVERAGE), "1.00", "-", "-"]
     terms = "; ".join(
         f"{name}: ln u = {one['intercept']:.2f} "
         + " ".join(f"+ {b:.2f} {term}" for term, b in one["coefficients"].items() if b > 0)
@@ -138,33 +121,51 @@ def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
         f"{name}: preset `{one['preset']}`" + (f", weights {one['weights']}" if one["weights"] else "")
         for name, one in record.items()
     )
-    lines = [
+    parts = [
         f"{settings}. Errors are absolute, in % of the brightest tissue; each number of stacks is judged on "
         "all its subjects together, *spread* is the smallest and largest ratio of single subjects, *worst "
         "bin* the ratio furthest from 1 among ten equally large groups of voxels, u the stated uncertainty.",
-        "",
-        markdown_table(head, rows),
-        "",
-        "<details><summary>Every subject, and the coefficients</summary>",
-        "",
-        markdown_table(each_head, each),
-        "",
-        f"{terms}.",
-        "",
-        "</details>",
+        f"{table(rows, SUMMARY)}\n| {' | '.join(exponential)} |",
+        details("Every subject, and the coefficients", table(each, EACH), f"{terms}."),
     ]
-    return "\n".join(lines)
+    return "\n\n".join(parts)
 
 
-def _sizes(figures: Mapping[str, Any]) -> list[str]:
-    error, stated = figures["mean_error"], figures["mean_stated"]
-    return [f"{100 * error:.2f}", f"{100 * stated:.2f}", f"{error / stated:.2f}"]
+def _ratio(figures: Mapping[str, Any]) -> str:
+    return f"{figures['mean_error'] / figures['mean_stated']:.2f}"
 
 
-def _ranks(figures: Mapping[str, Any]) -> list[str]:
-    return [f"{figures['spearman']:.2f}", f"{figures['gain_over_constant']:.0%}"]
+def _coverage(n: int) -> Callable[[Mapping[str, Any]], str]:
+    return lambda figures: f"{figures['coverage'][n]:.0%}"
 
 
-def _worst_bin(figures: Mapping[str, Any]) -> float:
+def _worst_bin(figures: Mapping[str, Any]) -> str:
     ratios = [one["mean_error"] / one["stated"] for one in figures["bins"]]
-    return float(max(ratios, key=lambda ratio: abs(np.log(ratio))))
+    return f"{max(ratios, key=lambda ratio: abs(np.log(ratio))):.2f}"
+
+
+SIZES: dict[str, Cell] = {
+    "mean error %": lambda figures: f"{100 * figures['mean_error']:.2f}",
+    "stated %": lambda figures: f"{100 * figures['mean_stated']:.2f}",
+    "error / stated": _ratio,
+}
+RANKS: dict[str, Cell] = {"rank correlation": "{spearman:.2f}", "gain over constant": "{gain_over_constant:.0%}"}
+SUMMARY: dict[str, Cell] = {
+    "calibration": "{calibration}",
+    "stacks": "{n_stacks}",
+    "subjects": lambda row: len(row["ratios"]),
+    **SIZES,
+    "spread of it": lambda row: f"{min(row['ratios']):.2f}-{max(row['ratios']):.2f}",
+    **{f"within {factor:g} u": _coverage(n) for n, factor in enumerate(COVERAGE_FACTORS)},
+    "worst bin": _worst_bin,
+    **RANKS,
+}
+EACH: dict[str, Cell] = {
+    "calibration": "{calibration}",
+    "subject": "{subject}",
+    "PSNR dB": "{psnr_db:.1f}",
+    "poses mm": "{poses_mm:.2f}",
+    "trusted": lambda row: {True: "yes", False: "no", None: "unknown"}[row["trusted"]],
+    **SIZES,
+    **RANKS,
+}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
 from data_synth import cli as simulate
@@ -13,7 +12,6 @@ from g3r.bench.scaling_tables import draw_scaling, scaling_tables
 from g3r.bench.trade_figure import draw_trade
 from g3r.bench.trade_tables import trade_tables
 from g3r.cli import bench
-from studies.tradeoff import peer_phantom
 
 MACHINE = {
     "processor": "made up",
@@ -131,15 +129,6 @@ def test_work_is_proportional_to_what_grows():
             work.append(pixel_evaluations(cloud, planes, find_overlaps(cloud, planes, 3.2), 3.2))
         assert work[1] / work[0] == pytest.approx(4, rel=0.1), field
     assert {field for field, *_ in GROWING.values()} == {"n_gaussians", "n_slices", "n_pixels", "n_voxels"}
-
-
-def test_the_small_phantom_has_the_size_of_the_other_methods(tmp_path, capsys):
-    assert peer_phantom.main(["--output", str(tmp_path / "small")]) == 0
-    said = capsys.readouterr().out
-    assert "truth 64x64x64, stacks 58x58x18, 58x58x18, 58x58x18" in said
-    truth = peer_phantom.small_head(1)
-    extent_mm = (np.ptp(np.argwhere(truth.mask), axis=0) + 1) * peer_phantom.VOXEL_MM
-    assert extent_mm.max() == pytest.approx(peer_phantom.LENGTH_MM, abs=2)
 
 
 @pytest.mark.slow

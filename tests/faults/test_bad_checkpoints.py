@@ -19,7 +19,7 @@ from g3r.prior.checkpoint import load_prior
 from tests.faults.commands import assert_refused, run
 from tests.faults.fuzz_checkpoints import Canary, rewritten, small_pose, small_prior
 from tests.faults.nifti_files import write
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 pytestmark = pytest.mark.usefixtures("networks_once")
 

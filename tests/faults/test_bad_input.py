@@ -13,7 +13,7 @@ from g3r.cli.infer import main
 from tests.faults.bad_files import BAD_MASKS, BAD_STACKS, moved
 from tests.faults.commands import assert_refused, run
 from tests.faults.nifti_files import AFFINE, ball, image, write
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 REFUSES = "g3r-infer"
 

@@ -17,7 +17,7 @@ import pytest
 
 from g3r.errors import cannot_be_written
 from tests.faults.small_case import WHOLE, Killed, SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 ENOUGH = "20m"
 SIZES = ("16k", "200k", "600k", "1000k", "1400k", "2000k", "4m", ENOUGH)

@@ -10,7 +10,7 @@ from g3r.cli import evaluate
 from tests.faults.bad_files import BAD_MASKS, BAD_STACKS, USABLE_AS_A_VOLUME
 from tests.faults.commands import Outcome, assert_refused, run
 from tests.faults.nifti_files import ball, image, write
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 
 def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) -> bool:

@@ -19,7 +19,7 @@ from g3r.cli.infer import main
 from tests.faults.commands import assert_refused, run
 from tests.faults.fuzz_headers import FIELDS, NUMBERS
 from tests.faults.nifti_files import ball, image, write, write_raw
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 FIELD_EPSILON = float(np.finfo(np.float32).eps)
 """NIfTI-1 keeps affines as float32."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.fuzz import KINDS, run_cases
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 FEW, MANY = 300, 10_000
 SEED = 20_261

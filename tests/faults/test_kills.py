@@ -13,7 +13,7 @@ import pytest
 
 from g3r.acquisition.images import load_volume
 from tests.faults.small_case import WHOLE, Killed, SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 N_KILLS, N_SIGNALS = 24, 12
 

@@ -21,7 +21,7 @@ from g3r.cli.infer import main
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
 from tests.faults.nifti_files import AFFINE, ball, image, write_raw
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 CANARY = "DOE^JANE 1987"
 """As short as the shortest text field, so that each can hold it whole."""

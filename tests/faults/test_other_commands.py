@@ -18,7 +18,7 @@ from g3r.cli.infer import main as infer
 from tests.faults.bad_files import BAD_STACKS, USABLE_AS_A_VOLUME
 from tests.faults.commands import assert_refused, run
 from tests.faults.nifti_files import ball, write
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 
 @pytest.fixture(autouse=True, scope="module")

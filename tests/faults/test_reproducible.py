@@ -17,7 +17,7 @@ from g3r.errors import InputError
 from g3r.output.record import RunRecord
 from g3r.run.provenance import FileHash
 from tests.faults.small_case import SmallCase
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 SAME = ("volume.nii.gz", "mask.nii.gz", "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "sections.png")
 QUICK = ("--preset", "draft", "--resolution", "2", "--thickness", "4")

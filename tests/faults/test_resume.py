@@ -24,7 +24,7 @@ from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage
 from g3r.run.stage_store import StageStore
 from tests.faults.small_case import SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 NAMES = ("registration", "coarse volume", "prior", "fit to prior", "fit to slices")
 STAGES = tuple(name.replace(" ", "-") for name in NAMES)

@@ -15,7 +15,7 @@ from g3r.acquisition.images import load_volume
 from g3r.gaussians import GaussianCloud
 from g3r.planning.presets import PRESETS
 from tests.faults.small_case import WHOLE, SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 N_STEPS = PRESETS["draft"].slice_stage.n_steps
 

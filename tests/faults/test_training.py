@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from g3r.errors import InputError
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 pytest.importorskip("torchio", reason="the training extra is not installed")

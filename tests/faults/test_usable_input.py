@@ -20,7 +20,7 @@ from g3r.cli.infer import main
 from tests.faults.bad_files import header, moved, only_sform
 from tests.faults.commands import run
 from tests.faults.nifti_files import AFFINE, SHAPE, ball, image, raw, write, write_raw
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 pytestmark = pytest.mark.usefixtures("networks_once")
 

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
-from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget
+from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.geometry import VolumeGrid
-from studies.tradeoff.gaussian_count import BALL_MOST, ball, lattice_cloud, psnr_db
 
 GRID = VolumeGrid.isotropic([-14.0] * 3, [14.0] * 3, 1.0)
 INDEX = np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1)
@@ -67,17 +66,3 @@ def test_masks_of_nothing_and_of_one_voxel():
     cloud, done = fitted(mask=one)
     assert all(torch.isfinite(p).all() for p in cloud.parameters)
     assert np.isfinite(done.rms)
-
-
-def test_a_ball_needs_few():
-    """On voxels of 1.6 mm, to be quick: under 500 Gaussians, where a lattice of twice as many is worse."""
-    volume, mask, grid = ball(1.6)
-    settings = AdaptiveSettings(bound=0.1, start=4.0, round_steps=25, last_steps=25)
-    cloud, done = fit_adaptive(volume, mask, grid, 4.0, settings, STAGE, np.random.default_rng(1))
-    target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
-    assert len(cloud) < BALL_MOST
-    psnr = psnr_db(cloud, target)
-    assert psnr > 27.5  # 28.8 with one thread; sums of gradients depend on their number
-    uniform = lattice_cloud((volume, mask, grid), 7.0, done.steps, 24, 1)
-    assert len(uniform) > 1.6 * len(cloud)
-    assert psnr > psnr_db(uniform, target)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from g3r.geometry import VolumeGrid
+from g3r.geometry import RigidPose, VolumeGrid
 
 
 def affine_of(axes: np.ndarray, spacing: tuple[float, float, float], origin: tuple[float, ...]) -> np.ndarray:
@@ -73,3 +73,10 @@ def test_what_is_no_grid_is_refused(shape, affine, message):
 
 def test_small_voxels_are_not_taken_for_singular():
     assert VolumeGrid((3, 3, 3), np.diag([1e-4, 1e-4, 1e-4, 1])).voxel_volume_mm3 == pytest.approx(1e-12)
+
+
+def test_a_moved_grid_has_its_voxels_where_the_motion_puts_them():
+    grid = VolumeGrid((3, 4, 5), affine_of(AXES["LAS"], (0.8, 1.0, 2.0), (4.0, -3.0, 2.0)))
+    motion = RigidPose.from_rotvec([[0.3, -0.2, 0.1]], [[5.0, 6.0, -7.0]])
+    index = np.array([[0.0, 0, 0], [2, 3, 4]])
+    np.testing.assert_allclose(grid.moved(motion).world(index), motion.apply(grid.world(index)[None])[0], atol=1e-12)

@@ -13,8 +13,8 @@ from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.amplitudes import AmplitudeSystem
-from studies.numerics.errors import FULL_CUTOFF, gradients
-from studies.numerics.scenes import single
+from tests.numerics.errors import FULL_CUTOFF, gradients
+from tests.numerics.scenes import single
 
 Evaluated = tuple[Tensor, dict[str, Tensor]]
 

@@ -11,8 +11,8 @@ from g3r.gaussians import GaussianCloud, render, solve_amplitudes
 from g3r.gaussians.amplitudes import AmplitudeSystem
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
-from studies.numerics.oracles import naive_amplitudes, naive_render
-from studies.numerics.scenes import head_scene, single, slender_scenes
+from tests.numerics.oracles import naive_amplitudes, naive_render
+from tests.numerics.scenes import head_scene, single, slender_scenes
 
 
 def copies(n: int) -> tuple[GaussianCloud, GaussianCloud]:
@@ -174,7 +174,7 @@ def test_the_prior_network_at_every_density(density: float, tally):
 @pytest.mark.parametrize("factor", [0.0, 1e-30, 1e-6, 1.0, 1e6])
 def test_density_and_coarse_volume_at_any_trust(factor: float, tally):
     """V_coarse is a mean: the size of the weights falls out, down to where nothing counts as measured."""
-    from studies.numerics.fits import slices_of_small_head
+    from tests.numerics.fits import slices_of_small_head
 
     slices, grid, *_ = slices_of_small_head(noise=0.0)
     weight = np.full(len(slices.pixel_index), factor)

@@ -13,7 +13,7 @@ from g3r.acquisition.robust import slice_weights
 from g3r.geometry import RigidPose
 from g3r.registration.normal_equations import correlation
 from g3r.registration.slice_rounds import SliceRounds, refine_slices
-from studies.numerics.fits import slices_of_small_head
+from tests.numerics.fits import slices_of_small_head
 
 ROUNDS = SliceRounds(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6, max_pixels=400_000)
 

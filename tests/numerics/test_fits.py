@@ -20,8 +20,8 @@ from g3r.fitting.schedules import AnnealedWeight
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
-from studies.numerics.fits import fit_at, slices_of_small_head, step_size_rows, times, volume_changes
-from studies.numerics.scenes import head_scene, single
+from tests.numerics.fits import fit_at, slices_of_small_head, step_size_rows, times, volume_changes
+from tests.numerics.scenes import head_scene, single
 
 
 def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options) -> SliceFit:
@@ -238,10 +238,8 @@ def test_a_small_rise_is_no_reason_to_go_back():
 
 @pytest.mark.parametrize("tau", [(0.8, 0.2), (-0.1, 0.5), (0.5, 1.1), (math.nan, 0.5), (0.5, math.inf)])
 def test_annealing_outside_or_reversed_is_refused(tau: tuple[float, float], tally):
-    refused = tally.refused
-    with tally.case(may_refuse=True):
+    with tally.refusal():
         AnnealedWeight(0.5, 0.1, *tau)
-    assert tally.refused == refused + 1
     with pytest.raises(InputError, match="tau_1"):
         AnnealedWeight(0.5, 0.1, *tau)
 

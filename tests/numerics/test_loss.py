@@ -21,7 +21,7 @@ from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight
 from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings, _blocks
 from g3r.gaussians import GaussianCloud, render
-from studies.numerics.scenes import head_scene, single
+from tests.numerics.scenes import head_scene, single
 
 CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
 STEP = 1e-5

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.numerics import tables as numerics
-from studies.numerics.errors import (
+from tests.numerics import tables as numerics
+from tests.numerics.errors import (
     comb,
     distance_rows,
     gradient_rows,

@@ -10,7 +10,7 @@ from g3r.gaussians import GaussianCloud, render
 from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_from_vector
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from studies.numerics.scenes import head_scene, single
+from tests.numerics.scenes import head_scene, single
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -36,7 +36,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
 
 def test_a_renderer_under_autocast_would_be_wrong():
     """The naive formula under the same autocast: why the reference switches it off."""
-    from studies.numerics.oracles import naive_render
+    from tests.numerics.oracles import naive_render
 
     scene = head_scene()
     exact = render(scene.cloud, scene.planes, backend="reference")

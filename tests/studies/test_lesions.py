@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from data_synth.atlas import TruthVolume
 from g3r.errors import InputError
-from studies.lesions.kept import VARIANTS, build_parser, lesion_text
+from studies.lesions.figure import draw_lesions_kept, save_sections
+from studies.lesions.kept import VARIANTS, tables
+from studies.lesions.runs import LesionRun, LesionSubject
 from studies.lesions.volumes import (
     BRIGHT_LEVEL,
     DARK_LEVEL,
@@ -96,12 +100,21 @@ def test_no_room_is_said(head: tuple[TruthVolume, np.ndarray]) -> None:
 
 def test_table_has_ratio_and_every_lesion() -> None:
     kept_of = dict(zip(VARIANTS, (0.8, 0.76, 0.9), strict=True))
-    rows = [{"subject": "a", "n_stacks": n, "kind": "dark", "kept": kept_of} for n in (3, 1)]
-    text = lesion_text({"preset": "p", "weights": "w", "rows": rows})
-    assert text.count("0.95 ± 0.00") == 2
+    rows = {str(n): {"lesions": [{"subject": "a", "n_stacks": n, "kind": "dark", "kept": kept_of}]} for n in (3, 1)}
+    text = tables({"preset": "p", "weights": "w", "rows": rows})["lesions"]
+    assert text.count("| dark sphere, 6 mm |") == text.count("| 0.95 | 0.95 | 0.85 |") == 2
     assert text.count("| a | ") == 2
 
 
-def test_options() -> None:
-    options = build_parser().parse_args(["--development", "--stacks", "1", "--subjects", "2"])
-    assert (options.development, options.stacks, options.subjects) == (True, [1], 2)
+def test_the_figure_shows_sections_that_a_run_has_kept(
+    head: tuple[TruthVolume, np.ndarray], lesions: list[Lesion], tmp_path: Path
+) -> None:
+    subject = LesionSubject("a", head[0], tuple(lesions), {})
+    volumes = dict.fromkeys(VARIANTS, head[0].data)
+    run = LesionRun(subject, 3, volumes, {}, dict.fromkeys(VARIANTS, [0.5] * len(lesions)), 1.0)
+    save_sections(run, tmp_path / "out" / "sections-3.npz")
+    draw_lesions_kept("a", {3: tmp_path / "out" / "sections-3.npz"}, VARIANTS, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").is_file()
+    with np.load(tmp_path / "out" / "sections-3.npz") as shown:
+        assert shown["bright/truth"].max() > 0.9 * BRIGHT_LEVEL * 1000
+        assert shown["dark/with prior/kept"] == 0.5

@@ -1,26 +1,24 @@
-"""Subjects of the benchmarks: repeatable, cached, and their true poses read back from files."""
+"""Subjects of the studies: repeatable, cached, their true poses read back from files, volumes aligned."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from g3r.acquisition.images import save_volume
+from g3r.acquisition.images import Volume, save_volume
 from g3r.errors import InputError
-from g3r.evaluation.case import load_case, read_true_poses
+from g3r.evaluation.case import SimulatedCase, load_case, read_true_poses
 from g3r.evaluation.pose_error import PoseTable
-from g3r.geometry import RigidPose
-from studies.motion.figure import draw_slice_errors, jerk_slices, places_in_time
-from studies.motion.layers import case_folders
-from studies.motion.sweep import LEVELS, specs
-from studies.runs import orientation_deg
-from studies.subjects import SubjectSpec, simulated_subject
-from studies.subjects import test_data_folder as data_folder
+from g3r.geometry import RigidPose, VolumeGrid
+from studies.runs import aligned, orientation_deg
+from studies.subjects import SubjectSpec, case_folders, data_folder, simulated_subject
 
-RECIPE = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
+SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
 
 
 @pytest.fixture
@@ -36,20 +34,13 @@ def atlas(tmp_path, rng):
     return tmp_path / "atlas"
 
 
-def test_every_subject_has_a_seed_of_its_own():
-    kinds = [{"turned": turned, "development": dev} for turned in (False, True) for dev in (False, True)]
-    every = [one for kind in kinds for one in specs(LEVELS, 100, **kind)]
-    assert len({one.seed for one in every}) == len({one.name for one in every}) == 1200
-    assert specs(["severe"], 2)[1] == specs(LEVELS, 10)[21]
-
-
 def test_subject_is_simulated_once_and_read_back(atlas, tmp_path):
-    folder = simulated_subject(RECIPE, atlas, tmp_path / "cache")
+    folder = simulated_subject(SPEC, atlas, tmp_path / "cache")
     written = (folder / "poses.tsv").stat().st_mtime_ns
-    assert simulated_subject(RECIPE, atlas, tmp_path / "cache") == folder
+    assert simulated_subject(SPEC, atlas, tmp_path / "cache") == folder
     assert (folder / "poses.tsv").stat().st_mtime_ns == written
-    with pytest.raises(InputError, match="another recipe"):
-        simulated_subject(replace(RECIPE, bias=0.15), atlas, tmp_path / "cache")
+    with pytest.raises(InputError, match="another specification"):
+        simulated_subject(replace(SPEC, bias=0.15), atlas, tmp_path / "cache")
     case = load_case(folder)
     assert [stack.thickness_mm for stack in case.stacks] == [2.2] * 3
     spacing = case.truth.grid.spacing_mm  # stretched by up to a twentieth, each axis by its own factor
@@ -67,7 +58,7 @@ def test_subject_is_simulated_once_and_read_back(atlas, tmp_path):
 
 
 def test_turned_subject_keeps_its_size(atlas, tmp_path):
-    case = load_case(simulated_subject(replace(RECIPE, turned=True), atlas, tmp_path / "cache"))
+    case = load_case(simulated_subject(replace(SPEC, turned=True), atlas, tmp_path / "cache"))
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
     assert np.abs(axes).max() < 0.999
@@ -108,33 +99,36 @@ def test_a_folder_without_poses(tmp_path):
     with pytest.raises(InputError, match=r"no stack-N\.nii\.gz"):
         load_case(tmp_path)
     with pytest.raises(InputError, match="no case named x"):
-        case_folders(tmp_path, ["x"])
+        case_folders(["x"], tmp_path)
+
+
+def test_cases_are_chosen_by_a_part_of_their_name_and_ordered_by_motion(tmp_path):
+    for name in ("b-severe", "a-mild-gap", "c-none", "a-single"):
+        (tmp_path / name).mkdir()
+    assert [f.name for f in case_folders(["*"], tmp_path)] == ["c-none", "a-mild-gap", "b-severe", "a-single"]
+    assert [f.name for f in case_folders(["mild", "b-*"], tmp_path)] == ["a-mild-gap", "b-severe"]
 
 
 def test_data_folder_that_is_not_there(tmp_path, monkeypatch):
     monkeypatch.setenv("G3R_TEST_DATA", str(tmp_path / "nothing"))
     with pytest.raises(InputError, match="set G3R_TEST_DATA"):
-        data_folder()
+        data_folder("atlas")
 
 
-def hand_made_jerk():
-    """Ten slices, taken 0 2 4 6 8 1 3 5 7 9; the head jumps 5 mm before slice 8."""
-    place = places_in_time(10)
-    assert place.tolist() == [0, 5, 1, 6, 2, 7, 3, 8, 4, 9]
-    shift = np.zeros((10, 3))
-    shift[:, 0] = 0.1 * place + 5.0 * (place >= 4)
-    keys = tuple((0, k) for k in range(10))
-    points = {key: np.array([[10.0, 0, key[1]], [0, 10.0, key[1]]]) for key in keys}
-    return PoseTable(keys, RigidPose(np.tile(np.eye(3), (10, 1, 1)), shift)), points
-
-
-def test_jerks_are_found_in_the_order_of_time():
-    assert jerk_slices(*hand_made_jerk()) == [[0, 4]]
-
-
-def test_figure_of_two_cases(tmp_path):
-    per_slice = [[0, k, 0.1 * k] for k in range(10)]
-    layers = {name: {"per_slice_mm": per_slice} for name in ("headers", "slices", "something new")}
-    case = {"layers": layers, "n_slices": [10], "jerks": [[0, 4]]}
-    draw_slice_errors({"a": case, "b": case, "c": case}, tmp_path / "made" / "figure.png")
-    assert (tmp_path / "made" / "figure.png").stat().st_size > 10_000
+def test_a_volume_far_away_is_brought_near_by_the_motion_of_its_slices(rng):
+    """Half a turn and a metre away, with other intensities; what is left, a millimetre, alignment finds."""
+    shape = (40, 44, 36)
+    truth = gaussian_filter(rng.normal(size=shape), 2.5)
+    truth = (1 + truth / truth.std()).astype(np.float32)
+    grid = VolumeGrid.isotropic([0, 0, 0], 1.5 * (np.array(shape) - 1), 1.5)
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)
+    mask = np.linalg.norm((index - (np.array(shape) - 1) / 2) / (15, 17, 13), axis=-1) < 1
+    case = SimulatedCase("head", Path(), (), PoseTable((), RigidPose.identity(0)), {})
+    case.__dict__.update(truth=Volume(truth, grid.affine, "truth"), truth_mask=mask)  # cached properties
+    near = RigidPose.from_rotvec([[0.02, -0.03, 0.01]], [[1.0, -0.6, 0.4]])
+    far = RigidPose.from_rotvec([[0.0, 0.0, 3.0]], [[1000.0, 0.0, 0.0]])
+    found = aligned(case, 3.0 * truth + 7.0, grid.moved(far.inverse() @ near), far)
+    assert found.scores.psnr_db > 45
+    assert found.alignment is not None
+    left = found.alignment.volume_from_reference @ near.inverse()
+    assert np.linalg.norm(left.apply(grid.center_mm[None])[0] - grid.center_mm) < 0.05

@@ -21,7 +21,7 @@ from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration.settings import RegistrationSettings
-from studies.numerics.scenes import ORIGIN_MM, head_scene, single, stacks_of_planes
+from tests.numerics.scenes import ORIGIN_MM, head_scene, single, stacks_of_planes
 
 HEAD_RADIUS_MM = 10.0
 NOISE = 0.02

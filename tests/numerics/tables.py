@@ -1,17 +1,18 @@
-"""`python -m studies.numerics.tables`: errors at the extremes, as the tables of docs/numerics.md."""
+"""`python -m tests.numerics.tables`: errors at the extremes, as the tables of docs/numerics.md."""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from g3r.bench.record import machine, markdown_table, put_between_markers, write_json
-from studies.command import run_command
-from studies.numerics.errors import (
+from g3r.errors import G3RError
+from tests.numerics.errors import (
     THICKNESSES_MM,
     distance_rows,
     gradient_rows,
@@ -21,40 +22,36 @@ from studies.numerics.errors import (
     shape_tolerance,
     size_rows,
 )
+from tests.numerics.fits import step_size_rows, volume_changes
 
 Rows = Sequence[Mapping[str, Any]]
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.numerics.tables",
+        prog="python -m tests.numerics.tables",
         description="Errors at the extremes, swept and tabulated.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
-    parser.add_argument("--output", type=Path, default=Path("runs") / "bench" / "numerics")
+    parser.add_argument("--output", type=Path, default=Path("runs") / "studies" / "numerics")
     parser.add_argument("--only", choices=TABLES, nargs="+", help="some of the tables (None: all)")
-    return parser
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return run_command("numerics", _run, build_parser().parse_args(argv))
-
-
-def _run(options: argparse.Namespace) -> int:
+    options = parser.parse_args(argv)
     logging.getLogger("g3r.fitting.divergence_guard").setLevel(logging.ERROR)  # its table says it
     record: dict[str, Any] = {"machine": machine(), "tables": {}}
-    for name in options.only or TABLES:
-        make, table = TABLES[name]
-        rows = make()
-        record["tables"][name] = rows
-        text = table(rows)
-        print(f"{name}\n\n{text}\n", flush=True)
-        if options.docs:
-            put_between_markers(options.docs, f"numerics-{name}", text)
-    write_json(options.output / "numerics.json", record)
+    try:
+        for name in options.only or TABLES:
+            make, table = TABLES[name]
+            record["tables"][name] = rows = make()
+            text = table(rows)
+            print(f"{name}\n\n{text}\n", flush=True)
+            if options.docs:
+                put_between_markers(options.docs, f"numerics-{name}", text)
+        write_json(options.output / "numerics.json", record)
+    except G3RError as error:
+        print(f"numerics: {error}", file=sys.stderr)
+        return error.exit_code
     return 0
 
 
@@ -136,26 +133,12 @@ def distance_table(rows: Rows) -> str:
     )
 
 
-def change_rows() -> Rows:
-    """See `volume_changes`; imported late, because it brings the whole pipeline."""
-    from studies.numerics.fits import volume_changes
-
-    return volume_changes()
-
-
 def change_table(rows: Rows) -> str:
     """What whole reconstructions make of changes that ought to change nothing."""
     return markdown_table(
         ["change of the input", "mean change", "largest change", "mean error against the truth"],
         [[row["change"], *(shown(row[name]) for name in ("mean", "largest")), f"{row['error']:.4f}"] for row in rows],
     )
-
-
-def step_rows() -> Rows:
-    """See `step_size_rows`."""
-    from studies.numerics.fits import step_size_rows
-
-    return step_size_rows()
 
 
 def step_table(rows: Rows) -> str:
@@ -188,8 +171,8 @@ TABLES: dict[str, tuple[Any, Any]] = {
     "size": (size_rows, size_table),
     "pixel": (pixel_rows, pixel_table),
     "distance": (distance_rows, distance_table),
-    "steps": (step_rows, step_table),
-    "changes": (change_rows, change_table),
+    "steps": (step_size_rows, step_table),
+    "changes": (volume_changes, change_table),
 }
 """Rows and their table, by the name of the markers in docs/numerics.md."""
 

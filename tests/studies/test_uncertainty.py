@@ -7,11 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from g3r.uncertainty.error_model import ErrorModel
-from studies.uncertainty.calibration import build_parser
-from studies.uncertainty.data import CHECK_VOLUMES, FIT_VOLUMES, check_recipes, fit_recipes, relative_error
+from studies.uncertainty.data import CHECK_VOLUMES, FIT_VOLUMES, check_subjects, fit_subjects, relative_error
 from studies.uncertainty.figure import draw_calibration
 from studies.uncertainty.judgement import EXPONENTIAL_COVERAGE, check_record, check_text, judge
 
@@ -64,7 +62,7 @@ def test_error_does_not_depend_on_the_scale_of_the_volume() -> None:
 
 def test_fit_and_check_share_no_volume_and_no_seed() -> None:
     assert not {v for v, *_ in FIT_VOLUMES} & {v for v, *_ in CHECK_VOLUMES}
-    fitted, checked = fit_recipes(), check_recipes()
+    fitted, checked = fit_subjects(), check_subjects()
     assert not {r.seed for r, _ in fitted} & {r.seed for r, _ in checked}
     assert len({r.name for r, _ in fitted}) == len(fitted)
     assert all(r.volume.startswith("spina-bifida/") and r.volume.endswith("-operated") for r, _ in fitted)
@@ -107,11 +105,4 @@ def test_record_table_and_figure(tmp_path: Path) -> None:
     assert text.count("| with prior |") == 2 + 4
     assert "+ 1.00 log residual" in text
     draw_calibration(record, tmp_path / "new" / "figure.png")
-    assert Image.open(tmp_path / "new" / "figure.png").width > 1000
-    assert len(list((tmp_path / "new").iterdir())) == 1
-
-
-def test_options() -> None:
-    assert build_parser().parse_args(["check", "--no-prior"]).no_prior
-    with pytest.raises(SystemExit):
-        build_parser().parse_args(["judge"])
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["figure.png"]

@@ -14,8 +14,8 @@ from g3r.acquisition.planes import Planes, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
-from studies.numerics.oracles import absolute, integrated_pixels, naive_render, volume_at
-from studies.numerics.scenes import PIXEL_MM, Scene, cloud_of, head_scene, single, slender_scenes
+from tests.numerics.oracles import absolute, integrated_pixels, naive_render, volume_at
+from tests.numerics.scenes import PIXEL_MM, Scene, cloud_of, head_scene, single, slender_scenes
 
 EPS32 = float(np.finfo(np.float32).eps)
 

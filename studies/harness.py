@@ -1,0 +1,256 @@
+"""What all studies share: options, a record that an interrupted run goes on with, tables and the end of a command.
+
+A study consists of what is special to it: its cases as tasks, what is measured, its tables and its figure. See
+`Study`; `python -m studies.PAGE.NAME --help` lists the options of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import logging
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from g3r.bench.record import available_cores, machine, put_between_markers, use_threads, write_json, write_text
+from g3r.errors import G3RError, InputError
+from g3r.planning.presets import PRESETS
+
+Row = dict[str, Any]
+Record = dict[str, Any]
+
+FOLDER = Path("runs") / "studies"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One measurement.
+
+    Attributes:
+        key: name of its row in the record.
+        call: measures; returns the row, or None where there is none (it has said why). A row with an entry
+            "skipped" is tried again by the next run. With --jobs the call runs in another process.
+        arguments: of the call.
+    """
+
+    key: str
+    call: Callable[..., Row | None]
+    arguments: tuple[Any, ...] = ()
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1, as the type of an option."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}; expected at least 1")
+    return int(text)
+
+
+SHARED: dict[str, dict[str, Any]] = {
+    "--preset": {"default": "balanced", "choices": PRESETS, "help": "settings"},
+    "--ckpt": {"metavar": "PRIOR.pt", "help": "prior (None: the one shipped)"},
+    "--threads": {"type": positive, "metavar": "N", "help": "(None: all cores, shared out)"},
+    "--jobs": {"type": positive, "metavar": "N", "default": 1, "help": "measurements at the same time"},
+    "--cache": {"type": Path, "default": FOLDER / "subjects", "help": "simulated subjects"},
+    "--development": {"action": "store_true", "help": "subjects that may be looked at"},
+    "--cases": {"nargs": "+", "metavar": "GLOB", "default": ["*"], "help": "parts of the names of cases"},
+    "folders": {"nargs": "*", "metavar": "CASE", "type": Path, "help": "of g3r-simulate (none: sta30-moderate)"},
+}
+"""Options that several studies take, each always with the same meaning."""
+
+FITS = ("--preset", "--ckpt", "--threads")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A study, without what all have in common.
+
+    Attributes:
+        name: PAGE.NAME, the module in `studies`.
+        about: for --help.
+        tasks: the measurements, from the options.
+        tables: from the record, Markdown by the name of the markers in the document.
+        document: in docs/, where --publish puts the tables; None publishes nothing.
+        picture: in docs/images/, the figure of --publish.
+        shared: those of `SHARED` that it takes.
+        options: its own, as arguments of `add_argument` by their name.
+        settings: what rows depend on beside the preset, weights, threads, jobs and --development.
+        line: what is said of a new row; its key and seconds when None.
+        figure: draws the record into `options.figure`.
+        finish: changes the record after the measurements.
+        resumes: False measures everything anew each time.
+        verdict: False ends the command with 1.
+    """
+
+    name: str
+    about: str
+    tasks: Callable[[argparse.Namespace], Iterable[Task]]
+    tables: Callable[[Record], Mapping[str, str]]
+    document: str | None = None
+    picture: str | None = None
+    shared: tuple[str, ...] = FITS
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    settings: Callable[[argparse.Namespace], Record] | None = None
+    line: Callable[[str, Row], str] | None = None
+    figure: Callable[[Record, argparse.Namespace], None] | None = None
+    finish: Callable[[Record, argparse.Namespace], None] | None = None
+    resumes: bool = True
+    verdict: Callable[[Record], bool] | None = None
+
+    def parser(self) -> argparse.ArgumentParser:
+        """All its options."""
+        parser = argparse.ArgumentParser(
+            prog=f"python -m studies.{self.name}",
+            description=f"{self.about} The record is kept in --output, and a later run goes on with it.",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        for name, arguments in ({name: SHARED[name] for name in self.shared} | dict(self.options)).items():
+            parser.add_argument(name, **arguments)
+        folder = FOLDER / self.name.replace(".", "-")
+        parser.add_argument("--output", type=Path, default=folder, help="for the record as JSON and Markdown")
+        parser.add_argument("--fresh", action="store_true", help="measure again what the record holds")
+        parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
+        if self.figure:
+            parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw it")
+        where = f"tables and figure into docs/{self.document}" if self.document else "nothing: in no document"
+        parser.add_argument("--publish", action="store_true", help=where)
+        return parser
+
+    def main(self, argv: Sequence[str] | None = None) -> int:
+        """Run the command; returns its exit code. An error of g3r's is one line and its own code."""
+        options = self.parser().parse_args(argv)
+        logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
+        try:
+            return self.run(options)
+        except G3RError as error:
+            print(f"{self.name}: {error}", file=sys.stderr)
+            return error.exit_code
+        except KeyboardInterrupt:
+            print(f"{self.name}: interrupted; the same command goes on from {options.output}", file=sys.stderr)
+            return 130
+
+    def run(self, options: argparse.Namespace) -> int:
+        """Measure what the record does not hold; write record, tables and figure; returns the exit code."""
+        if options.publish and self.document:
+            options.docs = options.docs or DOCS / self.document
+            if self.picture:
+                options.figure = options.figure or DOCS / "images" / self.picture
+        if options.docs and getattr(options, "development", False):
+            raise InputError(
+                "--docs, --publish: the published table needs seeds not looked at; leave out --development"
+            )
+        settings = self._settings(options)
+        tasks = list(self.tasks(options))
+        path = options.output / f"{self.name.split('.')[-1]}.json"
+        renewed = {task.key for task in tasks} if options.fresh or not self.resumes else set()
+        record = resumed(path, {**settings, "machine": machine(settings.get("threads")), "rows": {}}, renewed)
+        rows = record["rows"]
+        todo = [task for task in tasks if task.key not in rows]
+        start = time.perf_counter()
+        for task, row in results(todo, settings.get("jobs", 1), settings.get("threads")):
+            if row is not None:
+                rows[task.key] = row
+                print(self.line(task.key, row) if self.line else f"{task.key}: measured", flush=True)
+                write_json(path, record)
+        print(f"{len(todo)} of {len(tasks)} measured, {time.perf_counter() - start:.0f} s", flush=True)
+        order = {task.key: n for n, task in enumerate(tasks)}
+        record["rows"] = dict(sorted(rows.items(), key=lambda item: order.get(item[0], len(order))))
+        if self.finish:
+            self.finish(record, options)
+        write_json(path, record)
+        texts = self.tables(record)
+        write_text(path.with_suffix(".md"), "\n\n".join(texts.values()))
+        print("\n\n".join(texts.values()))
+        for marker, text in texts.items():
+            if options.docs:
+                put_between_markers(options.docs, marker, text)
+        if self.figure and options.figure:
+            self.figure(record, options)
+        return 0 if self.verdict is None or self.verdict(record) else 1
+
+    def _settings(self, options: argparse.Namespace) -> Record:
+        """What all rows of a record depend on."""
+        found: Record = {}
+        if hasattr(options, "preset"):
+            found["preset"] = options.preset
+        if hasattr(options, "ckpt"):
+            found["weights"] = weights(options.ckpt)
+        jobs = getattr(options, "jobs", None)
+        if jobs is not None:
+            found["jobs"] = jobs
+        if hasattr(options, "threads"):
+            found["threads"] = options.threads or max(1, available_cores() // (jobs or 1))
+        if hasattr(options, "development"):
+            found["development"] = options.development
+        return found | (self.settings(options) if self.settings else {})
+
+
+def resumed(path: Path, new: Record, renewed: set[str]) -> Record:
+    """The record of an earlier run with the same settings, or the new one.
+
+    Args:
+        path: of the record, whether it is there or not.
+        new: settings, machine and no rows.
+        renewed: keys of rows that are to be measured again.
+
+    Raises:
+        InputError: the file cannot be read, or holds rows of other settings that this run does not replace.
+    """
+    if not path.is_file():
+        return new
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        rows = {key: row for key, row in found["rows"].items() if key not in renewed and "skipped" not in row}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not a record of a study ({error}); choose another --output") from None
+    if not rows:
+        return new
+    other = [name for name in new if name not in ("machine", "rows") and found.get(name) != new[name]]
+    if other:
+        listed = ", ".join(f"{name} {found.get(name)} instead of {new[name]}" for name in other)
+        raise InputError(f"{path}: measured with {listed}; choose another --output, or remove it")
+    print(f"{path}: {len(rows)} rows kept, of commit {found['machine']['commit']}; --fresh measures again")
+    return {**found, "rows": rows}
+
+
+def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[tuple[Task, Row | None]]:
+    """Each task with its row, as they end.
+
+    Args:
+        tasks: what is to be measured.
+        jobs: processes; with 1 everything runs in this one.
+        threads: of each; None leaves them as they are.
+    """
+    if jobs == 1 or len(tasks) < 2:
+        if threads:
+            use_threads(threads)
+        for task in tasks:
+            yield task, task.call(*task.arguments)
+        return
+    # a fresh interpreter for each worker: thread pools do not survive a fork
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, spawn, initializer=use_threads, initargs=(threads or 1,)) as pool:
+        waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
+        for done in as_completed(waiting):
+            yield waiting[done], done.result()
+
+
+def weights(checkpoint: str | None) -> str:
+    """The first 16 digits of the SHA-256 of a prior's file: which weights rows were made with.
+
+    Raises:
+        InputError: no such file.
+    """
+    from g3r.reconstruct import DEFAULT_CHECKPOINT
+
+    path = Path(checkpoint or DEFAULT_CHECKPOINT)
+    if not path.is_file():
+        raise InputError(f"--ckpt {path}: no such file")
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -1,1 +1,0 @@
-"""Errors at the extremes: the tables of docs/numerics.md."""

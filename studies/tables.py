@@ -1,0 +1,83 @@
+"""Pieces of the studies' tables and figures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from statistics import mean, stdev
+from typing import TYPE_CHECKING, Any
+
+from g3r.bench.record import markdown_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Cell = str | Callable[[Any], object]
+"""What stands in a column: a format such as "{scores[V_prior][ssim]:.3f}", or a function of the row."""
+
+
+def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Sequence[tuple[str, Cell]]) -> str:
+    """A table in Markdown. A cell is empty where the row lacks a value that its format names.
+
+    Args:
+        rows: values by name.
+        columns: cells by the head of the column; pairs where a head stands twice.
+    """
+    pairs = list(columns.items()) if isinstance(columns, Mapping) else columns
+    return markdown_table([head for head, _ in pairs], [[_cell(row, cell) for _, cell in pairs] for row in rows])
+
+
+def _cell(row: Mapping[str, Any], cell: Cell) -> object:
+    if callable(cell):
+        return cell(row)
+    try:
+        return cell.format_map(row)
+    except KeyError:
+        return ""
+
+
+def details(summary: str, *parts: str) -> str:
+    """Text in Markdown that is folded away below its summary."""
+    return "\n\n".join([f"<details><summary>{summary}</summary>", *parts, "</details>"])
+
+
+def spread(values: Sequence[float], form: str = "{:.2f}") -> str:
+    """Mean and standard deviation; the mean alone of a single value, "-" of none."""
+    if not values:
+        return "-"
+    deviation = f" ± {form.replace('+', '').format(stdev(values))}" if len(values) > 1 else ""
+    return form.format(mean(values)) + deviation
+
+
+def marked(text: str, good: bool) -> str:
+    """The text, with (!) where something is not as wanted."""
+    return text if good else f"{text} (!)"
+
+
+def stacks(n: int) -> str:
+    """A number of stacks in words."""
+    return f"{n} stack{'s' * (n != 1)}"
+
+
+def new_figure(size: tuple[float, float], **options: Any) -> Figure:
+    """An empty figure that needs no display.
+
+    Args:
+        size: width and height in inches.
+        options: of matplotlib's Figure.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained", **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
+    """Write a PNG, whole or not at all; folders are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
+    figure.savefig(temporary, dpi=dpi)
+    os.replace(temporary, path)

@@ -1,0 +1,115 @@
+"""The harness: what is kept of an earlier record, where tables go, how a command ends; every study starts."""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from g3r.errors import InputError
+from studies.harness import Study, Task, resumed
+from studies.tables import details, spread, table
+
+FOLDER = Path(__file__).resolve().parents[2] / "studies"
+STUDIES = sorted(
+    ".".join(path.relative_to(FOLDER.parent).with_suffix("").parts)
+    for path in FOLDER.rglob("*.py")
+    if "if __name__" in path.read_text(encoding="utf-8")
+)
+PAGE = "before\n<!-- squares:begin -->\nold\n<!-- squares:end -->\nafter\n"
+
+
+def square(n: int, folder: Path) -> dict[str, int] | None:
+    """Measured once: a second time there is a file."""
+    (folder / f"measured-{n}").touch(exist_ok=False)
+    if n == 13:
+        raise InputError("13 is refused")
+    return None if n == 4 else {"n": n, "square": n * n, "process": os.getpid()}
+
+
+def squares(folder: Path) -> Study:
+    return Study(
+        name="page.squares",
+        about="Squares.",
+        document="page.md",
+        shared=("--jobs", "--threads", "--development"),
+        options={"numbers": {"nargs": "+", "type": int}, "--unit": {"default": "mm"}},
+        settings=lambda options: {"unit": options.unit},
+        tasks=lambda options: [Task(str(n), square, (n, folder)) for n in options.numbers],
+        tables=lambda record: {"squares": table(record["rows"].values(), {"n": "{n}", "squared": "{square}"})},
+        verdict=lambda record: all(row["n"] < 9 for row in record["rows"].values()),
+    )
+
+
+def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path, capsys):
+    (tmp_path / "page.md").write_text(PAGE)
+    study, output = squares(tmp_path), ["--output", str(tmp_path / "out")]
+    assert study.main(["3", "13", *output]) == InputError.exit_code
+    assert "page.squares: 13 is refused" in capsys.readouterr().err
+    assert list(json.loads((tmp_path / "out" / "squares.json").read_text())["rows"]) == ["3"]
+    # 3 is not measured again, 4 has no row, rows stand in the order of the tasks
+    assert study.main(["2", "3", "4", *output, "--docs", str(tmp_path / "page.md")]) == 0
+    assert "1 rows kept" in capsys.readouterr().out
+    lines = "| n | squared |\n| --- | ---: |\n| 2 | 4 |\n| 3 | 9 |"
+    assert (tmp_path / "page.md").read_text() == PAGE.replace("old", lines)
+    assert (tmp_path / "out" / "squares.md").read_text() == lines + "\n"
+    assert study.main(["9", *output]) == 1  # the verdict
+
+
+def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path, capsys):
+    study, output = squares(tmp_path), ["--output", str(tmp_path / "out")]
+    assert study.main(["2", "3", *output]) == 0
+    before = (tmp_path / "out" / "squares.json").read_bytes()
+    assert study.main(["5", *output, "--unit", "m"]) == InputError.exit_code
+    assert "measured with unit mm instead of m" in capsys.readouterr().err
+    assert study.main(["2", *output, "--unit", "m", "--fresh"]) == InputError.exit_code  # 3 would be lost
+    assert (tmp_path / "out" / "squares.json").read_bytes() == before
+    for path in tmp_path.glob("measured-*"):
+        path.unlink()
+    assert study.main(["2", "3", *output, "--unit", "m", "--fresh"]) == 0
+
+
+def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path):
+    new = {"preset": "fast", "machine": {"commit": "a"}, "rows": {}}
+    path = tmp_path / "record.json"
+    assert resumed(path, new, set()) == new
+    path.write_text(json.dumps(new | {"rows": {"a": {"x": 1}, "b": {"x": 2}, "c": {"skipped": "no data"}}}))
+    assert resumed(path, new, {"a"})["rows"] == {"b": {"x": 2}}
+    path.write_text("[]")
+    with pytest.raises(InputError, match="not a record"):
+        resumed(path, new, set())
+
+
+def test_jobs_run_in_processes_of_their_own(tmp_path):
+    assert squares(tmp_path).main(["2", "3", "--jobs", "2", "--output", str(tmp_path / "out")]) == 0
+    rows = json.loads((tmp_path / "out" / "squares.json").read_text())["rows"]
+    assert [row["square"] for row in rows.values()] == [4, 9]
+    assert os.getpid() not in {row["process"] for row in rows.values()}
+
+
+def test_subjects_that_were_looked_at_are_not_published(tmp_path, capsys):
+    (tmp_path / "page.md").write_text(PAGE)
+    words = ["2", "--development", "--docs", str(tmp_path / "page.md"), "--output", str(tmp_path)]
+    assert squares(tmp_path).main(words) == InputError.exit_code
+    assert "leave out --development" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        squares(tmp_path).main(["2", "--jobs", "0"])
+
+
+def test_cells_of_tables():
+    rows = [{"name": "a", "scores": {"V prior": 1.26}}, {"name": "b", "scores": {}}]
+    text = table(rows, [("", "{name}"), ("dB", "{scores[V prior]:.1f}"), ("dB", lambda row: len(row["scores"]))])
+    assert text.splitlines() == ["|  | dB | dB |", "| --- | ---: | ---: |", "| a | 1.3 | 1 |", "| b |  | 0 |"]
+    assert [spread([1.0, 2.0, 3.0], "{:+.1f}"), spread([1.0]), spread([])] == ["+2.0 ± 1.0", "1.00", "-"]
+    assert details("All", "x") == "<details><summary>All</summary>\n\nx\n\n</details>"
+
+
+@pytest.mark.parametrize("module", STUDIES)
+def test_every_study_starts(module, capsys):
+    found = import_module(module)
+    with pytest.raises(SystemExit, match="0"):
+        (found.STUDY if hasattr(found, "STUDY") else found).main(["--help"])
+    assert f"python -m {module}" in capsys.readouterr().out

@@ -1,0 +1,164 @@
+"""Studies of the prior: statistics and marks of their tables, subjects and networks; nothing is trained here."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from g3r.planning.presets import PRESETS, changed
+from studies.motion import sweep
+from studies.prior import ablation, alone, cases, network_scores, networks
+from studies.prior.figures import draw_ablation, draw_networks
+from studies.prior.volumes import slices_at_true_poses
+from studies.subjects import read_case
+
+SETTINGS = {"preset": "balanced", "weights": "abc", "threads": 2, "n_views": 4}
+
+
+def ablation_rows(gain=(2.0, 1.0, 0.5)):
+    """Two subjects, from 1 and 3 stacks."""
+    rows = {}
+    for number, (name, volume) in enumerate({"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()):
+        for n in (3, 1):
+            psnr = dict.fromkeys(ablation.VARIANTS, 20.0 + n + number)
+            psnr["with distillation"] += gain[n - 1] * (1 + number)
+            rows[f"{name} {n}"] = {
+                "subject": name,
+                "n_stacks": n,
+                "volume": volume,
+                "scores": {v: {"psnr_db": db, "ssim": 0.9} for v, db in psnr.items()},
+                "median_mm": dict.fromkeys(ablation.FITS_COMPARED, 0.25),
+            }
+    return rows
+
+
+def test_ablation_table_gives_mean_spread_and_paired_difference():
+    text = ablation.tables(SETTINGS | {"rows": ablation_rows()})["ablation"]
+    assert "| fit without prior | 21.50 ± 0.71 | 0.900 ± 0.000 |  |" in text
+    assert "| with distillation | 24.50 ± 2.12 | 0.900 ± 0.000 | +3.00 ± 1.41 |" in text
+    assert "| with distillation, sb | 26.00 | 0.900 | +4.00 |" in text
+    assert "2 subjects (1 sta, 1 sb)" in text
+    assert "1 stack: +2.00 dB (2 of 2 better); 3 stacks: +0.50 dB" in text
+    assert "| b | 1 | 22.00 | 22.00 | 22.00 | 22.00 | 22.00 | 26.00 | 0.25 |" in text
+    assert "2 stacks" not in text
+
+
+def test_ablation_subjects_are_many_fresh_and_of_their_own():
+    published, looked_at = ablation.specs(), ablation.specs(development=True)
+    assert len(published) >= 8
+    assert {one.seed for one in published}.isdisjoint(one.seed for one in looked_at)
+    sweeps = [sweep.specs(sweep.LEVELS, 100, development=dev) for dev in (False, True)]
+    assert {one.seed for one in published}.isdisjoint(one.seed for subjects in sweeps for one in subjects)
+    assert all(any(one.volume.startswith(p) for p in ablation.GROUPS.values()) for one in published)
+    for options in ablation.FITS_COMPARED.values():
+        changed(PRESETS["balanced"], options)
+
+
+def test_alone_table_marks_what_falls_short():
+    def row(n_stacks, gain, ssim):
+        psnr = {"V_coarse": 20.0, "V_sharp": 21.0, "V_prior": 20.0 + gain}
+        scores = {name: {"psnr_db": db, "ssim": ssim} for name, db in psnr.items()}
+        return {"case": "c", "n_stacks": n_stacks, "scores": scores, "seconds": 2.5}
+
+    speed = {"shape": [9, 8, 7], "voxel_mm": 0.8, "seconds": dict.fromkeys(alone.VOLUMES, 5.5), "tile_voxels": 72}
+    speed |= {"tiling_difference": 2e-4, "all_views_seconds": 4.9}
+    rows = {"a": row(1, 2.9, 0.81), "b": row(3, 2.1, 0.84), "c": row(2, 0.5, 0.5), alone.SPEED: speed}
+    text = alone.tables(SETTINGS | {"rows": rows})["alone"]
+    assert "| 22.90 / 0.810 | +2.90 (!) | 0.810 | 2.5 |" in text
+    assert "| +2.10 | 0.840 (!) | 2.5 |" in text
+    assert "| +0.50 | 0.500 | 2.5 |" in text  # nothing was asked of two stacks
+    assert "the network 5.5 s (asked: under 5 (!)), and the mean over the 4 views of the product 4.9 s." in text
+    assert "2.0e-04 of the intensity scale (asked: 0.001)" in text
+
+
+def test_cases_table_marks_a_prior_that_costs():
+    def row(gain):
+        scores = {v: {"psnr_db": 25.0, "ssim": 0.9} for v in ablation.VARIANTS}
+        scores[cases.PRODUCT] = {"psnr_db": 25.0 + gain, "ssim": 0.9}
+        return {"n_stacks": 3, "scores": scores, "median_mm": {cases.PRODUCT: 0.07}}
+
+    text = cases.tables(SETTINGS | {"rows": {"good": row(0.4), "bad": row(-0.3)}})["cases"]
+    assert "| 25.40 | +0.40 | 0.900 | 0.07 |" in text
+    assert "| 24.70 | -0.30 (!) | 0.900 | 0.07 |" in text
+
+
+def network_record():
+    scores = {n: {"l1": 0.05, "psnr_db": 25.0 + k, "ssim": 0.9} for k, n in enumerate(("1", "2", "all"))}
+    one = {"scores": scores, "parameters": 1_500_000, "seconds": 2.5, "steps": 288, "train_seconds": 600}
+    rows = {"size-16-32-64": {**one, "what": "small", "is_size": True}, "full": {**one, "what": "all", "is_size": True}}
+    return SETTINGS | {"rows": {"V_coarse": {"scores": scores}, "V_sharp": {"scores": scores}, **rows}}
+
+
+def test_network_table():
+    text = networks.tables(network_record())["networks"]
+    assert "| V_coarse |  | 0.0500 | 25.00 | 26.00 | 27.00 | 0.900 |  |  |  |  |" in text
+    assert "| full | all | 0.0500 | 25.00 | 26.00 | 27.00 | 0.900 | 1.50 M | 2.5 | 288 | 10 |" in text
+    assert text.index("| full |") < text.index("| size-16-32-64 |")
+
+
+def test_networks_differ_from_the_configuration():
+    config = networks.configuration()
+    found = {variant.name for variant in networks.distinct_variants(config)}
+    assert "size-" + "-".join(map(str, config["model"]["channels"])) not in found
+    assert {"full", "no-gate", "no-density", "no-density-no-gate", "no-sharp"} <= found
+    per_epoch = networks.epochs_of(10**6, config) / 10**6
+    assert networks.epochs_of(1, config) == 1
+    assert networks.epochs_of(300, config) == max(1, round(300 * per_epoch))
+    own = ["--data.subjects_per_epoch=6", "--data.patches_per_subject=4", "--data.batch_size=2", "--data.source=9"]
+    assert networks.epochs_of(36, config, own) == 3
+
+
+def test_network_options_are_those_of_the_module():
+    training = pytest.importorskip("g3r.training.prior_module", reason="the training extra is not installed")
+    for variant in networks.VARIANTS:
+        training.PriorModule(**{"channels": [8, 8, 8], **variant.options})
+
+
+def test_scores_by_number_of_stacks():
+    pytest.importorskip("torchmetrics", reason="the training extra is not installed")
+    truth = torch.rand(1, 1, 12, 12, 12)
+    volumes = [{"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)]
+    scores = network_scores.scores_by_stacks([truth + error for error in (0.1, 0.01, 0.03)], volumes)
+    assert scores["1"]["psnr_db"] == pytest.approx(20, abs=1e-3)
+    assert scores["3"]["l1"] == pytest.approx(0.02, abs=1e-6)
+    assert scores["all"]["l1"] == pytest.approx(0.14 / 3, abs=1e-6)
+
+
+def test_a_table_without_training_needs_a_record(tmp_path, capsys):
+    assert networks.STUDY.main(["--no-train", "--output", str(tmp_path)]) == 3
+    assert "no trained variant" in capsys.readouterr().err
+
+
+def test_the_newest_checkpoint_is_gone_on_with(tmp_path):
+    assert networks.newest_checkpoint(tmp_path) is None
+    for version, age in ((0, 50), (1, 10)):
+        path = tmp_path / "logs" / f"version_{version}" / "checkpoints" / "last.ckpt"
+        path.parent.mkdir(parents=True)
+        path.write_text("")
+        os.utime(path, (1e9 - age, 1e9 - age))
+    assert networks.newest_checkpoint(tmp_path) == path
+
+
+def test_figures_are_drawn_from_records(tmp_path):
+    draw_ablation(list(ablation_rows().values()), ablation.VARIANTS, ablation.BASELINE, tmp_path / "new" / "a.png")
+    draw_networks(network_record(), tmp_path / "b.png")
+    assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["a.png", "b.png"]  # no temporary file
+
+
+def test_slices_without_a_true_pose_are_left_out(tmp_path, rng):
+    from g3r.acquisition.images import save_volume
+
+    affine = np.diag([1.0, 1.0, 3.0, 1.0])
+    save_volume(tmp_path / "stack-0.nii.gz", rng.random((12, 12, 6)).astype(np.float32), affine)
+    save_volume(tmp_path / "mask-0.nii.gz", np.ones((12, 12, 6), bool), affine)
+    lines = ["stack slice rx ry rz tx ty tz".replace(" ", "\t")]
+    lines += [f"0\t{k}\t0\t0\t0.1\t{k}\t0\t0" for k in range(5)]
+    (tmp_path / "poses.tsv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    slices = slices_at_true_poses(read_case(tmp_path), 1)
+    assert slices.slice_index.tolist() == [0, 1, 2, 3, 4]
+    motion = slices.world_from_header()
+    np.testing.assert_allclose(motion.translation_mm[:, 0], range(5), atol=1e-9)
+    np.testing.assert_allclose(motion.rotvec_rad()[:, 2], 0.1, atol=1e-9)

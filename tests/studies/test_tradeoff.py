@@ -1,0 +1,99 @@
+"""Studies of the trade-off: steps read off a curve, marks in tables, few Gaussians for a ball, a small phantom."""
+
+import numpy as np
+import pytest
+
+from g3r.bench.record import machine
+from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
+from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget
+from studies.tradeoff import convergence, gaussian_count, memory, peer_phantom, time_budgets
+from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
+
+
+def test_steps_are_interpolated_on_their_logarithm():
+    assert steps_to_near([10, 40], [20.0, 22.0], 21.1) == pytest.approx(20.0)
+
+
+def test_a_curve_that_is_there_from_the_start_or_never():
+    assert steps_to_near([10, 40], [22.0, 22.0], 22.05) == 10
+    assert steps_to_near([10, 40], [20.0, 21.0], 22.0) is None
+
+
+def test_convergence_measures_every_way_against_the_best_of_all():
+    rows = {}
+    for way in WAYS:
+        low = 0.0 if way == "few Gaussians first (as shipped)" else 3.0
+        for k, n in enumerate(STEPS):
+            row = {"case": "one", "way": way, "steps": n, "psnr_db": 20.0 + k - low, "n_gaussians": 7}
+            rows[f"{way} {n}"] = row | {"cpu_s": float(n)}
+    text = convergence.tables({"preset": "balanced", "rows": rows})["convergence"]
+    assert text.count("never") == len(WAYS) - 1
+    assert (
+        "| one | few Gaussians first (as shipped) | 7 | 20.00 | 21.00 | 22.00 | 23.00 | 24.00 | 25.00 | 299 |" in text
+    )
+
+
+def test_budgets_mark_what_is_late_or_worse_and_nothing_else():
+    given = [(10, 13.0, 30.0), (20, 24.1, 29.95), (30, 30.0, 29.8)]
+    more = {"case": "one", "motion": "draft", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
+    rows = {str(b): {"budget_s": b, "seconds": s, "psnr_db": db, **more} for b, s, db in given}
+    text = time_budgets.tables({"rows": rows})["time-budgets"]
+    lines = [line for line in text.splitlines() if line.startswith("| one")]
+    assert [line.count("(!)") for line in lines] == [0, 1, 1]
+    assert "24.1 (!)" in lines[1]
+    assert "29.80 (!)" in lines[2]
+    assert "1,234" in lines[0]
+
+
+def test_memory_is_judged_by_statements_and_limits():
+    stated = dict.fromkeys(("weeks", "stacks", "threads"), 1) | {"preset": "draft", "more": "", "voxel_mm": 0.5}
+    stated |= {"stage": "prior", "stated_bytes": 1.2e9, "measured_bytes": 1e9}
+    limit = {"name": "a", "limit_bytes": 1e9, "stated_bytes": 9e8, "measured_bytes": 9e8, "changes": []}
+    limit |= {"cpu_seconds": 9.0, "psnr_db": 28.0}
+    refused = {"name": "a", "limit_bytes": 5e8, "refused": "too small; ask for more"}
+    record = {"most": 1.5, "machine": machine(), "rows": {"a": stated, "b": {"limited": [limit, refused]}}}
+    text = memory.tables(record)
+    assert "| 1.20 GB | prior | 1.00 GB | 1.20 |" in text["memory"]
+    assert "| a | 1.00 GB | 0.90 GB | 0.90 GB | 9 | 28.00 | nothing |" in text["memory-limits"]
+    assert "| a | 0.50 GB | refused |  |  |  | too small |" in text["memory-limits"]
+    assert memory.keeps_its_word(record)
+    for broken in ({"a": stated | {"measured_bytes": 1.3e9}}, {"b": {"limited": [limit | {"measured_bytes": 2e9}]}}):
+        assert not memory.keeps_its_word(record | {"rows": record["rows"] | broken})
+
+
+def test_a_lattice_is_read_between_its_points_alone():
+    rows = [{"psnr_db": 20.0, "n": 100}, {"psnr_db": 30.0, "n": 10_000}]
+    assert gaussian_count.uniform_number(rows, 25.0) == pytest.approx(1000)
+    assert gaussian_count.uniform_number(rows, 31.0) is None
+    case = {"adaptive": [{"bound": 0.1, "psnr_db": 25.0, "n": 500, **dict.fromkeys(DONE, 1)}], "uniform": rows}
+    record = {"rows": {"ball": case, "atlas": {"skipped": "no test data"}}}
+    text = gaussian_count.tables(record)["gaussian-count"]
+    assert "| ball | 0.1 | 25.0 | 500 | 1000 | 50 % | 1 + 1 - 1 - 1 |" in text
+    assert "atlas: left out, no test data" in text
+
+
+DONE = ("n_seeded", "n_added", "n_dropped", "n_merged")
+
+
+def test_a_ball_needs_few():
+    """On voxels of 1.6 mm, to be quick: under 500 Gaussians, where a lattice of twice as many is worse."""
+    volume, mask, grid = gaussian_count.ball(1.6)
+    stage = PriorStageSettings(n_steps=15, scale_weight=0.0)
+    settings = AdaptiveSettings(bound=0.1, start=4.0, round_steps=25, last_steps=25)
+    cloud, done = fit_adaptive(volume, mask, grid, 4.0, settings, stage, np.random.default_rng(1))
+    target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
+    assert len(cloud) < gaussian_count.BALL_MOST
+    psnr = gaussian_count.psnr_db(cloud, target)
+    assert psnr > 27.5  # 28.8 with one thread; sums of gradients depend on their number
+    uniform = gaussian_count.lattice_cloud((volume, mask, grid), 7.0, done.steps, 24, 1)
+    assert len(uniform) > 1.6 * len(cloud)
+    assert psnr > gaussian_count.psnr_db(uniform, target)
+
+
+def test_the_small_phantom_has_the_size_of_the_other_methods(tmp_path, capsys):
+    assert peer_phantom.main(["--output", str(tmp_path / "small")]) == 0
+    said = capsys.readouterr().out
+    assert "truth 64x64x64, stacks 58x58x18, 58x58x18, 58x58x18" in said
+    truth = peer_phantom.small_head(1)
+    extent_mm = (np.ptp(np.argwhere(truth.mask), axis=0) + 1) * peer_phantom.VOXEL_MM
+    assert extent_mm.max() == pytest.approx(peer_phantom.LENGTH_MM, abs=2)
