@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +25,9 @@ from g3r.output.record import Clock, skipped_slice_notes
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import TimeBudget
-from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
-from g3r.pose_network.inference import predict_poses
-from g3r.pose_network.network import PoseNetwork
-from g3r.prior.checkpoint import PriorCheckpoint, load_prior
-from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import estimate_prior
+from g3r.pose_network.model import PoseModel
+from g3r.prior.inference import Tiling
+from g3r.prior.model import VOXEL_MM_TOLERANCE, Prior
 from g3r.registration import Registration, register
 from g3r.registration.prior_registration import register_to_prior
 from g3r.registration.quality import pose_warnings, stack_qualities
@@ -40,9 +36,6 @@ from g3r.run.allocator import release_memory
 from g3r.run.deadline import Deadline
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
 from g3r.run.stop_request import StopRequest
-
-DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
-DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
@@ -73,10 +66,8 @@ class GaussianReconstructor:
     progress: Progress = lambda stage, done, total: None
     pose_checkpoint: str | os.PathLike[str] | None = None
     observer: FitObserver | None = None
-    pose_network: PoseNetwork | None = field(init=False, default=None)
-    pose_meta: PoseCheckpoint | None = field(init=False, default=None)
-    network: DensityGatedPriorNetwork | None = field(init=False, default=None)
-    prior_meta: PriorCheckpoint | None = field(init=False, default=None)
+    prior: Prior | None = field(init=False, default=None)
+    pose_model: PoseModel | None = field(init=False, default=None)
     _at: tuple[str, int, int] = field(init=False, default=("", 0, 0))
 
     def __post_init__(self) -> None:
@@ -88,11 +79,15 @@ class GaussianReconstructor:
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
         if self.settings.use_prior:
-            path = Path(self.checkpoint or DEFAULT_CHECKPOINT)
-            self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
+            self.prior = Prior.load(self.checkpoint)
+            found_mm, wanted_mm = self.prior.voxel_mm, self.settings.prior_voxel_mm
+            if not abs(found_mm - wanted_mm) <= VOXEL_MM_TOLERANCE:
+                raise InputError(
+                    f"{self.prior.file_name}: was trained on voxels of {found_mm:g} mm, expected {wanted_mm:g} mm; "
+                    f"pass another file, or --prior-voxel {found_mm:g} if that is what you want"
+                )
         if self.settings.registration.template or self.settings.registration.network:
-            path = Path(self.pose_checkpoint or DEFAULT_POSE_CHECKPOINT)
-            self.pose_network, self.pose_meta = load_pose_network(path)
+            self.pose_model = PoseModel.load(self.pose_checkpoint)
 
     def reconstruct(
         self,
@@ -149,8 +144,8 @@ class GaussianReconstructor:
         run = RunSoFar(
             stacks,
             settings,
-            self.prior_meta,
-            self.pose_meta,
+            self.prior,
+            self.pose_model,
             motion,
             qualities,
             volume,
@@ -208,14 +203,13 @@ class GaussianReconstructor:
         """
         chosen = settings or self.settings
         assert isinstance(chosen, ReconstructionSettings)
-        template = self.pose_meta.template if self.pose_meta else None
+        template = self.pose_model.template if self.pose_model else None
         proposals = {}
         wanted = chosen.registration.network
         if chosen.registration.network_as_reserve:
             wanted &= template is None or not template_fits(slices, template)
-        if self.pose_network is not None and self.pose_meta is not None and wanted:
-            pose = predict_poses(self.pose_network, self.pose_meta, slices)
-            proposals["network"] = pose @ slices.header_pose.inverse()
+        if self.pose_model is not None and wanted:
+            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(
             slices,
             chosen.registration,
@@ -245,7 +239,7 @@ class GaussianReconstructor:
         def make() -> PriorVolume:
             nonlocal chosen
             clock, gain = stages.clock, motion.gain
-            voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else settings.resolution_mm
+            voxel_mm = self.prior.voxel_mm if self.prior else settings.resolution_mm
             with clock("coarse"):
                 start = FitStart.of(motion.slices, gain, motion.weight, voxel_mm)
             if budget:
@@ -267,17 +261,11 @@ class GaussianReconstructor:
         return stages.once("prior", make), chosen
 
     def _prior(self, start: FitStart, settings: ReconstructionSettings) -> NDArray[np.float32]:
-        if self.network is None:
+        if self.prior is None:
             return start.sharp
-        prior = estimate_prior(
-            self.network,
-            start.coarse,
-            start.density,
-            start.sharp,
-            n_views=settings.prior_views,
-            max_whole_voxels=settings.prior_whole_voxels,
-            tile_voxels=settings.prior_tile_voxels,
-            halo_voxels=settings.prior_halo_voxels,
+        tiling = Tiling(settings.prior_whole_voxels, settings.prior_tile_voxels, settings.prior_halo_voxels)
+        prior = self.prior.estimate(
+            start.coarse, start.density, start.sharp, n_views=settings.prior_views, tiling=tiling
         )
         release_memory()  # the most that is ever freed at a time
         return prior

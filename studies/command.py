@@ -25,7 +25,7 @@ def parser_of(name: str, description: str, folder: Path) -> argparse.ArgumentPar
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--preset", default="balanced", help="settings")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior (None: the one shipped)")
+    parser.add_argument("--ckpt", metavar="PRIOR.safetensors", help="prior (None: the one shipped)")
     parser.add_argument("--threads", type=int, help="(None: all cores, shared out)")
     parser.add_argument("--output", type=Path, default=folder, help="for the record as JSON and Markdown")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")

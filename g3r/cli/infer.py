@@ -187,15 +187,10 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
 
 def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
     """Refuse what can be seen without reading an image."""
-    from g3r.checkpoints.archive import check_archive
     from g3r.output.result import check_output_folder
 
-    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
-    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
-    check_output_folder(folder, replace=replaces, inputs=inputs)
-    for kind, path in networks.items():
-        if path:
-            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
+    networks = [path for path in (options.ckpt, options.pose_ckpt) if path]
+    check_output_folder(folder, replace=replaces, inputs=[*options.stacks, *(options.masks or ()), *networks])
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
 
@@ -229,13 +224,13 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
 def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
     from g3r.output.earlier_run import FileHash, Inputs
-    from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
 
+    prior, pose = reconstructor.prior, reconstructor.pose_model
     return Inputs(
         tuple(map(FileHash.of, options.stacks)),
         tuple(map(FileHash.of, options.masks or [])),
-        FileHash.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
-        FileHash.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+        FileHash(prior.file_name, prior.file_sha256) if prior else None,
+        FileHash(pose.file_name, pose.file_sha256) if pose else None,
     )
 
 

@@ -30,9 +30,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="slice thickness, one for all or one per stack (default: the distance of slices)",
     )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument("--ckpt", metavar="PRIOR.safetensors", help="prior from g3r-export (default: the one shipped)")
     parser.add_argument(
-        "--pose-ckpt", metavar="POSE.pt", help="pose network and mean heads from g3r-export (default: shipped)"
+        "--pose-ckpt", metavar="POSE.safetensors", help="pose network and mean heads from g3r-export (default: shipped)"
     )
     parser.add_argument(
         "--space",

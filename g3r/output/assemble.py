@@ -22,8 +22,8 @@ from g3r.output.record import inactive_terms, run_record
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.time_budget import TimeBudget
-from g3r.pose_network.checkpoint import PoseCheckpoint
-from g3r.prior.checkpoint import PriorCheckpoint
+from g3r.pose_network.model import PoseModel
+from g3r.prior.model import Prior
 from g3r.registration import Registration
 from g3r.registration.quality import StackQuality, registration_reliable
 from g3r.run.allocator import release_memory
@@ -55,7 +55,7 @@ class RunSoFar:
     Attributes:
         stacks: as they were given.
         settings: as they are used.
-        prior_meta, pose_meta: of the networks; None where one is not used.
+        prior, pose_model: the networks; None where one is not used.
         motion: the registration, and what each stack's is worth.
         volume: the prior volume and what it was made of.
         intensity: what 1 stands for in the fit.
@@ -66,8 +66,8 @@ class RunSoFar:
 
     stacks: Sequence[Stack]
     settings: ReconstructionSettings
-    prior_meta: PriorCheckpoint | None
-    pose_meta: PoseCheckpoint | None
+    prior: Prior | None
+    pose_model: PoseModel | None
     motion: Registration
     qualities: list[StackQuality]
     volume: PriorVolume
@@ -188,8 +188,8 @@ def _record(run: RunSoFar, first: PriorCloud, fit: SliceFit) -> dict[str, Any]:
     settings, stages = run.settings, run.stages
     record = run_record(
         settings,
-        run.prior_meta,
-        run.pose_meta,
+        run.prior,
+        run.pose_model,
         run.stacks,
         run.volume.start.slices,
         run.motion,

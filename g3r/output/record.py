@@ -19,8 +19,8 @@ from g3r.acquisition.stacks import Stack
 from g3r.fitting.slice_stage import SliceFit
 from g3r.planning.memory_estimate import peak_bytes
 from g3r.planning.presets import ReconstructionSettings
-from g3r.pose_network.checkpoint import PoseCheckpoint
-from g3r.prior.checkpoint import PriorCheckpoint
+from g3r.pose_network.model import PoseModel
+from g3r.prior.model import Prior
 from g3r.registration import Registration
 from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 
@@ -29,8 +29,8 @@ logger = logging.getLogger(__name__)
 
 def run_record(
     settings: ReconstructionSettings,
-    prior: PriorCheckpoint | None,
-    pose: PoseCheckpoint | None,
+    prior: Prior | None,
+    pose: PoseModel | None,
     stacks: Sequence[Stack],
     slices: Slices,
     motion: Registration,
@@ -48,8 +48,8 @@ def run_record(
         "g3r": __version__,
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         "settings": asdict(settings),
-        "prior": asdict(prior) if prior else None,
-        "pose_network": {"training_data": pose.training_data, "g3r_version": pose.g3r_version} if pose else None,
+        "prior": prior.record() if prior else None,
+        "pose_network": pose.record() if pose else None,
         "stacks": [
             {
                 "name": stack.name,

@@ -63,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from g3r.bench.record import available_cores, machine, use_threads
-    from g3r.reconstruct import DEFAULT_CHECKPOINT, GaussianReconstructor
+    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
+    from g3r.reconstruct import GaussianReconstructor
     from studies.lesions.runs import lesion_run, lesion_subject
     from studies.prior.volumes import file_digest
     from studies.runs import preset_settings
@@ -89,7 +90,7 @@ def _run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     record: dict[str, Any] = {
         "preset": options.preset,
-        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "weights": file_digest(Path(options.ckpt or SHIPPED_PRIOR)),
         "machine": machine(),
         "rows": [],
     }

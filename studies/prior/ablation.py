@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from g3r.bench.record import available_cores, machine
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
+    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
     from studies.prior.volumes import file_digest
     from studies.runs import preset_settings
     from studies.subjects import test_data_folder
@@ -116,7 +116,7 @@ def _run(options: argparse.Namespace) -> int:
     path = options.output / "ablation.json"
     record: dict[str, Any] = {
         "preset": options.preset,
-        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "weights": file_digest(Path(options.ckpt or SHIPPED_PRIOR)),
         "jobs": options.jobs,
         "threads": threads,
         "machine": machine(),

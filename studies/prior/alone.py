@@ -56,17 +56,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from g3r.bench.record import available_cores, machine, use_threads
+    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
     from g3r.evaluation.case import load_case
-    from g3r.prior.checkpoint import load_prior
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
+    from g3r.prior.model import Prior
     from studies.motion.layers import THICKNESS_MM, case_folders
     from studies.prior.volumes import file_digest
     from studies.runs import preset_settings
     from studies.subjects import test_data_folder
 
     root = test_data_folder()
-    checkpoint = Path(options.ckpt or DEFAULT_CHECKPOINT)
-    network, meta = load_prior(checkpoint)
+    checkpoint = Path(options.ckpt or SHIPPED_PRIOR)
+    prior = Prior.load(checkpoint)
     n_views = preset_settings(options.preset).prior_views
     threads = options.threads or available_cores()
     use_threads(threads)
@@ -82,10 +82,10 @@ def _run(options: argparse.Namespace) -> int:
     for folder in case_folders(root / "cases", options.cases):
         case = load_case(folder, THICKNESS_MM.get(folder.name))
         for n_stacks in sorted({1, len(case.stacks)}):
-            rows.append(measure(case, n_stacks, network, meta.voxel_mm, n_views))
+            rows.append(measure(case, n_stacks, prior.network, prior.voxel_mm, n_views))
             print(_line(rows[-1]), flush=True)
     if not options.no_speed:
-        record["speed"] = measure_speed(network, meta.voxel_mm, n_views, root / "atlas", options.cache)
+        record["speed"] = measure_speed(prior.network, prior.voxel_mm, n_views, root / "atlas", options.cache)
     write_json(options.output / "alone.json", record)
     text = alone_tables(record)
     write_text(options.output / "alone.md", text)

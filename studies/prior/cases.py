@@ -35,8 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from g3r.bench.record import available_cores, machine, use_threads
+    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
     from g3r.evaluation.case import load_case
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
     from studies.prior.volumes import file_digest
     from studies.runs import preset_settings
     from studies.subjects import test_data_folder
@@ -47,7 +47,7 @@ def _run(options: argparse.Namespace) -> int:
     rows: dict[str, Any] = {}
     record = {
         "preset": options.preset,
-        "weights": file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT)),
+        "weights": file_digest(Path(options.ckpt or SHIPPED_PRIOR)),
         "threads": threads,
         "machine": machine(),
         "cases": rows,

@@ -133,10 +133,10 @@ def _check(options: argparse.Namespace, found: list[Judged]) -> str:
 
 def _weights(options: argparse.Namespace) -> str | None:
     """Which prior the figures belong to."""
-    from g3r.reconstruct import DEFAULT_CHECKPOINT
+    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
     from studies.prior.volumes import file_digest
 
-    return None if options.no_prior else file_digest(Path(options.ckpt or DEFAULT_CHECKPOINT))
+    return None if options.no_prior else file_digest(Path(options.ckpt or SHIPPED_PRIOR))
 
 
 if __name__ == "__main__":
