@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
+from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, normalised_slices, with_pixels_of
@@ -61,10 +62,10 @@ class GaussianReconstructor:
         InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
     """
 
-    checkpoint: str | os.PathLike[str] | None = None
+    checkpoint: str | os.PathLike[str] | WeightsFile | None = None
     settings: ReconstructionSettings | str = "balanced"
     progress: Progress = lambda stage, done, total: None
-    pose_checkpoint: str | os.PathLike[str] | None = None
+    pose_checkpoint: str | os.PathLike[str] | WeightsFile | None = None
     observer: FitObserver | None = None
     prior: Prior | None = field(init=False, default=None)
     pose_model: PoseModel | None = field(init=False, default=None)

@@ -22,7 +22,7 @@ from g3r.errors import G3RError, InputError
 FORMAT_VERSION = 2
 
 TRAINING_ENTRY = "g3r_export"
-"""Entry of a Lightning checkpoint that holds, in plain values, what an export needs beside the weights."""
+"""Entry of a Lightning checkpoint that holds, in plain values, what an export needs apart from the weights."""
 
 DAMAGED = "copy or export it again"
 
@@ -117,17 +117,18 @@ class TrainedModel:
         write_weights(Path(path), description, tensors)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str] | None = None) -> Self:
+    def load(cls, source: str | os.PathLike[str] | WeightsFile | None = None) -> Self:
         """Read an exported file. Nothing in it is executed, and everything it claims is checked.
 
         Args:
-            path: file written by `save`; None takes the weights that ship with the package.
+            source: path of a file written by `save`, or that file as `read_weights` gives it; None takes the
+                weights that ship with the package.
 
         Raises:
             InputError: missing, of another kind, format version or convention, damaged, with weights that do not
                 fit the network, or with values that make no sense.
         """
-        file = read_weights(Path(path or cls.shipped), cls.kind)
+        file = source if isinstance(source, WeightsFile) else read_weights(Path(source or cls.shipped), cls.kind)
         said = file.description
         _check_identity(file, cls.kind, {"format_version": FORMAT_VERSION, **cls.conventions})
         try:

@@ -56,9 +56,11 @@ class TensorClaim:
         return math.prod(self.shape) * BYTES_PER_VALUE[self.dtype]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class WeightsFile:
     """A file of exported weights whose header has been checked; the tensors are decoded on demand.
+
+    It can be read without torch, and handed to `TrainedModel.load` later.
 
     Attributes:
         path: of the file.

@@ -24,6 +24,7 @@ from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
+    from g3r.checkpoints.weights_file import WeightsFile
     from g3r.output.earlier_run import EarlierRun, Inputs
     from g3r.output.result import ReconstructionResult
     from g3r.planning.memory_limit import MemoryPlan
@@ -75,7 +76,7 @@ def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
 
     folder = Path(options.output)
     replaces = options.force or (options.resume and is_partial(folder))
-    _check_files(options, folder, replaces=replaces)  # before any work
+    weights = _check_files(options, folder, replaces=replaces)  # before any work
     with _lines_held_back():
         earlier = _earlier(options)
         stacks = _load(options, earlier)
@@ -86,7 +87,7 @@ def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
 
         n_threads = _use_threads(options.threads or (earlier.n_threads if earlier else None))
         settings = earlier.settings if earlier else _settings(options)
-        reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+        reconstructor = GaussianReconstructor(weights.get("prior"), settings, pose_checkpoint=weights.get("pose"))
         inputs = _inputs(options, reconstructor)
         plan = plan_for_stacks(stacks, settings, options.max_memory)
         reconstructor.settings = plan.settings
@@ -185,16 +186,19 @@ def _earlier(options: argparse.Namespace) -> EarlierRun | None:
     return earlier
 
 
-def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
-    """Refuse what can be seen without reading an image."""
+def _check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
+    """Refuse what can be seen without reading an image; return the files of networks."""
+    from g3r.checkpoints.weights_file import read_weights
     from g3r.output.result import check_output_folder
 
-    networks = [path for path in (options.ckpt, options.pose_ckpt) if path]
-    check_output_folder(folder, replace=replaces, inputs=[*options.stacks, *(options.masks or ()), *networks])
+    paths = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    networks = {kind: path for kind, path in paths.items() if path}
+    check_output_folder(folder, replace=replaces, inputs=[*options.stacks, *(options.masks or ()), *networks.values()])
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
 
         check_tensorboard(Path(options.tensorboard))
+    return {kind: read_weights(Path(path), kind) for kind, path in networks.items()}
 
 
 def _load(options: argparse.Namespace, earlier: EarlierRun | None) -> list[Stack]:

@@ -15,14 +15,14 @@ SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0]
 """Points of a slice over which a pose error is averaged."""
 N_REFINEMENTS = 2
 VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
-"""Turns by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
+"""Rotations by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
 
 The network sees all four and the answers are averaged, which takes a fifth off the error.
 """
 VIEW_SCALE_MM = 3.0
 """Views further than this from the mean count less in it, in proportion."""
 ROTATION_ARM_MM = 25.0
-"""At this distance from a slice's centre a turn is measured in mm."""
+"""Distance from a slice's centre at which a rotation is measured in mm."""
 ROBUST_SCALE_MM = 3.0
 """Slices further than this from their stack's common motion count less in it, in proportion."""
 ROBUST_STEPS = 12

@@ -30,7 +30,7 @@ COARSE_SHAPE, COARSE_SPACING_MM = 28, 5.0
 N_CODES = 2 * len(WAVELENGTHS_MM) + 5
 N_POSE_CODES = 12
 SIDE_MM = 4.0
-"""How far beside the slice's plane a refinement also looks at the mean head."""
+"""Distance from the slice's plane, on both sides, at which a refinement also samples the atlas template."""
 N_SEEN = 7
 
 SliceBatch = Mapping[str, Tensor]
@@ -49,7 +49,7 @@ class PoseStep(NamedTuple):
     Attributes:
         rotation: [S, 3, 3].
         translation_mm: [S, 3].
-        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less sure, the smaller.
+        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less certain, the smaller.
     """
 
     rotation: Tensor
@@ -60,12 +60,12 @@ class PoseStep(NamedTuple):
 class PoseNetwork(nn.Module):
     """Poses of slices in the atlas frame, by a first guess and refinements.
 
-    Nothing but rotations between stacks is taken from the headers, so turning all of them together changes
-    nothing, and neither does the order of slices or stacks. In each step every slice votes for a rotation and
-    shift of its stack; votes of a stack are summed, those of other stacks added through the header's
-    rotations between stacks (first step) or as they are (refinements), and the sum is made a rotation. Then
-    every slice moves a little on its own. Refinements see, at the current poses, the template's mean head of
-    the best age and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
+    Only rotations between stacks are taken from the headers, so rotating all of them together changes nothing,
+    and neither does the order of slices or stacks. In each step every slice votes for a rotation and a
+    translation of its stack. Votes of a stack are summed; those of other stacks are added through the header's
+    rotations between stacks (first step) or as they are (refinements); the sum is made a rotation. Then every
+    slice moves a little on its own. Refinements see, at the current poses, the atlas template of the best age
+    and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
 
     Args:
         config: see `PoseNetworkConfig`.
@@ -85,7 +85,7 @@ class PoseNetwork(nn.Module):
         self.refining_transformer = SetTransformer(
             config.width, N_CODES + N_POSE_CODES, config.n_blocks, config.n_heads
         )
-        # how much the votes of all stacks count beside the stack's own, in the first step and in refinements
+        # weight of the votes of all stacks relative to the stack's own, in the first step and in refinements
         self.log_share = nn.Parameter(torch.zeros(2))
 
     def set_template(self, volume: Tensor) -> None:
@@ -148,8 +148,8 @@ class PoseNetwork(nn.Module):
     def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
         """What the template and the other stacks show at the slices' poses, [S, N_SEEN, N / 2, N / 2].
 
-        The mean head of the age that suits a set's slices best, in the slice's plane and beside it, and a
-        coarse volume of the other stacks; both also as differences from the slice.
+        The atlas template of the age that correlates best with a set's slices, in the slice's plane and on both
+        sides of it, and a coarse volume of the other stacks; both also as differences from the slice.
         """
         half, spacing_mm = self.config.image_size // 2, self.config.template_spacing_mm
         value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
@@ -189,7 +189,11 @@ class PoseNetwork(nn.Module):
 
 
 def slice_codes(batch: SliceBatch) -> Tensor:
-    """What is known of a slice beside its image [S, N_CODES]: position, thickness, area, rank in time."""
+    """What is known of a slice apart from its image [S, N_CODES]: position, thickness, area, rank in time.
+
+    The rank is known in trainings only: image files do not say in which order slices were acquired, so that
+    reconstructions always give "unknown" (NaN), which the weights were trained with too.
+    """
     image = batch["image"]
     position, thickness, area, rank = (
         batch[name].to(image.dtype) for name in ("position_mm", "thickness_mm", "area_mm2", "time_rank")
@@ -201,6 +205,6 @@ def slice_codes(batch: SliceBatch) -> Tensor:
 
 
 def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:
-    """A stack's pose of each slice, followed by the slice's own turn and shift in its own frame."""
+    """A stack's pose of each slice, followed by the slice's own rotation and translation in its own frame."""
     shift = (rotation @ (vote[:, 3:] * RESIDUAL_SCALE_MM)[..., None])[..., 0]
     return rotation @ rotation_from_vector(vote[:, :3] * RESIDUAL_SCALE_RAD), translation_mm + shift

@@ -58,7 +58,7 @@ class AnnealedModule(LightningModule):
         raise NotImplementedError
 
     def own_description(self) -> dict[str, Any]:
-        """What the exported model needs beside its weights, in plain values."""
+        """What the exported model needs apart from its weights, in plain values."""
         raise NotImplementedError
 
     def keep_hyperparameters(self, network: NetworkConfig) -> None:

@@ -36,7 +36,7 @@ DISTURBED_SHARE = 0.6
 STACK_ROTATION_RAD, STACK_TRANSLATION_MM = 0.3, 6.0
 SLICE_ROTATION_RAD, SLICE_TRANSLATION_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
-"""Weight of the votes' squared error (0 to 3, no unit) beside the distances."""
+"""Weight of the votes' squared error (0 to 3, no unit) relative to the distances."""
 N_PANEL_SLICES = 12
 RIGHT_WITHIN_DEG = 20.0
 
@@ -181,7 +181,7 @@ class PoseModule(AnnealedModule):
             ) from error
 
     def own_description(self) -> dict[str, Any]:
-        """What a `PoseModel` needs beside its weights."""
+        """What a `PoseModel` needs apart from its weights."""
         return {"weeks": self.weeks}
 
 

@@ -28,10 +28,10 @@ DEFAULT_NETWORK = PriorNetworkConfig()
 class PriorModule(AnnealedModule):
     """Supervised training of V_prior against the true volume.
 
-    Loss: mean absolute error, weighted 1 in the brain mask and `background_weight` elsewhere. Only what lies
-    in the mask is used later, and V_coarse ends in a bright halo around it: with a background that counted
-    more (0.1, and 1 within 3 voxels of the mask, was tried) the network learnt to trim the halo and nothing
-    else. The little that is left keeps the output bounded there.
+    Loss: mean absolute error, weighted 1 in the brain mask and `background_weight` elsewhere. Only the
+    mask is used later, and V_coarse ends in a bright halo around it: with a larger weight of the background
+    (0.1, and 1 within 3 voxels of the mask, was tried) the network learnt to trim the halo and nothing else.
+    The small weight that remains keeps the output bounded there.
 
     Args:
         network: see `PriorNetworkConfig`.
@@ -162,7 +162,7 @@ class PriorModule(AnnealedModule):
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
 
     def own_description(self) -> dict[str, Any]:
-        """What a `Prior` needs beside its weights."""
+        """What a `Prior` needs apart from its weights."""
         return {"voxel_mm": self.voxel_mm}
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from g3r.checkpoints.trained_model import TrainedModel
-from g3r.checkpoints.weights_file import SHIPPED_POSE, SHIPPED_PRIOR
+from g3r.checkpoints.weights_file import SHIPPED_POSE, SHIPPED_PRIOR, read_weights
 from g3r.errors import InputError
 from g3r.pose_network.model import PoseModel
 from g3r.prior.dgpn import DensityGatedPriorNetwork
@@ -214,3 +214,11 @@ def assert_refused(kind: type[TrainedModel], path: Path, says: str) -> None:
     message = str(caught.value)
     assert message.startswith(f"{path}: "), message
     assert "\n" not in message
+
+
+def test_a_file_that_was_read_already_is_not_opened_again(saved: dict[str, Path], tmp_path: Path):
+    path = tmp_path / "prior.safetensors"
+    path.write_bytes(saved["prior"].read_bytes())
+    file = read_weights(path, "prior")
+    path.unlink()
+    assert Prior.load(file).record() == Prior.load(saved["prior"]).record()
