@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
+from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.observer import FitObserver
@@ -27,12 +27,9 @@ from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, preset
 from g3r.planning.stages import Stage, stage_rng
-from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
-from g3r.pose_network.inference import predict_poses
-from g3r.pose_network.network import PoseNetwork
-from g3r.prior.checkpoint import PriorCheckpoint, load_prior
-from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import estimate_prior
+from g3r.pose_network.model import PoseModel
+from g3r.prior.inference import Tiling
+from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.prior_registration import register_to_prior
@@ -58,9 +55,6 @@ STORED_RECORDS = (
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
-DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
-DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
-
 NOTE_ON_SINGLE = {
     None: "slices of the single stack stay where the atlas template or the header has them",
     True: "slices of the single stack were registered to the prior volume",
@@ -84,10 +78,10 @@ class GaussianReconstructor:
 
     def __init__(
         self,
-        checkpoint: str | os.PathLike[str] | None = None,
+        checkpoint: str | os.PathLike[str] | WeightsFile | None = None,
         settings: ReconstructionSettings | str = "balanced",
         *,
-        pose_checkpoint: str | os.PathLike[str] | None = None,
+        pose_checkpoint: str | os.PathLike[str] | WeightsFile | None = None,
         observer: FitObserver | None = None,
     ) -> None:
         self.settings = preset(settings) if isinstance(settings, str) else settings
@@ -95,15 +89,9 @@ class GaussianReconstructor:
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
-        self.network: DensityGatedPriorNetwork | None = None
-        self.prior_meta: PriorCheckpoint | None = None
-        self.pose_network: PoseNetwork | None = None
-        self.pose_meta: PoseCheckpoint | None = None
-        if self.settings.use_prior:
-            path = Path(checkpoint or DEFAULT_CHECKPOINT)
-            self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
-        if self.settings.registration.template or self.settings.registration.network:
-            self.pose_network, self.pose_meta = load_pose_network(Path(pose_checkpoint or DEFAULT_POSE_CHECKPOINT))
+        self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
+        needs_pose_model = self.settings.registration.template or self.settings.registration.network
+        self.pose_model = PoseModel.load(pose_checkpoint) if needs_pose_model else None
 
     def reconstruct(
         self,
@@ -141,8 +129,8 @@ class GaussianReconstructor:
             intensity=intensity * prior.scale,
             cloud=cloud,
             fit=fit,
-            prior_record=asdict(self.prior_meta) if self.prior_meta else None,
-            pose_record=self._pose_record(),
+            prior_record=self.prior.record() if self.prior else None,
+            pose_record=self.pose_model.record() if self.pose_model else None,
         )
         return assemble(found, plan, run)
 
@@ -170,19 +158,14 @@ class GaussianReconstructor:
             deadline: when the search has to end.
         """
         settings = settings or self.settings.registration
-        template = self.pose_meta.template if self.pose_meta else None
+        template = self.pose_model.template if self.pose_model else None
         proposals = {}
         wanted = settings.network
         if settings.network_as_reserve:
             wanted &= template is None or not template_fits(slices, template)
-        if self.pose_network is not None and self.pose_meta is not None and wanted:
-            pose = predict_poses(self.pose_network, self.pose_meta, slices)
-            proposals["network"] = pose @ slices.header_pose.inverse()
+        if self.pose_model is not None and wanted:
+            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
-
-    def _pose_record(self) -> dict[str, str] | None:
-        meta = self.pose_meta
-        return {"training_data": meta.training_data, "g3r_version": meta.g3r_version} if meta else None
 
     def _slices(self, stacks: Sequence[Stack], run: RunContext) -> tuple[Slices, float]:
         """The slices at their header poses, in normalised intensities, and what 1 stands for."""
@@ -216,7 +199,7 @@ class GaussianReconstructor:
 
     @property
     def _voxel_mm(self) -> float:
-        return self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
+        return self.prior.voxel_mm if self.prior else self.settings.resolution_mm
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
@@ -234,17 +217,11 @@ class GaussianReconstructor:
         return prior
 
     def _prior_values(self, volumes: InitialVolumes, settings: ReconstructionSettings) -> NDArray[np.float32]:
-        if self.network is None:
+        if self.prior is None:
             return volumes.sharp
-        values = estimate_prior(
-            self.network,
-            volumes.coarse,
-            volumes.density,
-            volumes.sharp,
-            n_views=settings.prior_views,
-            max_whole_voxels=settings.prior_whole_voxels,
-            tile_voxels=settings.prior_tile_voxels,
-            halo_voxels=settings.prior_halo_voxels,
+        tiling = Tiling(settings.prior_whole_voxels, settings.prior_tile_voxels, settings.prior_halo_voxels)
+        values = self.prior.estimate(
+            volumes.coarse, volumes.density, volumes.sharp, n_views=settings.prior_views, tiling=tiling
         )
         release_memory()  # the most that is ever freed at a time
         return values
