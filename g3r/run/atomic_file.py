@@ -1,0 +1,56 @@
+"""Files that appear whole or not at all: written under a temporary name in the same folder, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
+    """A temporary path to write to; it becomes `path` when the block ends well, and is removed otherwise.
+
+    Args:
+        path: file to write; an earlier one is replaced.
+        durable: wait until the data are on the disk before the rename, so that a crash of the machine or a full
+            disk cannot leave a file that is cut off.
+
+    Raises:
+        OSError: the file cannot be written or renamed.
+    """
+    path = Path(path)
+    # hidden, of this process, and with the whole name at the end: writers choose the format by the suffix
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        yield temporary
+        if durable:
+            sync(temporary)
+        os.replace(temporary, path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file (UTF-8), whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def sync(path: Path) -> None:
+    """Wait until a file is on the disk.
+
+    Raises:
+        OSError: the disk is full or broken, which some systems say no sooner.
+    """
+    descriptor = os.open(path, os.O_RDWR)  # Windows refuses to sync what is open for reading
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
