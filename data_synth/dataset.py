@@ -197,7 +197,7 @@ def _poses_left_by_registration(
 
 def _trust(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
     """Weight of each masked pixel: registration mostly notices slices without signal."""
-    dropout = np.array([stacks[s].is_void[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
+    dropout = np.array([stacks[s].dropout[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
     noticed = dropout & (rng.random(len(dropout)) < NOTICED_SHARE)
     return np.where(noticed, rng.uniform(0, 0.3, len(dropout)), 1.0)[slices.pixel_plane]
 

@@ -89,7 +89,7 @@ def _write(folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], r
             rotvec, pose = one.true_pose.rotvec_rad(), one.true_pose
             for k in range(n_k):
                 motion = [f"{v:.9g}" for v in (*rotvec[k], *pose.translation_mm[k])]
-                table.writerow([number, k, *motion, f"{one.gain[k]:.6g}", int(one.is_void[k])])
+                table.writerow([number, k, *motion, f"{one.gain[k]:.6g}", int(one.dropout[k])])
                 header_center = stack.grid.world([(n_i - 1) / 2, (n_j - 1) / 2, k])
                 center = pose.rotation[k] @ header_center + pose.translation_mm[k]
                 rotation = pose.rotation[k] @ frame

@@ -88,7 +88,7 @@ def in_shape(one: SimulatedStack) -> SimulatedStack:
     low[2] = first
     cut = replace(stack, image=_window(stack.image, low, shape), mask=_window(stack.mask, low, shape), affine=affine)
     kept = slice(first, last)
-    return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.is_void[kept])
+    return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.dropout[kept])
 
 
 def _window(data: NDArray, low: Sequence[int], shape: Sequence[int]) -> NDArray:

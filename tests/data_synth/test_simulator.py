@@ -83,7 +83,7 @@ def test_sampling_the_truth_at_the_true_poses_gives_the_slices(fine: bool) -> No
         replace(CLEAN, orientation=o, motion=LEVELS["severe"], thickness_mm=1.0, gap_mm=2.0, interleave=3)
         for o in ("axial", "sagittal")
     ]
-    settings = [replace(s, registration=replace(s.motion, dropout_share=0.0)) for s in settings]
+    settings = [replace(s, motion=replace(s.motion, dropout_share=0.0)) for s in settings]
     for one in simulate_stacks(volume, BALL, AFFINE, settings, np.random.default_rng(2), fine=fine):
         inside = deep(one)
         expected = map_coordinates(volume, GRID.index(true_points_mm(one)[inside]).T, order=3)
@@ -134,8 +134,8 @@ def test_noise_gain_and_voids() -> None:
     level = MotionLevel(dropout_share=0.3)
     noisy = StackSettings(motion=level, snr=20.0, bias=0.0, gain_deviation=0.1, gap_mm=0.0, thickness_mm=2.0)
     (one,) = simulate_stacks(volume, BALL, AFFINE, [noisy], np.random.default_rng(7))
-    assert 1 <= one.is_void.sum() < len(one.is_void)
-    assert (one.gain[one.is_void] < 0.7).all()
+    assert 1 <= one.dropout.sum() < len(one.dropout)
+    assert (one.gain[one.dropout] < 0.7).all()
     inside = deep(one)
     for k in np.flatnonzero(inside.sum((0, 1)) > 200):
         values = one.stack.image[:, :, k][inside[:, :, k]]
