@@ -48,7 +48,7 @@ def training_and_validation(
     include: Sequence[str] | None,
     exclude: Sequence[str] | None,
     val_include: Sequence[str] | None,
-    val_exclude: Sequence[str] | None,
+    *,
     n_val_phantoms: int,
     seed: int,
 ) -> tuple[list[Subject], list[Subject]]:
@@ -60,7 +60,6 @@ def training_and_validation(
         exclude: glob patterns of names not to train on.
         val_include: glob patterns of names to validate on, which are not trained on; without any, the
             training subjects are taken, and a warning says so.
-        val_exclude: glob patterns of names not to validate on.
         n_val_phantoms: phantoms to validate on.
         seed: of the phantoms.
 
@@ -74,7 +73,7 @@ def training_and_validation(
         )
     train: list[Subject] = [*find_subjects(source, include or (), [*(exclude or ()), *(val_include or ())])]
     if val_include:
-        return train, [*find_subjects(source, val_include, val_exclude or ())]
+        return train, [*find_subjects(source, val_include)]
     logger.warning("no val_include given: validating on other simulations of the training subjects")
     return train, [*train]
 

@@ -50,9 +50,7 @@ class ProfileOperator(VoxelOperator):
         self.move(planes)
 
 
-def profile_nodes(
-    resolution_mm: float, thickness_mm: float, profile: Profile, voxel_mm: float
-) -> tuple[Array, Array]:
+def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, voxel_mm: float) -> tuple[Array, Array]:
     """Quadrature of a slice profile whose samples are read by trilinear interpolation.
 
     Args:

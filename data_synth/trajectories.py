@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.motion import about
-from g3r.acquisition.interleave import acquisition_order
+from data_synth.motion import place_in_time
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 
@@ -81,17 +80,15 @@ def modelled_trajectory(n_samples: int, rng: np.random.Generator) -> RecordedTra
 def timed_trajectory(
     n_slices: int,
     seconds_per_slice: float,
-    center_mm: Array,
     interleave: int,
     rng: np.random.Generator,
     recorded: Sequence[RecordedTrajectory] = (),
 ) -> RigidPose:
-    """True motion of each slice of one stack, about the stack's mean: a piece of a trajectory in time.
+    """True motion of each slice of one stack about the origin: a piece of a trajectory in time, without its mean.
 
     Args:
         n_slices: K.
         seconds_per_slice: time between two slices.
-        center_mm: the head's centre [3], about which it turns.
         interleave: see `acquisition_order`.
         rng: source of randomness.
         recorded: trajectories to cut the piece from; none takes the model.
@@ -114,7 +111,5 @@ def timed_trajectory(
     sample_seconds = np.arange(len(angle)) * SAMPLE_SECONDS
     both = np.concatenate([angle, piece.translation_mm - piece.translation_mm.mean(0)], axis=1)
     in_time = np.stack([np.interp(seconds, sample_seconds, column) for column in both.T], axis=1)
-    place = np.empty(n_slices, np.int64)
-    place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
-    in_space = in_time[place]
-    return about(RigidPose.from_rotvec(in_space[:, :3], in_space[:, 3:]), center_mm)
+    in_space = in_time[place_in_time(n_slices, interleave)]
+    return RigidPose.from_rotvec(in_space[:, :3], in_space[:, 3:])
