@@ -36,7 +36,7 @@ class AtlasSubject:
     labels: Path | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TruthVolume:
     """A volume to be sliced.
 
@@ -139,7 +139,7 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
         raise InputError(f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image")
     data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
     ventricles = None if labels is None else (labels == VENTRICLES) & mask
-    return TruthVolume(subject.name, data, mask, affine, labels, ventricles)
+    return TruthVolume(name=subject.name, data=data, mask=mask, affine=affine, labels=labels, ventricles=ventricles)
 
 
 def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
@@ -154,7 +154,12 @@ def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
         return None if array is None else np.pad(array[box], margin_voxels)
 
     return TruthVolume(
-        volume.name, cut(volume.data), cut(volume.mask), affine, cut(volume.labels), cut(volume.ventricles)
+        name=volume.name,
+        data=cut(volume.data),
+        mask=cut(volume.mask),
+        affine=affine,
+        labels=cut(volume.labels),
+        ventricles=cut(volume.ventricles),
     )
 
 

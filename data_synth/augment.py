@@ -57,7 +57,7 @@ def augmented(volume: TruthVolume, transform: tio.Transform, rng: np.random.Gene
     if moved.mask.sum() < MIN_MASK_SHARE * volume.mask.sum():
         return volume
     bright = np.float32(max(float(np.percentile(moved.data[moved.mask], 99.5)), 1e-6))
-    return TruthVolume(moved.name, moved.data / bright, moved.mask, moved.affine)
+    return TruthVolume(name=moved.name, data=moved.data / bright, mask=moved.mask, affine=moved.affine)
 
 
 def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Generator) -> TruthVolume:
@@ -69,7 +69,9 @@ def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Ge
     result = applied(transform, subject, rng)
     mask = result["mask"].data[0].numpy() > 0
     data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
-    return TruthVolume(volume.name, np.where(mask, data, np.float32(0)), mask, np.array(result["image"].affine))
+    return TruthVolume(
+        name=volume.name, data=np.where(mask, data, np.float32(0)), mask=mask, affine=np.array(result["image"].affine)
+    )
 
 
 def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Generator) -> Any:

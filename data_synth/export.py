@@ -28,10 +28,12 @@ def save_simulation(
 ) -> None:
     """Write a simulated subject.
 
-    `stack-N.nii.gz` (int16) and `mask-N.nii.gz`; `truth.nii.gz` and `truth-mask.nii.gz`; `poses.tsv`, a
-    row per slice (`POSE_COLUMNS`; a point at x by the file's header truly lies at R x + t); `poses.json`, a
-    list of `stack`, `slice`, `rotation` [3, 3], `center` [3] (the point at (x, y) mm from the middle of the
-    pixel grid truly lies at rotation (x, y, 0) + center); `simulation.json`, the record.
+    - `stack-N.nii.gz` (int16) and `mask-N.nii.gz`; `truth.nii.gz` and `truth-mask.nii.gz`.
+    - `poses.tsv`: a row per slice (`POSE_COLUMNS`). A point that the file's header puts at x is truly at R x + t;
+      `void` is 1 where the slice lost its signal.
+    - `poses.json`: a list of `stack`, `slice`, `rotation` [3, 3], `center` [3]. The point at (x, y) mm from the
+      middle of the pixel grid is truly at rotation (x, y, 0) + center.
+    - `simulation.json`: the record.
 
     Args:
         folder: output folder.

@@ -96,19 +96,23 @@ def weeks_of(subject: Subject) -> float:
     return float(found[0])
 
 
-def load_volume_of(subject: Subject, spacing_mm: float) -> TruthVolume:
-    """The subject's normalised volume at an isotropic voxel size; for errors see `load_subject`."""
+def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:
+    """The subject's normalised volume at an isotropic voxel size; for errors see `load_subject`.
+
+    None keeps the grid of an atlas subject; a phantom has none of its own.
+    """
     if isinstance(subject, AtlasSubject):
         return load_subject(subject, spacing_mm)
+    assert spacing_mm is not None
     made = fetal_brain_phantom(subject.weeks, spacing_mm, subject.seed)
     bright = float(np.percentile(made.t2[made.mask], 99.5))
     return TruthVolume(
-        subject.name,
-        made.t2 / np.float32(bright),
-        made.mask,
-        made.affine,
-        made.labels,
-        made.labels == LABELS["ventricles"],
+        name=subject.name,
+        data=made.t2 / np.float32(bright),
+        mask=made.mask,
+        affine=made.affine,
+        labels=made.labels,
+        ventricles=made.labels == LABELS["ventricles"],
     )
 
 

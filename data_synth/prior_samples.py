@@ -219,4 +219,6 @@ def _padded(volume: TruthVolume, smallest: int) -> TruthVolume:
     width = [(int(n) // 2, int(n) - int(n) // 2) for n in missing]
     affine = volume.affine.copy()
     affine[:3, 3] -= affine[:3, :3] @ [before for before, _ in width]
-    return TruthVolume(volume.name, np.pad(volume.data, width), np.pad(volume.mask, width), affine)
+    return TruthVolume(
+        name=volume.name, data=np.pad(volume.data, width), mask=np.pad(volume.mask, width), affine=affine
+    )

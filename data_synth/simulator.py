@@ -151,7 +151,7 @@ def simulate_stacks(
     ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Head:
     """The volume to be sliced, its mask, where signal may be, and corners of the mask in the world."""
 
@@ -178,14 +178,14 @@ class _Head:
             volume = zoom(volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest")
             volume_grid = VolumeGrid(volume.shape, affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
         return cls(
-            np.ascontiguousarray(volume, np.float32),
-            volume_grid,
-            mask.astype(np.float32),
-            reach.astype(np.float32),
-            grid,
-            points,
-            (extent.min(0) + extent.max(0)) / 2,
-            bright,
+            volume=np.ascontiguousarray(volume, np.float32),
+            volume_grid=volume_grid,
+            mask=mask.astype(np.float32),
+            reach=reach.astype(np.float32),
+            mask_grid=grid,
+            point_mm=points,
+            center_mm=(extent.min(0) + extent.max(0)) / 2,
+            bright=bright,
         )
 
 

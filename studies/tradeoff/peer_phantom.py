@@ -74,7 +74,9 @@ def small_head(seed: int) -> TruthVolume:
     affine = np.diag([VOXEL_MM, VOXEL_MM, VOXEL_MM, 1.0])
     affine[:3, 3] = -VOXEL_MM * (VOXELS - 1) / 2
     shape = (VOXELS, VOXELS, VOXELS)
-    return TruthVolume("phantom", _window(made.t2 * bright, low, shape), _window(made.mask, low, shape), affine)
+    return TruthVolume(
+        name="phantom", data=_window(made.t2 * bright, low, shape), mask=_window(made.mask, low, shape), affine=affine
+    )
 
 
 def in_shape(one: SimulatedStack) -> SimulatedStack:

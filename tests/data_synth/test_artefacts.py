@@ -16,7 +16,7 @@ from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 
 @pytest.fixture(scope="module")
 def stacks(head: TruthVolume) -> list[SimulatedStack]:
-    settings = [StackSettings(resolution_mm=1.2, thickness_mm=3.0, orientation=name) for name in ("axial", "coronal")]
+    settings = [StackSettings(resolution_mm=1.5, thickness_mm=4.0, orientation=name) for name in ("axial", "coronal")]
     return simulate_stacks(head.data, head.mask, head.affine, settings, np.random.default_rng(4))
 
 

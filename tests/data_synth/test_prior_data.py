@@ -56,7 +56,7 @@ def test_batches_of_training_and_validation() -> None:
 
 
 def test_what_remains_of_an_epoch_is_left_out() -> None:
-    data = StackSynthesisDataModule(**{**TINY, "patches_per_subject": 1, "subjects_per_epoch": 5, "batch_size": 2})
+    data = StackSynthesisDataModule(**{**TINY, "patches_per_subject": 5, "subjects_per_epoch": 1})
     loader = data.train_dataloader()
     assert len(loader) == 2
     first = [batch["truth"] for batch in loader]
