@@ -6,7 +6,8 @@ A head becomes stacks and then training data in this order; a module imports onl
   NIfTI volumes; `heads` gives both as subjects; `template` averages them by age.
 - Variation of a head: `contrast` (tissue intensities), `pathology` (ventricles, lesions), `augment` (torchio's
   transforms with a generator of ours), `head_variation` (shapes and intensities for the pose network).
-- Motion: `motion` (from slice to slice), `trajectories` (in time, as recorded), `stack_planning` (where stacks lie).
+- Motion: `motion` (from slice to slice), `trajectories` (in time, as recorded), `stack_planning` (where the stacks'
+  slices are).
 - Slices: `slice_profile` and `simulator` make the stacks, the same for evaluation and for training;
   `slice_sampling` makes slice images by the hundred; `artefacts` corrupts single slices.
 - What is wrong before the prior sees it: `registration_errors` (poses), `mask_errors` (masks).

@@ -61,7 +61,16 @@ def augmented(volume: TruthVolume, transform: tio.Transform, rng: np.random.Gene
 
 
 def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Generator) -> TruthVolume:
-    """A head and its mask after one torchio transform; zero outside the mask, without labels."""
+    """A head and its mask after a torchio transform.
+
+    Args:
+        volume: a head.
+        transform: of images and label maps.
+        rng: source of randomness.
+
+    Returns:
+        A volume without labels, zero outside its mask.
+    """
     subject = tio.Subject(
         image=tio.ScalarImage(tensor=torch.from_numpy(volume.data)[None], affine=volume.affine),
         mask=tio.LabelMap(tensor=torch.from_numpy(volume.mask.astype(np.uint8))[None], affine=volume.affine),
@@ -78,6 +87,11 @@ def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Gener
     """Apply a torchio transform whose random numbers come from `rng`.
 
     torchio draws from torch's global generator; it is seeded here and put back afterwards.
+
+    Args:
+        transform: to apply.
+        subject: torchio's.
+        rng: source of the seed.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**62)))

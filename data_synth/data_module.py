@@ -33,7 +33,7 @@ class SyntheticDataModule(LightningDataModule):
         exclude: glob patterns of subject names not to train on.
         val_include: glob patterns of subject names to validate on; they are not trained on. None validates on
             other simulations of the training subjects, which flatters the network, and says so.
-        num_workers: processes that make training data beside the training.
+        num_workers: worker processes that make training data.
         seed: decides every item together with its epoch and index.
 
     Raises:

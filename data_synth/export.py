@@ -49,8 +49,8 @@ def save_simulation(
     with OutputFolder(folder) as run:
         check_output(folder, replace=replace)
         try:
-            with run.result() as beside:
-                _write(beside, truth, stacks, record)
+            with run.result() as staging:
+                _write(staging, truth, stacks, record)
         except OSError as error:
             raise cannot_be_written(folder, error) from None
 

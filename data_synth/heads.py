@@ -37,7 +37,13 @@ Subject = AtlasSubject | PhantomSubject
 
 
 def phantom_subjects(n: int, seed: int, split: str) -> list[PhantomSubject]:
-    """N phantoms with ages spread evenly over 21 to 38 weeks; `split` separates training from validation."""
+    """Phantoms with ages spread evenly over 21 to 38 weeks.
+
+    Args:
+        n: number of phantoms.
+        seed: of their shapes.
+        split: `training` or `validation`; they share no phantom.
+    """
     first = 10_000 * seed + (5_000 if split == "validation" else 0)
     ages = 21 + 17 * (np.arange(n) + 0.5) / n
     return [PhantomSubject(f"phantom-{w:.1f}w-{first + k}", float(w), first + k) for k, w in enumerate(ages)]
@@ -117,7 +123,13 @@ def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:
 
 
 def load_head(subject: Subject, spacing_mm: float, margin_voxels: int = 3) -> TruthVolume:
-    """The subject in the atlas frame: cropped, zero outside the mask, the mask's centroid at the origin."""
+    """The subject in the atlas frame: cropped, zero outside the mask, the mask's centroid at the origin.
+
+    Args:
+        subject: for errors see `load_subject`.
+        spacing_mm: isotropic voxel size.
+        margin_voxels: background around the head.
+    """
     volume = cropped(load_volume_of(subject, spacing_mm), margin_voxels)
     centroid_mm = VolumeGrid(volume.data.shape, volume.affine).world(center_of_mass(volume.mask))
     affine = volume.affine.copy()

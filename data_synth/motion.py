@@ -1,6 +1,6 @@
 """How a fetal head moves during a stack.
 
-All poses are motions of world space: a point x of a slice by the file's header truly lies at R x + t.
+All poses are motions of world space: a point x of a slice by the file's header is truly at R x + t.
 Every function takes the generator that it draws from.
 """
 
@@ -26,9 +26,9 @@ class MotionLevel:
         walk_mm: random walk of the position per slice in time.
         n_jerks: sudden lasting movements per stack.
         jerk_deg: rotation of a jerk.
-        jerk_mm: shift of a jerk.
+        jerk_mm: translation of a jerk.
         offset_deg: rotation of a whole stack.
-        offset_mm: shift of a whole stack.
+        offset_mm: translation of a whole stack.
         dropout_share: probability that motion during a slice's excitation takes its signal (dropout).
     """
 
@@ -69,7 +69,7 @@ def slice_trajectory(
     Args:
         n_slices: K.
         level: magnitudes.
-        center_mm: the head's centre [3], about which it turns.
+        center_mm: the head's centre [3], about which it rotates.
         interleave: see `acquisition_order`.
         rng: source of randomness.
 
@@ -102,5 +102,5 @@ def place_in_time(n_slices: int, interleave: int) -> NDArray[np.int64]:
 def about(pose: RigidPose, center_mm: Array) -> RigidPose:
     """The motions x -> R (x - c) + c + t for centres c [3] or [S, 3] (mm)."""
     center = np.broadcast_to(np.asarray(center_mm, dtype=np.float64), (len(pose), 3))
-    turned = np.einsum("sij,sj->si", pose.rotation, center)
-    return RigidPose(pose.rotation, pose.translation_mm + center - turned)
+    rotated = np.einsum("sij,sj->si", pose.rotation, center)
+    return RigidPose(pose.rotation, pose.translation_mm + center - rotated)

@@ -91,11 +91,11 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
     shape = tuple(int(n) for n in np.ceil((high - low) / spacing_mm).astype(int) + 1)
     affine = np.diag([spacing_mm] * 3 + [1.0])
     affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing_mm
-    shift = (low + high) / 2  # the grid is centred on zero, the shapes on the middle of the cerebrum
+    middle = (low + high) / 2  # the grid is centred on zero, the shapes on the middle of the cerebrum
 
     axes = [
         (np.arange(n, dtype=np.float32) * np.float32(spacing_mm) + np.float32(o + s))
-        for n, o, s in zip(shape, affine[:3, 3], shift, strict=True)
+        for n, o, s in zip(shape, affine[:3, 3], middle, strict=True)
     ]
     grid = np.meshgrid(*axes, indexing="ij", sparse=True)
     bend = 0.015 * body.a  # individual shape: the coordinates are warped a little before anything is drawn

@@ -22,7 +22,7 @@ MAX_NOISE = 0.06
 """Largest standard deviation of the noise; the head's 99.5th percentile is 1."""
 MIN_AREA_MM2 = 60.0
 LOOK_PIXEL_MM, LOOK_SIZE = 5.0, 36
-"""The quick look at where in the field of view the head is."""
+"""Large pixels by which the head is found in the field of view."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def draw_slice_set(
     plan = draw_stacks(corners, rng, n_stacks, recorded)
     threshold = float(rng.uniform(0.3, 0.6)) if vary else 0.5
 
-    # where each stack's mask is by its header, from a quick look at large pixels
+    # where each stack's mask is by its header, at large pixels
     look = sample_masks(head, index_from_atlas, plan.true_pose, LOOK_PIXEL_MM, LOOK_SIZE, threshold)
     area = look.sum((1, 2)) * LOOK_PIXEL_MM**2
     kept = _thinned(np.flatnonzero(area > MIN_AREA_MM2), max_slices, rng)

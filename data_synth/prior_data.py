@@ -127,7 +127,7 @@ class PatchBatches(IterableDataset[Patches]):
         subjects: loader of all patches of one subject at a time, with an `EpochSampler`.
         seed: of the order.
         n_patches: of each subject.
-        batch_size: patches per batch; what remains at the end of an epoch is left out.
+        batch_size: patches per batch; the remainder of an epoch is dropped.
     """
 
     def __init__(self, subjects: DataLoader, seed: int, n_patches: int, batch_size: int) -> None:

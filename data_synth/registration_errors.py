@@ -86,6 +86,6 @@ def mean_motion(true_pose: RigidPose, center_mm: NDArray[np.float64]) -> RigidPo
     """
     n = len(true_pose)
     rotation = Rotation.from_matrix(true_pose.rotation).mean()
-    shift = (true_pose.apply(np.tile(center_mm, (n, 1, 1)))[:, 0] - center_mm).mean(0)
-    one = about(RigidPose.from_rotvec(rotation.as_rotvec()[None], shift[None]), center_mm)
+    translation_mm = (true_pose.apply(np.tile(center_mm, (n, 1, 1)))[:, 0] - center_mm).mean(0)
+    one = about(RigidPose.from_rotvec(rotation.as_rotvec()[None], translation_mm[None]), center_mm)
     return one.take(np.zeros(n, np.int64))

@@ -35,7 +35,7 @@ FRAMES = {
 }
 
 FIELD_OF_VIEW_MARGIN_MM = 5.0
-"""Around the head as it lies at rest; motion may carry a part of it out of view, as it does in a scanner."""
+"""Around the head at rest; motion may carry a part of it out of view, as it does in a scanner."""
 
 SIGNAL_REACH_VOXELS = 4
 """Pixels further than this from the mask show nothing but noise and are not computed."""
@@ -91,7 +91,7 @@ class SimulatedStack:
 
     Args:
         stack: what a scanner would give; its header states the geometry without motion.
-        true_pose: [K] a point x of slice k by the header truly lies at R x + t.
+        true_pose: [K] a point x of slice k by the header is truly at R x + t.
         gain: [K] intensity factor of each slice (dropouts included).
         dropout: [K] whether the slice lost its signal.
     """
@@ -125,7 +125,7 @@ def simulate_stacks(
     """Take stacks of a volume.
 
     Args:
-        volume: [I, J, K] intensities; what lies outside the mask by more than 4 voxels is not seen.
+        volume: [I, J, K] intensities; anything further than 4 voxels from the mask is not seen.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
         settings: one entry per stack.

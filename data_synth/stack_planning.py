@@ -1,4 +1,4 @@
-"""Stacks planned on a head, or beside it, and how the head moves while they are taken: poses without images."""
+"""Stacks planned on a head or at random, and the head's motion while they are acquired: poses without images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 N_STACKS_SHARE = {1: 0.15, 2: 0.15, 3: 0.4, 4: 0.15, 5: 0.08, 6: 0.07}
 PLANNED_SHARE = 0.7
-"""Share of sets whose stacks were planned on the head's own axes; the others lie anywhere on the sphere."""
+"""Share of sets whose stacks were planned on the head's own axes; the others have any orientation."""
 PLAN_TILT_DEG = 8.0
 CUT_SHARE = 0.12
 """Share of stacks that do not cover the head."""

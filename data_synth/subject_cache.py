@@ -86,6 +86,11 @@ class SubjectCache:
     def save(self, epoch: int, index: int, subject: SyntheticSubject) -> None:
         """Keep a subject; its file appears whole or not at all.
 
+        Args:
+            epoch: of the subject's number.
+            index: of the subject's number.
+            subject: to keep.
+
         Raises:
             InputError: the folder is full or cannot be written.
         """
