@@ -139,8 +139,14 @@ def test_help_is_light() -> None:
     code = (
         "import sys\nfrom data_synth.cli import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
-        "assert not {'torch', 'torchio', 'lightning', 'monai'} & set(sys.modules)\n"
+        "assert not {'torch', 'torchio', 'lightning', 'monai', 'numba', 'scipy', 'numpy'} & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--phantom" in done.stdout
+
+
+def test_the_simulator_needs_no_training_packages() -> None:
+    code = "import sys, data_synth.simulator\nassert not {'torch', 'torchio', 'lightning', 'monai'} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
