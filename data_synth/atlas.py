@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 IMAGE_NAMES = ("t2", "T2", "T2w", "image", "volume", "truth")
 MASK_ENDINGS = ("_mask", "-mask")
 VENTRICLES = 2
-"""Label of the ventricles in a `labels` file beside the image, as in the atlases of Fidon et al. (2021)."""
+"""Label of the ventricles in a `labels` file next to the image, as in the atlases of Fidon et al. (2021)."""
 EXTENSIONS = (".nii.gz", ".nii")
 
 
@@ -36,7 +36,7 @@ class AtlasSubject:
     labels: Path | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TruthVolume:
     """A volume to be sliced.
 
@@ -114,10 +114,10 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
     volume = load_volume(subject.image)
     mask = load_mask(subject.mask, volume)
     data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
-    turn = nib.orientations.io_orientation(volume.affine)
-    affine = volume.affine @ nib.orientations.inv_ornt_aff(turn, data.shape)
-    data = nib.orientations.apply_orientation(data, turn)
-    mask = nib.orientations.apply_orientation(mask, turn).astype(bool)
+    to_ras = nib.orientations.io_orientation(volume.affine)
+    affine = volume.affine @ nib.orientations.inv_ornt_aff(to_ras, data.shape)
+    data = nib.orientations.apply_orientation(data, to_ras)
+    mask = nib.orientations.apply_orientation(mask, to_ras).astype(bool)
 
     labels = None
     if subject.labels is not None:
@@ -127,7 +127,7 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
                 f"{subject.labels}: shape {of_file.data.shape}, but the image has {volume.data.shape}; "
                 "expected labels on the image's grid"
             )
-        labels = nib.orientations.apply_orientation(np.rint(of_file.data), turn).astype(np.uint8)
+        labels = nib.orientations.apply_orientation(np.rint(of_file.data), to_ras).astype(np.uint8)
 
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if spacing_mm is not None and np.abs(spacing - spacing_mm).max() > 1e-3:
@@ -139,7 +139,7 @@ def load_subject(subject: AtlasSubject, spacing_mm: float | None) -> TruthVolume
         raise InputError(f"{subject.image}: 99.5th percentile in the mask is {bright:g}; expected a positive image")
     data = np.where(mask, np.clip(data / bright, 0, None), 0).astype(np.float32)
     ventricles = None if labels is None else (labels == VENTRICLES) & mask
-    return TruthVolume(subject.name, data, mask, affine, labels, ventricles)
+    return TruthVolume(name=subject.name, data=data, mask=mask, affine=affine, labels=labels, ventricles=ventricles)
 
 
 def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
@@ -154,7 +154,12 @@ def cropped(volume: TruthVolume, margin_voxels: int) -> TruthVolume:
         return None if array is None else np.pad(array[box], margin_voxels)
 
     return TruthVolume(
-        volume.name, cut(volume.data), cut(volume.mask), affine, cut(volume.labels), cut(volume.ventricles)
+        name=volume.name,
+        data=cut(volume.data),
+        mask=cut(volume.mask),
+        affine=affine,
+        labels=cut(volume.labels),
+        ventricles=cut(volume.ventricles),
     )
 
 

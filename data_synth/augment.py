@@ -1,4 +1,4 @@
-"""Variation of a truth volume before it is sliced. The only file that names torchio's transforms."""
+"""Variation of a truth volume before it is sliced, by torchio's transforms and by our own where it has none."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from data_synth.pathology import REACH_MM, enlarged_ventricles, with_lesions
 
 CONTRAST_SHARE, VENTRICLES_SHARE, LESION_SHARE = 0.3, 0.2, 0.25
 """How often a head gets other tissue intensities, enlarged ventricles, lesions."""
+
+MIN_MASK_SHARE = 0.3
+"""Less than this of the mask left: the head was pushed out of the grid."""
 
 
 def augmentation() -> tio.Compose:
@@ -38,28 +41,61 @@ def augmentation() -> tio.Compose:
     )
 
 
-def augmented(volume: TruthVolume, transform: tio.Compose, rng: np.random.Generator) -> TruthVolume:
-    """The volume with other tissues, a pathology at times, and bent.
+def augmented(volume: TruthVolume, transform: tio.Transform, rng: np.random.Generator) -> TruthVolume:
+    """The volume with other tissues, at times with a pathology, and transformed.
 
-    Zero outside its (moved) mask, the 99.5th percentile is 1.
+    Args:
+        volume: a head, with labels where they are known.
+        transform: such as `augmentation()`.
+        rng: source of randomness.
 
-    torchio draws from torch's global generator; it is seeded from `rng` here and put back afterwards.
+    Returns:
+        A volume without labels. It is zero outside its (moved) mask, and its 99.5th percentile is 1.
     """
     volume = _other_anatomy(volume, rng)
+    moved = transformed(volume, transform, rng)
+    if moved.mask.sum() < MIN_MASK_SHARE * volume.mask.sum():
+        return volume
+    bright = np.float32(max(float(np.percentile(moved.data[moved.mask], 99.5)), 1e-6))
+    return TruthVolume(name=moved.name, data=moved.data / bright, mask=moved.mask, affine=moved.affine)
+
+
+def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Generator) -> TruthVolume:
+    """A head and its mask after a torchio transform.
+
+    Args:
+        volume: a head.
+        transform: of images and label maps.
+        rng: source of randomness.
+
+    Returns:
+        A volume without labels, zero outside its mask.
+    """
     subject = tio.Subject(
         image=tio.ScalarImage(tensor=torch.from_numpy(volume.data)[None], affine=volume.affine),
         mask=tio.LabelMap(tensor=torch.from_numpy(volume.mask.astype(np.uint8))[None], affine=volume.affine),
     )
-    result: Any
+    result = applied(transform, subject, rng)
+    mask = result["mask"].data[0].numpy() > 0
+    data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
+    return TruthVolume(
+        name=volume.name, data=np.where(mask, data, np.float32(0)), mask=mask, affine=np.array(result["image"].affine)
+    )
+
+
+def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Generator) -> Any:
+    """Apply a torchio transform whose random numbers come from `rng`.
+
+    torchio draws from torch's global generator; it is seeded here and put back afterwards.
+
+    Args:
+        transform: to apply.
+        subject: torchio's.
+        rng: source of the seed.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**62)))
-        result = transform(subject)
-    mask = result["mask"].data[0].numpy() > 0
-    if mask.sum() < 0.3 * volume.mask.sum():  # pushed out of the grid: rather no variation than no head
-        return volume
-    data = np.clip(np.nan_to_num(result["image"].data[0].numpy().astype(np.float32)), 0, None)
-    data /= max(float(np.percentile(data[mask], 99.5)), 1e-6)
-    return TruthVolume(volume.name, np.where(mask, data, 0).astype(np.float32), mask, np.array(result["image"].affine))
+        return transform(subject)
 
 
 def _other_anatomy(volume: TruthVolume, rng: np.random.Generator) -> TruthVolume:

@@ -3,12 +3,17 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from g3r._version import __version__
 from g3r.errors import G3RError
 
 BRIGHT = 1000.0
 """The 99.5th percentile of the truth in the mask; stacks are int16."""
+PHANTOM_SPACING_MM = 0.8
+MARGIN_VOXELS = 4
+"""Background around the truth that is written."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,6 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="g3r-simulate", description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--volume", type=Path, help="NIfTI volume to slice")
     source.add_argument("--phantom", type=float, metavar="WEEKS", help="built-in brain of 18 to 41 weeks")
@@ -56,14 +62,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _simulate(arguments: argparse.Namespace) -> str:
-    """Do what was asked for and return the line to print."""
+    """Simulate and write the stacks; return the line to print."""
     import numpy as np
 
-    from data_synth.atlas import AtlasSubject, TruthVolume, cropped, load_subject
+    from data_synth.atlas import AtlasSubject, cropped
     from data_synth.export import check_output, save_simulation
-    from data_synth.phantom import fetal_brain_phantom
+    from data_synth.heads import PhantomSubject, load_volume_of
     from data_synth.simulator import orthogonal_settings, simulate_stacks
-    from g3r._version import __version__
 
     check_output(arguments.output, replace=arguments.force)  # before any work
     settings = orthogonal_settings(
@@ -78,14 +83,11 @@ def _simulate(arguments: argparse.Namespace) -> str:
         gain_deviation=arguments.gain,
     )
     if arguments.volume is None:
-        made = fetal_brain_phantom(arguments.phantom, seed=arguments.seed)
-        bright = np.float32(np.percentile(made.t2[made.mask], 99.5))
-        truth = TruthVolume("phantom", made.t2 / bright, made.mask, made.affine)
+        truth = load_volume_of(PhantomSubject("phantom", arguments.phantom, arguments.seed), PHANTOM_SPACING_MM)
     else:
-        name = arguments.volume.name
-        truth = load_subject(AtlasSubject(name, arguments.volume, arguments.mask), spacing_mm=None)
-    truth = cropped(truth, 4)
-    truth = TruthVolume(truth.name, truth.data * np.float32(BRIGHT), truth.mask, truth.affine)
+        truth = load_volume_of(AtlasSubject(arguments.volume.name, arguments.volume, arguments.mask), spacing_mm=None)
+    truth = cropped(truth, MARGIN_VOXELS)
+    truth = replace(truth, data=truth.data * np.float32(BRIGHT))
     rng = np.random.default_rng(arguments.seed)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     record = {

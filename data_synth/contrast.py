@@ -12,7 +12,7 @@ from data_synth.atlas import TruthVolume
 
 NEAR_SHARE = 0.5
 """How often intensities stay near the true ones (another field strength, another echo time); otherwise they
-are drawn anew, whatever the tissue (Billot et al. 2023, SynthSeg)."""
+are drawn uniformly for every tissue (Billot et al. 2023, SynthSeg)."""
 
 NEAR_DEVIATION = 0.12
 INTENSITY_RANGE = (0.1, 1.0)

@@ -28,10 +28,12 @@ def save_simulation(
 ) -> None:
     """Write a simulated subject.
 
-    `stack-N.nii.gz` (int16) and `mask-N.nii.gz`; `truth.nii.gz` and `truth-mask.nii.gz`; `poses.tsv`, a
-    row per slice (`POSE_COLUMNS`; a point at x by the file's header truly lies at R x + t); `poses.json`, a
-    list of `stack`, `slice`, `rotation` [3, 3], `center` [3] (the point at (x, y) mm from the middle of the
-    pixel grid truly lies at rotation (x, y, 0) + center); `simulation.json`, the record.
+    - `stack-N.nii.gz` (int16) and `mask-N.nii.gz`; `truth.nii.gz` and `truth-mask.nii.gz`.
+    - `poses.tsv`: a row per slice (`POSE_COLUMNS`). A point that the file's header puts at x is truly at R x + t;
+      `void` is 1 where the slice lost its signal.
+    - `poses.json`: a list of `stack`, `slice`, `rotation` [3, 3], `center` [3]. The point at (x, y) mm from the
+      middle of the pixel grid is truly at rotation (x, y, 0) + center.
+    - `simulation.json`: the record.
 
     Args:
         folder: output folder.
@@ -47,8 +49,8 @@ def save_simulation(
     with OutputFolder(folder) as run:
         check_output(folder, replace=replace)
         try:
-            with run.result() as beside:
-                _write(beside, truth, stacks, record)
+            with run.result() as staging:
+                _write(staging, truth, stacks, record)
         except OSError as error:
             raise cannot_be_written(folder, error) from None
 
@@ -89,7 +91,7 @@ def _write(folder: Path, truth: TruthVolume, stacks: Sequence[SimulatedStack], r
             rotvec, pose = one.true_pose.rotvec_rad(), one.true_pose
             for k in range(n_k):
                 motion = [f"{v:.9g}" for v in (*rotvec[k], *pose.translation_mm[k])]
-                table.writerow([number, k, *motion, f"{one.gain[k]:.6g}", int(one.is_void[k])])
+                table.writerow([number, k, *motion, f"{one.gain[k]:.6g}", int(one.dropout[k])])
                 header_center = stack.grid.world([(n_i - 1) / 2, (n_j - 1) / 2, k])
                 center = pose.rotation[k] @ header_center + pose.translation_mm[k]
                 rotation = pose.rotation[k] @ frame

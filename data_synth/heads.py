@@ -37,7 +37,13 @@ Subject = AtlasSubject | PhantomSubject
 
 
 def phantom_subjects(n: int, seed: int, split: str) -> list[PhantomSubject]:
-    """N phantoms with ages spread evenly over 21 to 38 weeks; `split` separates training from validation."""
+    """Phantoms with ages spread evenly over 21 to 38 weeks.
+
+    Args:
+        n: number of phantoms.
+        seed: of their shapes.
+        split: `training` or `validation`; they share no phantom.
+    """
     first = 10_000 * seed + (5_000 if split == "validation" else 0)
     ages = 21 + 17 * (np.arange(n) + 0.5) / n
     return [PhantomSubject(f"phantom-{w:.1f}w-{first + k}", float(w), first + k) for k, w in enumerate(ages)]
@@ -48,7 +54,7 @@ def training_and_validation(
     include: Sequence[str] | None,
     exclude: Sequence[str] | None,
     val_include: Sequence[str] | None,
-    val_exclude: Sequence[str] | None,
+    *,
     n_val_phantoms: int,
     seed: int,
 ) -> tuple[list[Subject], list[Subject]]:
@@ -60,7 +66,6 @@ def training_and_validation(
         exclude: glob patterns of names not to train on.
         val_include: glob patterns of names to validate on, which are not trained on; without any, the
             training subjects are taken, and a warning says so.
-        val_exclude: glob patterns of names not to validate on.
         n_val_phantoms: phantoms to validate on.
         seed: of the phantoms.
 
@@ -74,7 +79,7 @@ def training_and_validation(
         )
     train: list[Subject] = [*find_subjects(source, include or (), [*(exclude or ()), *(val_include or ())])]
     if val_include:
-        return train, [*find_subjects(source, val_include, val_exclude or ())]
+        return train, [*find_subjects(source, val_include)]
     logger.warning("no val_include given: validating on other simulations of the training subjects")
     return train, [*train]
 
@@ -97,24 +102,34 @@ def weeks_of(subject: Subject) -> float:
     return float(found[0])
 
 
-def load_volume_of(subject: Subject, spacing_mm: float) -> TruthVolume:
-    """The subject's normalised volume at an isotropic voxel size; for errors see `load_subject`."""
+def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:
+    """The subject's normalised volume at an isotropic voxel size; for errors see `load_subject`.
+
+    None keeps the grid of an atlas subject; a phantom has none of its own.
+    """
     if isinstance(subject, AtlasSubject):
         return load_subject(subject, spacing_mm)
+    assert spacing_mm is not None
     made = fetal_brain_phantom(subject.weeks, spacing_mm, subject.seed)
     bright = float(np.percentile(made.t2[made.mask], 99.5))
     return TruthVolume(
-        subject.name,
-        made.t2 / np.float32(bright),
-        made.mask,
-        made.affine,
-        made.labels,
-        made.labels == LABELS["ventricles"],
+        name=subject.name,
+        data=made.t2 / np.float32(bright),
+        mask=made.mask,
+        affine=made.affine,
+        labels=made.labels,
+        ventricles=made.labels == LABELS["ventricles"],
     )
 
 
 def load_head(subject: Subject, spacing_mm: float, margin_voxels: int = 3) -> TruthVolume:
-    """The subject in the atlas frame: cropped, zero outside the mask, the mask's centroid at the origin."""
+    """The subject in the atlas frame: cropped, zero outside the mask, the mask's centroid at the origin.
+
+    Args:
+        subject: for errors see `load_subject`.
+        spacing_mm: isotropic voxel size.
+        margin_voxels: background around the head.
+    """
     volume = cropped(load_volume_of(subject, spacing_mm), margin_voxels)
     centroid_mm = VolumeGrid(volume.data.shape, volume.affine).world(center_of_mass(volume.mask))
     affine = volume.affine.copy()

@@ -1,4 +1,4 @@
-"""Heads that no atlas of healthy subjects holds: enlarged ventricles, and lesions of any brightness."""
+"""Heads that no atlas of healthy subjects holds: enlarged ventricles, and lesions of any intensity."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume
         translation_mm: how far the walls move at most; up to `REACH_MM` no tissue is folded.
 
     Raises:
-        ValueError: a shift below 0 or beyond `REACH_MM`.
+        ValueError: a translation below 0 or beyond `REACH_MM`.
     """
     if not 0 <= translation_mm <= REACH_MM:
         raise ValueError(f"walls move by {translation_mm:g} mm; expected 0 to {REACH_MM:g} mm")
@@ -53,33 +53,33 @@ def enlarged_ventricles(head: TruthVolume, translation_mm: float) -> TruthVolume
 
 
 def with_lesions(head: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """A head with one to three ellipsoids of other brightness, somewhere in the mask."""
+    """A head with one to three ellipsoids of another intensity, anywhere in the mask."""
     inside = np.argwhere(head.mask)
     for _ in range(int(rng.integers(1, MAX_LESIONS + 1))):
         center = inside[rng.integers(len(inside))]
         radii = rng.uniform(*LESION_RADIUS_MM) * np.exp(rng.normal(0, 0.25, 3))
-        turn = Rotation.random(rng=rng).as_matrix()
-        head = with_lesion(head, center, radii, float(rng.uniform(0.0, 1.2)), turn)
+        axes = Rotation.random(rng=rng).as_matrix()
+        head = with_lesion(head, center, radii, float(rng.uniform(0.0, 1.2)), axes)
     return head
 
 
 def with_lesion(
-    head: TruthVolume, center: NDArray[np.integer], radii_mm: Array, intensity: float, turn: Array | None = None
+    head: TruthVolume, center: NDArray[np.integer], radii_mm: Array, intensity: float, axes: Array | None = None
 ) -> TruthVolume:
     """A head in which one ellipsoid has one intensity.
 
     Args:
-        head: of order one.
+        head: intensities of order one.
         center: [3] voxel.
         radii_mm: [3] half axes.
         intensity: inside.
-        turn: [3, 3] axes of the ellipsoid as columns; those of the world when None.
+        axes: [3, 3] axes of the ellipsoid as columns; those of the world when None.
     """
     grid = VolumeGrid(head.data.shape, head.affine)
     box = _box(head, center, float(np.max(radii_mm)) + 4 * LESION_EDGE_MM)
     index = np.stack(np.meshgrid(*[np.arange(s.start, s.stop) for s in box], indexing="ij"), -1)
     away = grid.world(index.reshape(-1, 3)) - grid.world(np.asarray(center, float))
-    local = away @ (np.eye(3) if turn is None else turn)
+    local = away @ (np.eye(3) if axes is None else axes)
     # the distance to the surface, exact for a sphere
     outside_mm = (np.linalg.norm(local / radii_mm, axis=1) - 1) * float(np.mean(radii_mm))
     share = 1 / (1 + np.exp(np.clip(outside_mm / (LESION_EDGE_MM / 2), -50, 50)))

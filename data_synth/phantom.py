@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_synth import anatomy
+from data_synth.anatomy import Anatomy
 from data_synth.shapes import (
     Coordinates,
     Field,
@@ -24,7 +26,6 @@ from data_synth.shapes import (
     intersection,
     sheet_distance,
     smooth_noise,
-    tube,
     union,
     wave_field,
 )
@@ -44,53 +45,22 @@ LABELS = {
 
 AGE_RANGE_WEEKS = (18.0, 41.0)
 
-# Columns: weeks, biparietal and occipitofrontal diameter (mm; outer border of the subarachnoid space),
-# subarachnoid space (mm), half opening of the Sylvian fissure (mm), depth of the primary and of the
-# secondary sulci (mm), T2 signal of cortical plate, white matter, subplate, deep grey (CSF is 1000).
-_GROWTH = np.array(
-    [
-        # GA   BPD   OFD  SAS  Sylv  d1   d2    CP   WM   SP   DG
-        [18.0, 43.0, 53.0, 2.6, 2.4, 0.0, 0.0, 430, 600, 720, 470],
-        [21.0, 52.0, 65.0, 2.8, 2.4, 0.0, 0.0, 430, 610, 720, 470],
-        [25.0, 63.0, 79.0, 2.8, 1.9, 2.0, 0.0, 430, 620, 710, 480],
-        [30.0, 75.0, 95.0, 2.6, 1.1, 8.0, 1.0, 430, 630, 690, 490],
-        [34.0, 85.0, 107.0, 2.1, 0.7, 11.0, 4.5, 400, 600, 630, 450],
-        [37.0, 92.0, 115.0, 1.8, 0.5, 13.0, 7.0, 370, 550, 570, 420],
-        [41.0, 97.0, 121.0, 1.5, 0.4, 14.0, 8.5, 360, 520, 530, 400],
-    ]
-)
-
 
 @dataclass(frozen=True)
 class Phantom:
-    """A synthetic head: `t2` f32 [I, J, K] (0..1000), `labels` uint8, `mask` bool, `affine` f64 (RAS, mm)."""
+    """A synthetic head.
+
+    Args:
+        t2: [I, J, K] T2-weighted signal, 0 to about 1000.
+        labels: [I, J, K] tissues (`LABELS`).
+        mask: [I, J, K] the head, with its fluid.
+        affine: [4, 4] RAS+ mm from index.
+    """
 
     t2: NDArray[np.float32]
     labels: NDArray[np.uint8]
     mask: NDArray[np.bool_]
     affine: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Anatomy:
-    """Sizes (mm) and signals of one age; `a`, `b` are half the biparietal and occipitofrontal diameter."""
-
-    weeks: float
-    a: float
-    b: float
-    csf: float
-    sylvian: float
-    depth_primary: float
-    depth_secondary: float
-    cortex: float
-    white: float
-    subplate: float
-    deep: float
-
-    @classmethod
-    def of_age(cls, weeks: float) -> _Anatomy:
-        row = [float(np.interp(weeks, _GROWTH[:, 0], column)) for column in _GROWTH.T[1:]]
-        return cls(weeks, row[0] / 2, row[1] / 2, *row[2:])
 
 
 def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float = 0.8, seed: int = 0) -> Phantom:
@@ -115,17 +85,17 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
     if not 0.3 <= spacing_mm <= 3:
         raise InputError(f"phantom: voxel size of {spacing_mm:g} mm; expected 0.3 to 3 mm")
     rng = np.random.default_rng([seed, round(gestational_age_weeks * 100)])
-    body = _Anatomy.of_age(gestational_age_weeks)
+    body = Anatomy.of_age(gestational_age_weeks)
     low = np.array([-body.a - 3, -body.b - 3, -1.22 * body.a - 3])
     high = np.array([body.a + 3, body.b + 3, 0.86 * body.a + 3])
     shape = tuple(int(n) for n in np.ceil((high - low) / spacing_mm).astype(int) + 1)
     affine = np.diag([spacing_mm] * 3 + [1.0])
     affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing_mm
-    shift = (low + high) / 2  # the grid is centred on zero, the shapes on the middle of the cerebrum
+    middle = (low + high) / 2  # the grid is centred on zero, the shapes on the middle of the cerebrum
 
     axes = [
         (np.arange(n, dtype=np.float32) * np.float32(spacing_mm) + np.float32(o + s))
-        for n, o, s in zip(shape, affine[:3, 3], shift, strict=True)
+        for n, o, s in zip(shape, affine[:3, 3], middle, strict=True)
     ]
     grid = np.meshgrid(*axes, indexing="ij", sparse=True)
     bend = 0.015 * body.a  # individual shape: the coordinates are warped a little before anything is drawn
@@ -135,24 +105,24 @@ def fetal_brain_phantom(gestational_age_weeks: float = 30.0, spacing_mm: float =
 
 
 def _draw(
-    body: _Anatomy, p: Coordinates, spacing_mm: float, rng: np.random.Generator
+    body: Anatomy, p: Coordinates, spacing_mm: float, rng: np.random.Generator
 ) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
     """Lay the tissues over each other, from CSF inwards, each weighted with its share of the voxel."""
     x, y, z = p
     half = (np.abs(x), y, z)  # mirror-symmetric shapes are drawn for one side
     a, b = body.a, body.b
     cerebrum = _smooth_cerebrum(body, half)
-    cerebellum, folia = _cerebellum(body, half)
-    brainstem = _brainstem(body, half)
+    cerebellum, folia = anatomy.cerebellum(body, half)
+    brainstem = anatomy.brainstem(body, half)
     head = union(cerebrum + np.float32(body.csf), union(cerebellum, brainstem, 6) + 2.0, 8.0)
     head = np.minimum(head, ellipsoid(half, (0, 0, -0.03 * a), (a + 0.3, b + 0.3, 1.35 * a)))
 
     surface = _folded_surface(body, p, cerebrum, spacing_mm, rng)
-    ventricles, cavum = _ventricles(body, half)
+    ventricles, cavum = anatomy.ventricles(body, half)
     thickness = np.float32(1.9) + 0.25 * smooth_noise(x.shape, 9.0, spacing_mm, rng)
     white = surface - thickness
-    deep, caudate = _deep_grey(body, half)
-    callosum = _corpus_callosum(body, half)
+    deep, caudate = anatomy.deep_grey(body, half)
+    callosum = anatomy.corpus_callosum(body, half)
 
     # White matter: subplate under the cortex, a darker band around the ventricles, slow variation.
     layer = np.exp(-(((white - 2.2) / 2.2) ** 2))
@@ -181,7 +151,7 @@ def _draw(
     lay(cavum, 960.0, "ventricles")
     lay(cerebellum, folia, "cerebellum")
     lay(brainstem, body.deep + 20 + 30 * np.cos(x / np.float32(0.05 * a)), "brainstem", soft + 0.4)
-    lay(_fourth_ventricle(body, half), 950.0, "ventricles")
+    lay(anatomy.fourth_ventricle(body, half), 950.0, "ventricles")
 
     texture = 1 + 0.012 * smooth_noise(x.shape, 2 * spacing_mm, spacing_mm, rng)
     texture += 0.03 * smooth_noise(x.shape, 18.0, spacing_mm, rng)
@@ -192,8 +162,8 @@ def _draw(
     return t2, labels, mask
 
 
-def _smooth_cerebrum(body: _Anatomy, p: Coordinates) -> Field:
-    """Both hemispheres without fissures: an egg (wider behind), bias_corrected below, with temporal lobes."""
+def _smooth_cerebrum(body: Anatomy, p: Coordinates) -> Field:
+    """Both hemispheres without fissures: an egg (wider behind), flattened below, with temporal lobes."""
     a, b, c = body.a, body.b, body.csf
     x, y, z = p
     taper = 1 - 0.07 * y / np.float32(b)  # narrower forehead
@@ -205,7 +175,7 @@ def _smooth_cerebrum(body: _Anatomy, p: Coordinates) -> Field:
 
 
 def _folded_surface(
-    body: _Anatomy, p: Coordinates, cerebrum: Field, spacing_mm: float, rng: np.random.Generator
+    body: Anatomy, p: Coordinates, cerebrum: Field, spacing_mm: float, rng: np.random.Generator
 ) -> Field:
     """Distance (mm, positive inside) to the brain's surface after fissures and sulci are cut into it."""
     a, b = body.a, body.b
@@ -257,91 +227,3 @@ def _folded_surface(
         valley = np.sqrt(away**2 + below**2) - np.float32((0.25 + 0.1 * body.csf) * min(1, depth / 4)) * allowed
         surface = intersection(surface, valley, 2.5)
     return surface
-
-
-def _ventricles(body: _Anatomy, p: Coordinates) -> tuple[Field, Field]:
-    """Lateral ventricles; third ventricle together with the cavum septi pellucidi."""
-    a, b = body.a, body.b
-    scale = float(np.interp(body.weeks, [18, 22, 30, 41], [4.2, 4.4, 3.9, 3.0]))
-    x, y, z = p
-    lateral = tube(
-        (x * 1.15, y, z),  # a little flatter sideways than up and down
-        [
-            (0.17 * a, 0.40 * b, 0.08 * a),
-            (0.17 * a, 0.05 * b, 0.21 * a),
-            (0.27 * a, -0.26 * b, 0.17 * a),
-            (0.42 * a, -0.40 * b, 0.02 * a),
-            (0.34 * a, -0.62 * b, -0.02 * a),
-        ],
-        [0.55 * scale, 0.60 * scale, 0.80 * scale, 1.05 * scale, 0.45 * scale],
-    )
-    horn = tube(
-        p,
-        [(0.44 * a, -0.38 * b, -0.02 * a), (0.53 * a, -0.15 * b, -0.30 * a), (0.50 * a, 0.08 * b, -0.38 * a)],
-        [0.80 * scale, 0.45 * scale, 0.25 * scale],
-    )
-    lateral = union(lateral, horn, 2.0)
-    third = ellipsoid(p, (0, 0.02 * b, -0.10 * a), (1.3, 0.20 * b, 0.20 * a))
-    cavum = ellipsoid(p, (0, 0.24 * b, 0.13 * a), (0.75 * scale, 0.16 * b, 0.09 * a))
-    return lateral, union(third, cavum, 1.0)
-
-
-def _corpus_callosum(body: _Anatomy, p: Coordinates) -> Field:
-    """A thin arch over the ventricles, seen in the midline and fanning out a little to the sides."""
-    a, b = body.a, body.b
-    x, y, z = p
-    radius = np.sqrt((y - np.float32(0.04 * b)) ** 2 * np.float32((0.32 * a / (0.42 * b)) ** 2) + z**2)
-    arch = np.float32(1.0 + 0.03 * a) - np.abs(radius - np.float32(0.30 * a) - 0.45 * x)
-    arch = intersection(arch, z - 0.02 * a, 1.0)
-    return intersection(arch, np.float32(0.15 * a) - x, 2.0)
-
-
-def _deep_grey(body: _Anatomy, p: Coordinates) -> tuple[Field, Field]:
-    """Thalami and lentiform nuclei; caudate heads with the ganglionic eminence along the ventricle."""
-    a, b = body.a, body.b
-    thalamus = ellipsoid(p, (0.17 * a, -0.08 * b, -0.04 * a), (0.155 * a, 0.19 * b, 0.16 * a))
-    lentiform = ellipsoid(p, (0.37 * a, 0.12 * b, -0.05 * a), (0.12 * a, 0.25 * b, 0.17 * a))
-    caudate = tube(
-        p,
-        [(0.26 * a, 0.32 * b, 0.02 * a), (0.28 * a, 0.05 * b, 0.14 * a), (0.36 * a, -0.18 * b, 0.12 * a)],
-        [0.085 * a, 0.05 * a, 0.03 * a],
-    )
-    return union(thalamus, lentiform, 1.0), caudate
-
-
-def _cerebellum(body: _Anatomy, p: Coordinates) -> tuple[Field, Field]:
-    """Cerebellar hemispheres with vermis, and their signal: folia around a brighter centre."""
-    a, b = body.a, body.b
-    half_width = 0.53 * body.weeks  # transcerebellar diameter in mm is about the age in weeks
-    size = half_width / 20.0
-    centre = (0.44 * half_width, -0.50 * b, -0.58 * a)
-    lobe = ellipsoid(p, centre, (0.58 * half_width, 13.0 * size, 11.0 * size))
-    vermis = ellipsoid(p, (0, -0.48 * b, -0.57 * a), (4.5 * size, 11.5 * size, 12.0 * size))
-    whole = union(lobe, vermis, 3.0)
-    x, y, z = p
-    # Folia are lamellae fanned around the peduncle, in front of the cerebellum.
-    angle = np.arctan2(z - np.float32(centre[2]), -(y - np.float32(centre[1] + 11 * size)))
-    number = np.float32(np.interp(body.weeks, [18, 24, 30, 41], [10, 14, 22, 32]))
-    strength = np.float32(np.interp(body.weeks, [18, 24, 30, 41], [20, 50, 110, 170]))
-    lamella = np.cos(number * angle + 0.15 * x)
-    depth = np.clip(whole / np.float32(5.0 * size), 0, 1)  # 0 at the surface, 1 in the white centre
-    signal = np.float32(body.cortex + 40) + 130 * depth + strength * lamella * (1 - depth) * 0.6
-    return whole - 0.5 * np.maximum(lamella, 0) * np.float32(min(1.0, float(strength) / 120)), signal
-
-
-def _brainstem(body: _Anatomy, p: Coordinates) -> Field:
-    """Midbrain, pons (bulging forwards) and medulla."""
-    a, b = body.a, body.b
-    stem = tube(
-        p,
-        [(0, -0.06 * b, -0.20 * a), (0, -0.13 * b, -0.48 * a), (0, -0.22 * b, -0.85 * a), (0, -0.28 * b, -1.05 * a)],
-        [0.17 * a, 0.15 * a, 0.11 * a, 0.08 * a],
-    )
-    pons = ellipsoid(p, (0, -0.10 * b, -0.54 * a), (0.20 * a, 0.13 * b, 0.17 * a))
-    return union(stem, pons, 2.0)
-
-
-def _fourth_ventricle(body: _Anatomy, p: Coordinates) -> Field:
-    """The fluid between pons and vermis."""
-    a, b = body.a, body.b
-    return ellipsoid(p, (0, -0.27 * b, -0.56 * a), (0.09 * a, 0.04 * b, 0.14 * a))

@@ -18,7 +18,13 @@ Coordinates = tuple[Field, Field, Field]
 
 
 def ellipsoid(p: Coordinates, center_mm: tuple[float, ...], radius_mm: tuple[float, ...]) -> Field:
-    """Signed distance (mm) to an axis-aligned ellipsoid, first order in the distance from its surface."""
+    """Signed distance (mm) to an axis-aligned ellipsoid, first order in the distance from its surface.
+
+    Args:
+        p: coordinates (mm).
+        center_mm: [3].
+        radius_mm: [3] half axes.
+    """
     q = [(axis - np.float32(c)) / np.float32(r) for axis, c, r in zip(p, center_mm, radius_mm, strict=True)]
     k0 = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
     k1 = np.sqrt(sum((axis / np.float32(r)) ** 2 for axis, r in zip(q, radius_mm, strict=True)))
@@ -27,7 +33,13 @@ def ellipsoid(p: Coordinates, center_mm: tuple[float, ...], radius_mm: tuple[flo
 
 
 def tube(p: Coordinates, points_mm: list[tuple[float, ...]], radius_mm: list[float]) -> Field:
-    """Signed distance (mm) to a tube along a polyline whose radius changes linearly between its points."""
+    """Signed distance (mm) to a tube along a polyline whose radius changes linearly between its points.
+
+    Args:
+        p: coordinates (mm).
+        points_mm: [n, 3] of the polyline.
+        radius_mm: [n] at its points.
+    """
     best: Field | None = None
     for a, b, ra, rb in zip(points_mm, points_mm[1:], radius_mm, radius_mm[1:], strict=False):
         axis = np.subtract(b, a)
@@ -41,7 +53,13 @@ def tube(p: Coordinates, points_mm: list[tuple[float, ...]], radius_mm: list[flo
 
 
 def union(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
-    """Union of two shapes; edges where they meet are filled over `blend_mm` (polynomial smooth maximum)."""
+    """Union of two shapes (polynomial smooth maximum).
+
+    Args:
+        a: signed distance (mm).
+        b: signed distance (mm).
+        blend_mm: width over which the edges where they meet are filled.
+    """
     if blend_mm <= 0:
         return np.maximum(a, b)
     h = np.maximum(np.float32(blend_mm) - np.abs(a - b), 0)
@@ -49,7 +67,7 @@ def union(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
 
 
 def intersection(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
-    """Intersection of two shapes, its edges rounded over `blend_mm`."""
+    """Intersection of two shapes, its edges rounded; for the arguments see `union`."""
     return -union(-a, -b, blend_mm)
 
 
@@ -96,6 +114,12 @@ def smooth_noise(shape: tuple[int, ...], sigma_mm: float, spacing_mm: float, rng
 
     Drawn on a grid about as coarse as the noise is smooth and interpolated by cubic splines, so a
     long correlation costs no more than a short one.
+
+    Args:
+        shape: of the grid.
+        sigma_mm: correlation length.
+        spacing_mm: voxel size.
+        rng: source of randomness.
     """
     step = max(1.0, sigma_mm / spacing_mm)
     small = tuple(int(np.ceil(n / step)) + 3 for n in shape)

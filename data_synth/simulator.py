@@ -1,8 +1,9 @@
 """From a volume to stacks of slices of a moving head, with the true pose of every slice.
 
-A pixel is a weighted sum of samples of the volume, spread over the slice's profile. The volume is read by
-trilinear interpolation, which itself blurs; the sample positions are drawn together by just that much, so
-that the profile seen by the slices has the stated variance (`_profile_nodes`).
+A pixel is a weighted sum of samples of the volume, spread over the slice's profile (`data_synth.slice_profile`).
+The same simulator makes the stacks of evaluations and of trainings. Bias field and Rician noise are its own
+lines instead of torchio's and MONAI's: the field is fixed to the scanner over a whole stack and stated per
+millimetre, and evaluations must not change with a version of those libraries.
 """
 
 from __future__ import annotations
@@ -17,15 +18,14 @@ from scipy.ndimage import binary_dilation, zoom
 from scipy.spatial.transform import Rotation
 
 from data_synth.motion import LEVELS, MotionLevel, slice_trajectory
+from data_synth.slice_profile import Profile, ProfileOperator
 from g3r.acquisition.planes import Planes
-from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack
-from g3r.acquisition.voxel_operator import VoxelOperator, psf_nodes
+from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
 
 Orientation = Literal["axial", "coronal", "sagittal", "random"]
-Profile = Literal["box", "gaussian"]
 
 # Columns: in-plane x, in-plane y, normal (right-handed).
 FRAMES = {
@@ -35,15 +35,13 @@ FRAMES = {
 }
 
 FIELD_OF_VIEW_MARGIN_MM = 5.0
-"""Around the head as it lies at rest; motion may carry a part of it out of view, as it does in a scanner."""
+"""Around the head at rest; motion may carry a part of it out of view, as it does in a scanner."""
 
 SIGNAL_REACH_VOXELS = 4
 """Pixels further than this from the mask show nothing but noise and are not computed."""
-TRILINEAR_VARIANCE = 1.0 / 6.0
-"""Variance that trilinear reading adds on average, in squared voxels: the mean of f (1 - f) over a voxel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StackSettings:
     """How one stack is taken.
 
@@ -59,7 +57,6 @@ class StackSettings:
         snr: the 99.5th percentile in the mask is 2 snr noise deviations; infinity for none.
         bias: strength of the smooth in-plane inhomogeneity; 0 for none.
         gain_deviation: standard deviation of the slices' log gains.
-        spike_share: share of slices with a spike in k-space: stripes over the whole image.
     """
 
     orientation: Orientation = "axial"
@@ -73,7 +70,6 @@ class StackSettings:
     snr: float = 25.0
     bias: float = 0.05
     gain_deviation: float = 0.05
-    spike_share: float = 0.0
 
     def __post_init__(self) -> None:
         checks = {
@@ -83,7 +79,6 @@ class StackSettings:
             "snr": (self.snr, 0.1, np.inf),
             "bias": (self.bias, 0.0, 1.0),
             "gain deviation": (self.gain_deviation, 0.0, 1.0),
-            "share of spikes": (self.spike_share, 0.0, 1.0),
         }
         for name, (value, low, high) in checks.items():
             if not low <= value <= high:
@@ -96,15 +91,15 @@ class SimulatedStack:
 
     Args:
         stack: what a scanner would give; its header states the geometry without motion.
-        true_pose: [K] a point x of slice k by the header truly lies at R x + t.
-        gain: [K] intensity factor of each slice (drop-outs included).
-        is_void: [K] whether the slice lost its signal.
+        true_pose: [K] a point x of slice k by the header is truly at R x + t.
+        gain: [K] intensity factor of each slice (dropouts included).
+        dropout: [K] whether the slice lost its signal.
     """
 
     stack: Stack
     true_pose: RigidPose
     gain: NDArray[np.float64]
-    is_void: NDArray[np.bool_]
+    dropout: NDArray[np.bool_]
 
 
 def orthogonal_settings(n_stacks: int, motion: str = "none", **common: object) -> list[StackSettings]:
@@ -130,7 +125,7 @@ def simulate_stacks(
     """Take stacks of a volume.
 
     Args:
-        volume: [I, J, K] intensities; what lies outside the mask by more than 4 voxels is not seen.
+        volume: [I, J, K] intensities; anything further than 4 voxels from the mask is not seen.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
         settings: one entry per stack.
@@ -156,7 +151,7 @@ def simulate_stacks(
     ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Head:
     """The volume to be sliced, its mask, where signal may be, and corners of the mask in the world."""
 
@@ -183,14 +178,14 @@ class _Head:
             volume = zoom(volume, [m / n for m, n in zip(shape, volume.shape, strict=True)], order=3, mode="nearest")
             volume_grid = VolumeGrid(volume.shape, affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
         return cls(
-            np.ascontiguousarray(volume, np.float32),
-            volume_grid,
-            mask.astype(np.float32),
-            reach.astype(np.float32),
-            grid,
-            points,
-            (extent.min(0) + extent.max(0)) / 2,
-            bright,
+            volume=np.ascontiguousarray(volume, np.float32),
+            volume_grid=volume_grid,
+            mask=mask.astype(np.float32),
+            reach=reach.astype(np.float32),
+            mask_grid=grid,
+            point_mm=points,
+            center_mm=(extent.min(0) + extent.max(0)) / 2,
+            bright=bright,
         )
 
 
@@ -216,20 +211,18 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
         np.zeros((n_slices, 3)),  # the profile is the simulator's own
     )
     planes = nominal.moved(true_pose)
-    reach = _ProfileOperator(planes, head.mask_grid, None, None).forward(head.reach) > 0.01
-    seen = np.flatnonzero(reach)
+    seen = np.flatnonzero(VoxelOperator(planes, head.mask_grid, None, (1, 1, 1)).forward(head.reach) > 0.01)
     mask = np.zeros(planes.n_pixels, bool)
-    mask[seen] = _ProfileOperator(planes, head.mask_grid, seen, None).forward(head.mask) > 0.5
+    mask[seen] = VoxelOperator(planes, head.mask_grid, seen, (1, 1, 1)).forward(head.mask) > 0.5
     signal = np.zeros(planes.n_pixels)
-    signal[seen] = _ProfileOperator(planes, head.volume_grid, seen, settings).forward(head.volume)
+    profile = (settings.resolution_mm, settings.thickness_mm, settings.profile)
+    signal[seen] = ProfileOperator(planes, head.volume_grid, seen, *profile).forward(head.volume)
     signal = np.maximum(signal, 0).reshape(n_slices, *shape[:2])
 
     gain = np.exp(rng.normal(0, 1, n_slices) * settings.gain_deviation)
-    is_void = rng.random(n_slices) < settings.motion.dropout_share
-    gain = np.where(is_void, gain * rng.uniform(0.1, 0.5, n_slices), gain)
+    dropout = rng.random(n_slices) < settings.motion.dropout_share
+    gain = np.where(dropout, gain * rng.uniform(0.1, 0.5, n_slices), gain)
     image = signal * gain[:, None, None] * _bias(shape[:2], settings, rng)
-    for k in np.flatnonzero(rng.random(n_slices) < settings.spike_share) if settings.spike_share else ():
-        image[k] += _stripes(shape[:2], head.bright, rng)
     if np.isfinite(settings.snr):
         deviation = head.bright / (2 * settings.snr)
         noise = rng.standard_normal((2, *image.shape), dtype=np.float32) * np.float32(deviation)
@@ -240,7 +233,7 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
         raise InputError(f"simulation: {name} sees nothing of the head; use less motion or another seed")
     pixels = np.ascontiguousarray(image.transpose(in_file), dtype=np.float32)
     stack = Stack(pixels, np.ascontiguousarray(mask3d), affine, settings.thickness_mm, name)
-    return SimulatedStack(stack, true_pose, gain, is_void)
+    return SimulatedStack(stack, true_pose, gain, dropout)
 
 
 def _frame(settings: StackSettings, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -257,58 +250,3 @@ def _bias(shape: NDArray[np.int64], settings: StackSettings, rng: np.random.Gene
     c = rng.normal(size=5) * settings.bias
     x, y = x[:, None], y[None, :]
     return np.exp(c[0] * x + c[1] * y + c[2] * x * y + 0.5 * (c[3] * x**2 + c[4] * y**2))
-
-
-def _stripes(shape: NDArray[np.int64], bright: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """What one wrong sample in k-space adds to an image."""
-    x, y = np.meshgrid(*[np.arange(n) for n in shape], indexing="ij")
-    across = rng.uniform(-0.3, 0.3, 2)  # cycles per pixel
-    return bright * rng.uniform(0.1, 0.4) * np.cos(2 * np.pi * (across[0] * x + across[1] * y + rng.random()))
-
-
-class _ProfileOperator(VoxelOperator):
-    """The voxel operator with the simulator's own slice profile; without settings it reads single points."""
-
-    def __init__(
-        self, planes: Planes, grid: VolumeGrid, pixel_index: NDArray[np.int64] | None, settings: StackSettings | None
-    ) -> None:
-        super().__init__(planes, grid, pixel_index, (1, 1, 1))
-        if settings is not None:
-            nodes, self.node_weight = _profile_nodes(settings, float(grid.spacing_mm.mean()))
-            self.node_mm = np.tile(nodes, (len(planes), 1, 1))
-            self.move(planes)
-
-
-def _profile_nodes(settings: StackSettings, voxel_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sample positions [Q, 3] (mm in the slice's frame) and weights [Q] of the slice profile.
-
-    The variance along each axis is that of the profile less that of trilinear reading.
-    """
-    blur_mm2 = TRILINEAR_VARIANCE * voxel_mm**2
-    target = psf_variance_mm2([settings.resolution_mm] * 2, settings.thickness_mm)
-    axes = []
-    for axis in range(3):
-        reach = 5.2 * np.sqrt(target[axis])
-        # in plane the pixel is about a voxel wide, so that three positions are enough
-        n = 3 if axis < 2 else 2 * int(np.ceil(reach / max(0.6, voxel_mm) / 2)) + 1
-        if axis == 2 and settings.profile == "box":
-            nodes, weights, variance = _soft_box(n, settings.thickness_mm)
-        else:
-            nodes, weights = psf_nodes(n)
-            variance = float(target[axis])
-        axes.append((nodes * np.sqrt(max(variance - blur_mm2, 0.0)), weights))
-    grid = np.stack(np.meshgrid(*[a[0] for a in axes], indexing="ij"), -1).reshape(-1, 3)
-    return grid, np.einsum("i,j,k->ijk", *[a[1] for a in axes]).ravel()
-
-
-def _soft_box(n: int, thickness_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """A profile flat inside the slice whose edges fall over a fifth of its thickness.
-
-    Returns:
-        n nodes scaled to unit variance, their weights, and the profile's true variance in mm^2 (that of a box
-        of the thickness convolved with one of a fifth of it).
-    """
-    nodes = np.linspace(-0.6, 0.6, n + 2)[1:-1]
-    weights = np.clip((0.6 - np.abs(nodes)) / 0.2, 0.0, 1.0)
-    weights /= weights.sum()
-    return nodes / np.sqrt((weights * nodes**2).sum()), weights, thickness_mm**2 * (1 + 0.2**2) / 12

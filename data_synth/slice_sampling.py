@@ -51,7 +51,20 @@ def sample_slices(
     size: int,
     threshold: float = 0.5,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images [K, N, N], averaged over pixel and thickness, and the mask's share of each pixel."""
+    """Slice images of a head, averaged over pixel and thickness.
+
+    Args:
+        head: the truth.
+        index_from_atlas: [4, 4] voxel index from the atlas frame (mm).
+        pose: [K] atlas frame from the slices, whose origins are the images' centres.
+        thickness_mm: [K].
+        pixel_mm: edge of the square pixels.
+        size: pixels per edge, N.
+        threshold: of the soft mask; less makes the head larger.
+
+    Returns:
+        Images [K, N, N], zero outside the mask, and the mask's share of each pixel [K, N, N].
+    """
     linear = index_from_atlas[:3, :3]
     axes = linear @ pose.rotation
     origin = pose.translation_mm @ linear.T + index_from_atlas[:3, 3]
@@ -72,7 +85,7 @@ def sample_slices(
 def sample_masks(
     head: Head, index_from_atlas: Array, pose: RigidPose, pixel_mm: float, size: int, threshold: float
 ) -> NDArray[np.float32]:
-    """Whether each pixel's centre lies in the mask [K, N, N], 0 or 1."""
+    """Whether each pixel's centre is in the mask [K, N, N], 0 or 1; for the arguments see `sample_slices`."""
     linear = index_from_atlas[:3, :3]
     axes = np.ascontiguousarray(linear @ pose.rotation, dtype=np.float32)
     origin = np.ascontiguousarray(pose.translation_mm @ linear.T + index_from_atlas[:3, 3], dtype=np.float32)

@@ -1,9 +1,8 @@
-"""Synthetic subjects, and a folder that keeps them: made once, read in a hundredth of the time."""
+"""Synthetic subjects of the prior network, and a folder that keeps them: reading one takes a hundredth of the time."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,16 +10,29 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.motion import ResidualKind
+from data_synth.registration_errors import ResidualKind
 from g3r.errors import InputError
+from g3r.run.atomic_file import atomic_path
 
-RECIPE_VERSION = 1
-"""Raised whenever the synthesis changes, so that no subject of another recipe is taken for one of this."""
+SYNTHESIS_VERSION = 2
+"""Raised whenever the synthesis changes, so that subjects of an earlier one are not taken."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SyntheticSubject:
-    """What the network sees and should answer, [I, J, K] on the truth's grid, in normalised intensities."""
+    """What the prior network sees and should answer, on the truth's grid, in normalised intensities.
+
+    Args:
+        coarse: [I, J, K] V_coarse.
+        density: [I, J, K] M_rho.
+        sharp: [I, J, K] V_sharp.
+        truth: [I, J, K], zero outside the mask.
+        mask: [I, J, K] the head.
+        affine: [4, 4] RAS+ mm from index.
+        name: of the subject that it was made from.
+        n_stacks: stacks that it was made from.
+        residual: kind of its pose errors.
+    """
 
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
@@ -33,12 +45,12 @@ class SyntheticSubject:
     residual: ResidualKind
 
 
-class KeptSubjects:
+class SubjectCache:
     """Subjects as files in a folder; volumes as float16, which is finer than their noise.
 
     Args:
         folder: made where it is missing.
-        spec: all that decides the subjects; another recipe has files of other names.
+        spec: all that decides the subjects; another spec has files of other names.
 
     Raises:
         InputError: the folder cannot be made.
@@ -50,7 +62,7 @@ class KeptSubjects:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another cache") from None
-        self.prefix = hashlib.sha256(f"{RECIPE_VERSION} {spec}".encode()).hexdigest()[:12]
+        self.prefix = hashlib.sha256(f"{SYNTHESIS_VERSION} {spec}".encode()).hexdigest()[:12]
 
     def _path(self, epoch: int, index: int) -> Path:
         return self.folder / f"{self.prefix}-{epoch:05d}-{index:05d}.npz"
@@ -74,6 +86,11 @@ class KeptSubjects:
     def save(self, epoch: int, index: int, subject: SyntheticSubject) -> None:
         """Keep a subject; its file appears whole or not at all.
 
+        Args:
+            epoch: of the subject's number.
+            index: of the subject's number.
+            subject: to keep.
+
         Raises:
             InputError: the folder is full or cannot be written.
         """
@@ -82,11 +99,8 @@ class KeptSubjects:
             value = np.asarray(getattr(subject, field.name))
             arrays[field.name] = value.astype(np.float16) if value.dtype == np.float32 else value
         path = self._path(epoch, index)
-        beside = path.with_suffix(f".{os.getpid()}")
         try:
-            with open(beside, "wb") as stream:
-                np.savez(stream, **arrays)  # type: ignore[arg-type]
-            os.replace(beside, path)
+            with atomic_path(path) as temporary:
+                np.savez(temporary, **arrays)  # type: ignore[arg-type]
         except OSError as error:
-            beside.unlink(missing_ok=True)
             raise InputError(f"{path}: cannot be written ({error.strerror}); free some space") from None

@@ -28,8 +28,8 @@ def atlas_templates(
     """Mean heads in the atlas frame: centred, normalised, averaged over near ages, left-right symmetric.
 
     Each subject is brought to the template's voxel size, its mask's centroid to the origin and its 99.5th
-    percentile to 1. Axes are taken as they stand: both atlases and the phantom are RAS with the mid-sagittal
-    plane at constant x. An age without a subject within two weeks is left out.
+    percentile to 1. Axes are taken as they are: both atlases and the phantom are RAS with the mid-sagittal
+    plane at constant x. An age without a subject within two weeks is skipped.
 
     Args:
         subjects: to average.

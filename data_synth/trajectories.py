@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.motion import about
-from g3r.acquisition.interleave import acquisition_order
+from data_synth.motion import place_in_time
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
 
@@ -22,8 +21,8 @@ SAMPLE_SECONDS = 7.0
 
 # Fitted to the 154 trajectories of fetal heads (19,661 steps of 7 s) in traj_flat.npz, the file that comes
 # with SVoRT (Xu et al., MICCAI 2022). The mean square rotation grows with the lag (72, 98, 138, 189 deg^2 per
-# axis after 1, 2, 4, 8 steps), which splits into white tracking noise (46 deg^2), no motion and left out, and
-# a walk of 15 to 25 deg^2 per step; the quiet steps (under 4 deg) have 1.4 deg and 1.3 mm per axis.
+# axis after 1, 2, 4, 8 steps), which splits into white tracking noise (46 deg^2), which is not modelled, and a
+# walk of 15 to 25 deg^2 per step; the quiet steps (under 4 deg) have 1.4 deg and 1.3 mm per axis.
 QUIET_DEG = 1.2
 QUIET_MM = 0.8
 JERK_SHARE = 0.06
@@ -55,10 +54,10 @@ def load_trajectories(path: str | Path) -> list[RecordedTrajectory]:
         raise InputError(f"{path}: cannot be read as npz; expected rot_* (rad) and trans_* (mm)") from error
     found = []
     for name in sorted(name for name in arrays if name.startswith("rot_")):
-        angle, shift = arrays[name], arrays.get("trans_" + name.removeprefix("rot_"))
-        if shift is None or angle.shape != shift.shape or angle.ndim != 2 or angle.shape[1] != 3:
+        angle, translation = arrays[name], arrays.get("trans_" + name.removeprefix("rot_"))
+        if translation is None or angle.shape != translation.shape or angle.ndim != 2 or angle.shape[1] != 3:
             raise InputError(f"{path}: {name} {angle.shape} has no trans_* of its shape; expected [T, 3]")
-        found.append(RecordedTrajectory(Rotation.from_euler("xyz", angle).as_matrix(), shift))
+        found.append(RecordedTrajectory(Rotation.from_euler("xyz", angle).as_matrix(), translation))
     if not found:
         raise InputError(f"{path}: holds no trajectory; expected rot_* (rad) and trans_* (mm)")
     return found
@@ -66,10 +65,10 @@ def load_trajectories(path: str | Path) -> list[RecordedTrajectory]:
 
 def modelled_trajectory(n_samples: int, rng: np.random.Generator) -> RecordedTrajectory:
     """A random walk of small steps and rare large ones, with the recorded trajectories' statistics."""
-    lively = np.exp(rng.normal(0, SPREAD_BETWEEN_SUBJECTS))
+    activity = np.exp(rng.normal(0, SPREAD_BETWEEN_SUBJECTS))
     jerk = rng.random((n_samples, 1)) < JERK_SHARE
-    angle_deg = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_DEG, QUIET_DEG) * lively
-    translation_mm = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_MM, QUIET_MM) * lively
+    angle_deg = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_DEG, QUIET_DEG) * activity
+    translation_mm = rng.normal(0, 1, (n_samples, 3)) * np.where(jerk, JERK_MM, QUIET_MM) * activity
     steps = Rotation.from_rotvec(angle_deg, degrees=True).as_matrix()
     rotation = np.empty((n_samples, 3, 3))
     rotation[0] = np.eye(3)
@@ -81,17 +80,15 @@ def modelled_trajectory(n_samples: int, rng: np.random.Generator) -> RecordedTra
 def timed_trajectory(
     n_slices: int,
     seconds_per_slice: float,
-    center_mm: Array,
     interleave: int,
     rng: np.random.Generator,
     recorded: Sequence[RecordedTrajectory] = (),
 ) -> RigidPose:
-    """True motion of each slice of one stack, about the stack's mean: a piece of a trajectory in time.
+    """True motion of each slice of one stack about the origin: a piece of a trajectory in time, without its mean.
 
     Args:
         n_slices: K.
         seconds_per_slice: time between two slices.
-        center_mm: the head's centre [3], about which it turns.
         interleave: see `acquisition_order`.
         rng: source of randomness.
         recorded: trajectories to cut the piece from; none takes the model.
@@ -114,7 +111,5 @@ def timed_trajectory(
     sample_seconds = np.arange(len(angle)) * SAMPLE_SECONDS
     both = np.concatenate([angle, piece.translation_mm - piece.translation_mm.mean(0)], axis=1)
     in_time = np.stack([np.interp(seconds, sample_seconds, column) for column in both.T], axis=1)
-    place = np.empty(n_slices, np.int64)
-    place[acquisition_order(n_slices, interleave)] = np.arange(n_slices)
-    in_space = in_time[place]
-    return about(RigidPose.from_rotvec(in_space[:, :3], in_space[:, 3:]), center_mm)
+    in_space = in_time[place_in_time(n_slices, interleave)]
+    return RigidPose.from_rotvec(in_space[:, :3], in_space[:, 3:])

@@ -153,4 +153,4 @@ def stretched(truth: TruthVolume, spec: SubjectSpec, rng: np.random.Generator) -
     affine = np.eye(4)
     affine[:3, :3] = turn @ truth.affine[:3, :3] * factor
     affine[:3, 3] = -affine[:3, :3] @ ((np.array(truth.data.shape) - 1) / 2)
-    return TruthVolume(spec.name, truth.data * np.float32(BRIGHT), truth.mask, affine)
+    return TruthVolume(name=spec.name, data=truth.data * np.float32(BRIGHT), mask=truth.mask, affine=affine)

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.phantoms import simulate_small_subject
+
 # torch's threads wait for each other busily: on two cores with anything beside them, small networks take
 # ten times as long; commands that tests start choose their own number
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -31,3 +33,9 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no test data at {folder}; set G3R_TEST_DATA to the folder that holds cases/ and real/")
     return folder
+
+
+@pytest.fixture(scope="session")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of three small stacks of a phantom that moves a little; tests do not write to it."""
+    return simulate_small_subject(tmp_path_factory.mktemp("simulated") / "subject")

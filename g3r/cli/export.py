@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g3r._version import __version__
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code (0 done, 2 usage, 3 bad input)."""
     parser = argparse.ArgumentParser(prog="g3r-export", description=__doc__)
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("run", metavar="RUN.ckpt", type=Path, help="checkpoint written by g3r-pretrain")
     parser.add_argument("file", metavar="FILE.safetensors", type=Path, help="file to write")
     parser.add_argument("--data-description", metavar="TEXT", help="training data in words, kept in the file")

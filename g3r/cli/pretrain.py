@@ -4,6 +4,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from g3r._version import __version__
+
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
 
@@ -30,6 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_HELP, end="")
         return 0 if arguments else 2
+
+    if arguments[0] == "--version":
+        print(f"g3r-pretrain {__version__}")
+        return 0
 
     from g3r.errors import G3RError
 

@@ -26,7 +26,7 @@ from studies.subjects import BRIGHT, SubjectSpec, stretched
 
 MARGIN_VOXELS = 4
 MOTION = "mild"
-VOID_WEIGHT = 0.05
+DROPOUT_WEIGHT = 0.05
 """Trust in a slice that lost its signal, as registration would have it."""
 
 
@@ -154,13 +154,13 @@ def true_motion(stacks: list[SimulatedStack]) -> Registration:
     first = np.concatenate([[0], np.cumsum([len(one.gain) for one in stacks])])
     row = first[slices.stack_id] + slices.slice_index
     gain = np.concatenate([one.gain for one in stacks])[row]
-    is_void = np.concatenate([one.is_void for one in stacks])[row]
+    dropout = np.concatenate([one.dropout for one in stacks])[row]
     pose = RigidPose(rotation[row], shift[row])
     n = len(stacks)
     return Registration(
         slices.with_pose(pose @ slices.header_pose),
         gain / np.exp(np.log(gain).mean()),
-        np.where(is_void, VOID_WEIGHT, 1.0),
+        np.where(dropout, DROPOUT_WEIGHT, 1.0),
         np.ones(len(slices)),
         [1.0] * n if n > 1 else None,
         "true poses",

@@ -87,7 +87,9 @@ def load_labels(volume_file: Path, mask_file: Path, margin_voxels: int) -> Truth
     turn = nib.orientations.io_orientation(labels.affine)
     affine = labels.affine @ nib.orientations.inv_ornt_aff(turn, labels.data.shape)
     data, inside = (nib.orientations.apply_orientation(one.data, turn) for one in (labels, mask))
-    return cropped(TruthVolume("labels", np.asarray(data, np.float32), inside > 0.5, affine), margin_voxels)
+    return cropped(
+        TruthVolume(name="labels", data=np.asarray(data, np.float32), mask=inside > 0.5, affine=affine), margin_voxels
+    )
 
 
 def draw_lesions(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.motion import acquisition_order
+from g3r.acquisition.interleave import acquisition_order
 from g3r.evaluation.pose_error import PoseTable, SliceKey
 from studies.tables import new_figure, save_figure
 

@@ -82,7 +82,9 @@ def small_head(seed: int) -> TruthVolume:
     affine = np.diag([VOXEL_MM, VOXEL_MM, VOXEL_MM, 1.0])
     affine[:3, 3] = -VOXEL_MM * (VOXELS - 1) / 2
     shape = (VOXELS, VOXELS, VOXELS)
-    return TruthVolume("phantom", _window(made.t2 * bright, low, shape), _window(made.mask, low, shape), affine)
+    return TruthVolume(
+        name="phantom", data=_window(made.t2 * bright, low, shape), mask=_window(made.mask, low, shape), affine=affine
+    )
 
 
 def in_shape(one: SimulatedStack) -> SimulatedStack:
@@ -96,7 +98,7 @@ def in_shape(one: SimulatedStack) -> SimulatedStack:
     low[2] = first
     cut = replace(stack, image=_window(stack.image, low, shape), mask=_window(stack.mask, low, shape), affine=affine)
     kept = slice(first, last)
-    return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.is_void[kept])
+    return SimulatedStack(cut, one.true_pose.take(kept), one.gain[kept], one.dropout[kept])
 
 
 def _window(data: NDArray, low: Sequence[int], shape: Sequence[int]) -> NDArray:

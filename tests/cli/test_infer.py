@@ -1,4 +1,4 @@
-"""`g3r-simulate` and `g3r-infer` as processes: outputs, refusals, exit codes; the same from Python."""
+"""`g3r-infer` as a process: outputs, refusals, exit codes; the same from Python."""
 
 import csv
 import gzip
@@ -47,17 +47,6 @@ def files(subject: Path, kind: str) -> list[Path]:
 
 def inputs(subject: Path) -> list[object]:
     return ["--stacks", *files(subject, "stack"), "--masks", *files(subject, "mask")]
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three stacks of a small phantom that moves a little, written by g3r-simulate."""
-    folder = tmp_path_factory.mktemp("simulated") / "subject"
-    done = run(
-        "simulate", "--phantom", 22, "--resolution", 1.5, "--thickness", 4, "--motion", "mild", "--output", folder
-    )
-    assert done.returncode == 0, done.stderr
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data_synth.phantom import fetal_brain_phantom
+from g3r._version import __version__
 
 FILES = {
     *(f"{kind}-{n}.nii.gz" for kind in ("stack", "mask") for n in range(2)),
@@ -39,26 +40,8 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_a_subject_from_a_volume(volume: tuple[Path, Path], tmp_path: Path) -> None:
     output = tmp_path / "new" / "case"
-    done = run(
-        "--volume",
-        volume[0],
-        "--mask",
-        volume[1],
-        "--output",
-        output,
-        "--stacks",
-        2,
-        "--resolution",
-        1.2,
-        "--thickness",
-        3,
-        "--gap",
-        0.5,
-        "--motion",
-        "moderate",
-        "--seed",
-        3,
-    )
+    options = "--stacks 2 --resolution 1.2 --thickness 3 --gap 0.5 --motion moderate --seed 3"
+    done = run("--volume", volume[0], "--mask", volume[1], "--output", output, *options.split())
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert str(output) in done.stdout
@@ -140,24 +123,30 @@ def test_bad_input_is_one_line_and_exit_3(case: str, volume: tuple[Path, Path], 
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        (),
-        ("--output", "x"),
-        ("--volume", "v", "--output", "x"),
-        ("--phantom", "22", "--output", "x", "--motion", "wild"),
-    ],
+    "arguments", ["", "--output x", "--volume v --output x", "--phantom 22 --output x --motion wild"]
 )
-def test_usage_errors_are_exit_2(arguments: tuple[str, ...]) -> None:
-    assert run(*arguments).returncode == 2
+def test_usage_errors_are_exit_2(arguments: str) -> None:
+    assert run(*arguments.split()).returncode == 2
+
+
+def test_version() -> None:
+    done = run("--version")
+    assert done.returncode == 0
+    assert __version__ in done.stdout
 
 
 def test_help_is_light() -> None:
     code = (
         "import sys\nfrom data_synth.cli import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
-        "assert not {'torch', 'torchio', 'lightning', 'monai'} & set(sys.modules)\n"
+        "assert not {'torch', 'torchio', 'lightning', 'monai', 'numba', 'scipy', 'numpy'} & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--phantom" in done.stdout
+
+
+def test_the_simulator_needs_no_training_packages() -> None:
+    code = "import sys, data_synth.simulator\nassert not {'torch', 'torchio', 'lightning', 'monai'} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from data_synth.motion import LEVELS, MotionLevel, draw_residual_kind, residual_errors, slice_trajectory
+from data_synth.atlas import TruthVolume
+from data_synth.motion import LEVELS, MotionLevel
 from data_synth.simulator import SimulatedStack, StackSettings, orthogonal_settings, simulate_stacks
-from g3r.acquisition.interleave import acquisition_order
+from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
@@ -129,13 +131,13 @@ def test_generator_decides_everything() -> None:
     assert np.abs(first[0].true_pose.translation_mm - other[0].true_pose.translation_mm).max() > 0.1
 
 
-def test_noise_gain_and_voids() -> None:
+def test_noise_gain_and_dropout() -> None:
     volume = np.full((N, N, N), 500, np.float32)
     level = MotionLevel(dropout_share=0.3)
     noisy = StackSettings(motion=level, snr=20.0, bias=0.0, gain_deviation=0.1, gap_mm=0.0, thickness_mm=2.0)
     (one,) = simulate_stacks(volume, BALL, AFFINE, [noisy], np.random.default_rng(7))
-    assert 1 <= one.is_void.sum() < len(one.is_void)
-    assert (one.gain[one.is_void] < 0.7).all()
+    assert 1 <= one.dropout.sum() < len(one.dropout)
+    assert (one.gain[one.dropout] < 0.7).all()
     inside = deep(one)
     for k in np.flatnonzero(inside.sum((0, 1)) > 200):
         values = one.stack.image[:, :, k][inside[:, :, k]]
@@ -167,45 +169,16 @@ def test_empty_mask_and_unknown_motion() -> None:
         orthogonal_settings(3, "wild")
 
 
-class TestMotion:
-    def test_neighbours_in_time_move_together(self) -> None:
-        level = MotionLevel(walk_mm=1.0, walk_deg=1.0)
-        rng = np.random.default_rng(0)
-        pose = slice_trajectory(200, level, np.zeros(3), 2, rng)
-        in_time = pose.translation_mm[acquisition_order(200, 2)]
-        assert 0.8 < np.diff(in_time, axis=0).std() < 1.2
-        assert np.abs(in_time.mean(0)).max() < 0.5
-
-    def test_a_jerk_lasts(self) -> None:
-        level = MotionLevel(n_jerks=1, jerk_mm=5.0)
-        pose = slice_trajectory(30, level, np.zeros(3), 1, np.random.default_rng(1))
-        steps = np.linalg.norm(np.diff(pose.translation_mm, axis=0), axis=1)
-        assert (steps > 1e-9).sum() == 1
-
-    def test_the_head_turns_about_its_centre(self) -> None:
-        center = np.array([30.0, -20.0, 50.0])
-        level = MotionLevel(offset_deg=20.0)
-        pose = slice_trajectory(8, level, center, 2, np.random.default_rng(2))
-        np.testing.assert_allclose(pose.apply(np.tile(center, (8, 1))), np.tile(center, (8, 1)), atol=1e-9)
-
-    def test_residual_errors_have_the_stated_size(self) -> None:
-        stack_id, center = np.repeat([0, 1, 2], 40), np.random.default_rng(3).normal(size=(120, 3)) * 20
-        lengths, angles = [], []
-        for seed in range(40):
-            error = residual_errors("small", stack_id, center, np.random.default_rng(seed))
-            moved = np.linalg.norm(error.apply(center) - center, axis=1)
-            lengths.append(np.sqrt((moved**2).mean()))
-            angles.append(np.degrees(np.sqrt((error.rotvec_rad() ** 2).sum(1).mean())))
-        # 0.1 to 0.8 mm and 0.2 to 1.2 degrees, a third more for the tail
-        assert min(lengths) > 0.08
-        assert max(lengths) < 1.6
-        assert 0.35 < np.mean(lengths) < 0.55
-        assert 0.7 < np.mean(angles) < 1.2
-        assert np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max() == 0
-        gross = residual_errors("gross", stack_id, center, np.random.default_rng(0))
-        assert 2.0 < np.linalg.norm(gross.apply(center) - center, axis=1).max() < 20
-
-    def test_shares_of_residual_kinds(self) -> None:
-        rng = np.random.default_rng(4)
-        kinds = [draw_residual_kind(rng) for _ in range(2000)]
-        assert abs(kinds.count("small") / 2000 - 0.65) < 0.04
+def test_overlapping_slices_measure_more_than_once(head: TruthVolume) -> None:
+    density = {}
+    for gap_mm in (-1.5, 0.0, 1.5):
+        settings = StackSettings(resolution_mm=1.5, thickness_mm=3.0, gap_mm=gap_mm)
+        stacks = simulate_stacks(head.data, head.mask, head.affine, [settings], np.random.default_rng(0))
+        slices = slices_from_stacks([stacks[0].stack])
+        grid = VolumeGrid(head.data.shape, head.affine)
+        density[gap_mm] = float(coarse_and_density(slices, grid)[1][head.mask].mean())
+    assert density[0.0] == pytest.approx(1, abs=0.08)
+    assert density[-1.5] == pytest.approx(2, abs=0.16)
+    assert density[1.5] == pytest.approx(2 / 3, abs=0.08)
+    with pytest.raises(InputError, match="gap"):
+        StackSettings(thickness_mm=2.0, gap_mm=-2.0)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_synth.cli import main as simulate
 from g3r.cli.infer import main as infer
 from g3r.output.record import CommandRecord, Inputs, RunRecord, StackRecord
 from g3r.planning.presets import PRESETS
 from g3r.run.provenance import FileHash
+from tests.phantoms import simulate_small_subject
 
 FOLDER = Path(__file__).parent
 
@@ -69,8 +69,7 @@ class SmallCase:
 
 def make_small_case(folder: Path) -> SmallCase:
     """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
-    options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
-    assert simulate([*options, "--seed", "61001", "--output", str(folder / "stacks")]) == 0
+    simulate_small_subject(folder / "stacks", "--seed", "61001")
     draft = PRESETS["draft"]
     registration = replace(
         draft.registration,

@@ -69,7 +69,7 @@ def trained(folder: Path, end_at: int | None = None, resume: Path | None = None)
         plugins=[WholeCheckpoints()],
     )
     try:
-        module, data = PriorModule(**NETWORK), StackSynthesisDataModule("phantom", **DATA)
+        module, data = PriorModule(**NETWORK), StackSynthesisDataModule(**DATA)
         trainer.fit(module, data, ckpt_path=resume, weights_only=True if resume else None)
     except ZeroDivisionError:
         assert end_at is not None

@@ -11,7 +11,6 @@ import pytest
 
 import g3r.planning.memory_estimate
 import g3r.planning.memory_limit
-from data_synth.cli import main as simulate
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
@@ -29,14 +28,6 @@ from g3r.planning.time_budget import TimeBudget
 DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
 PROCESS = 500_000_000
 MB = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("simulated") / "subject"
-    options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
-    assert simulate([*options, "--output", str(folder)]) == 0
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from data_synth.cli import main as simulate
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
@@ -27,11 +27,8 @@ class Clock:
 
 
 @pytest.fixture(scope="module")
-def stacks(tmp_path_factory: pytest.TempPathFactory) -> list[Stack]:
-    folder = tmp_path_factory.mktemp("simulated") / "subject"
-    options = ["--phantom", "22", "--resolution", "1.5", "--thickness", "4", "--motion", "mild"]
-    assert simulate([*options, "--output", str(folder)]) == 0
-    return [load_stack(folder / f"stack-{n}.nii.gz", folder / f"mask-{n}.nii.gz", 4.0) for n in range(3)]
+def stacks(subject: Path) -> list[Stack]:
+    return [load_stack(subject / f"stack-{n}.nii.gz", subject / f"mask-{n}.nii.gz", 4.0) for n in range(3)]
 
 
 def budget(seconds: float, settings: ReconstructionSettings = SETTINGS) -> TimeBudget:

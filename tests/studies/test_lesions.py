@@ -39,7 +39,7 @@ def head() -> tuple[TruthVolume, np.ndarray]:
     data[labels > 0] = 1000
     affine = np.diag([1.2, 1.2, 1.2, 1.0])
     affine[:3, 3] = -1.2 * (np.array(SHAPE) - 1) / 2
-    return TruthVolume("ball", data, mask, affine), labels
+    return TruthVolume(name="ball", data=data, mask=mask, affine=affine), labels
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,93 @@
+"""The slice profile of the simulator: how pixels average over the volume, in plane and through the slice.
+
+The volume is read by trilinear interpolation, which itself blurs. The sample positions are drawn together by
+just that much, so that the profile seen by the slices has the stated variance.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Planes
+from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.voxel_operator import VoxelOperator, psf_nodes
+from g3r.geometry import VolumeGrid
+
+Array = NDArray[np.float64]
+Profile = Literal["box", "gaussian"]
+
+TRILINEAR_VARIANCE = 1.0 / 6.0
+"""Variance that trilinear reading adds on average, in squared voxels: the mean of f (1 - f) over a voxel."""
+
+
+class ProfileOperator(VoxelOperator):
+    """The voxel operator with a slice profile of the simulator's own.
+
+    Args:
+        planes: slices at their true poses.
+        grid: of the volume.
+        pixel_index: pixels to compute; None takes all.
+        resolution_mm: in-plane pixel spacing.
+        thickness_mm: slice thickness.
+        profile: through the slice.
+    """
+
+    def __init__(
+        self,
+        planes: Planes,
+        grid: VolumeGrid,
+        pixel_index: NDArray[np.int64] | None,
+        resolution_mm: float,
+        thickness_mm: float,
+        profile: Profile,
+    ) -> None:
+        super().__init__(planes, grid, pixel_index, (1, 1, 1))
+        nodes, self.node_weight = profile_nodes(resolution_mm, thickness_mm, profile, float(grid.spacing_mm.mean()))
+        self.node_mm = np.tile(nodes, (len(planes), 1, 1))
+        self.move(planes)
+
+
+def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, voxel_mm: float) -> tuple[Array, Array]:
+    """Quadrature of a slice profile whose samples are read by trilinear interpolation.
+
+    Args:
+        resolution_mm: in-plane pixel spacing.
+        thickness_mm: slice thickness.
+        profile: `gaussian` has the variance of the model's PSF; `box` is flat with soft edges.
+        voxel_mm: voxel size of the volume that is read.
+
+    Returns:
+        Sample positions [Q, 3] (mm in the slice's frame) and weights [Q]. The variance along each axis is that
+        of the profile less that of trilinear interpolation.
+    """
+    blur_mm2 = TRILINEAR_VARIANCE * voxel_mm**2
+    target = psf_variance_mm2([resolution_mm] * 2, thickness_mm)
+    axes = []
+    for axis in range(3):
+        reach = 5.2 * np.sqrt(target[axis])
+        # in plane the pixel is about a voxel wide, so that three positions are enough
+        n = 3 if axis < 2 else 2 * int(np.ceil(reach / max(0.6, voxel_mm) / 2)) + 1
+        if axis == 2 and profile == "box":
+            nodes, weights, variance = _soft_box(n, thickness_mm)
+        else:
+            nodes, weights = psf_nodes(n)
+            variance = float(target[axis])
+        axes.append((nodes * np.sqrt(max(variance - blur_mm2, 0.0)), weights))
+    grid = np.stack(np.meshgrid(*[a[0] for a in axes], indexing="ij"), -1).reshape(-1, 3)
+    return grid, np.einsum("i,j,k->ijk", *[a[1] for a in axes]).ravel()
+
+
+def _soft_box(n: int, thickness_mm: float) -> tuple[Array, Array, float]:
+    """A profile flat inside the slice whose edges fall over a fifth of its thickness.
+
+    Returns:
+        n nodes scaled to unit variance, their weights, and the profile's true variance in mm^2 (that of a box
+        of the thickness convolved with one of a fifth of it).
+    """
+    nodes = np.linspace(-0.6, 0.6, n + 2)[1:-1]
+    weights = np.clip((0.6 - np.abs(nodes)) / 0.2, 0.0, 1.0)
+    weights /= weights.sum()
+    return nodes / np.sqrt((weights * nodes**2).sum()), weights, thickness_mm**2 * (1 + 0.2**2) / 12

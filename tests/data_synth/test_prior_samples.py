@@ -1,0 +1,104 @@
+"""Training subjects of the prior network: values, and that every one can be made again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("torchio")
+
+from data_synth.atlas import cropped, find_subjects, load_subject
+from data_synth.heads import PhantomSubject
+from data_synth.prior_samples import IMAGE_KEYS, SyntheticSubjects, patch_corners, synthesise
+
+SPACING_MM = 2.0
+
+
+def make_dataset(**options: object) -> SyntheticSubjects:
+    subjects = [PhantomSubject("young", 23.0, 1), PhantomSubject("old", 33.0, 2)]
+    defaults = {"spacing_mm": SPACING_MM, "length": 4, "seed": 7, "patch_size": 30, "artefact_share": 0.1}
+    return SyntheticSubjects(subjects, **{**defaults, **options})
+
+
+def test_a_sample_is_a_function_of_seed_epoch_and_index() -> None:
+    straight, other_way = make_dataset(), make_dataset()
+    a = straight.sample(2, 1)
+    torch.rand(5)  # the global generator plays no part
+    other_way.sample(0, 3)
+    b = other_way.sample(2, 1)
+    for key in IMAGE_KEYS:
+        np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+    assert straight.sample(3, 1).truth.shape != a.truth.shape or (
+        np.abs(straight.sample(3, 1).coarse - a.coarse).max() > 0
+    )
+
+
+def test_synthesis_leaves_the_global_generator_alone() -> None:
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    make_dataset().sample(0, 0)
+    torch.testing.assert_close(torch.rand(3), expected, rtol=0, atol=0)
+
+
+def test_patches_are_cut_from_the_subject() -> None:
+    dataset = make_dataset(n_patches=3)
+    one, patches = dataset.sample(2, 1), dataset[2 * 4 + 1]
+    assert list(patches) == [*IMAGE_KEYS, "n_stacks"]
+    corners = patch_corners(one.mask, 30, 3, [7, 2, 1, 1])
+    for k, corner in enumerate(corners):
+        box = tuple(slice(a, a + 30) for a in corner)
+        for key in IMAGE_KEYS:
+            np.testing.assert_array_equal(patches[key][k, 0].numpy(), getattr(one, key)[box].astype(np.float32))
+    assert patches["n_stacks"].tolist() == [one.n_stacks] * 3
+
+
+def test_coarse_and_truth_share_grid_and_scale() -> None:
+    dataset = make_dataset(in_order=True)
+    for index in range(3):
+        one = dataset.sample(0, index)
+        seen = one.mask & (one.density > 0.5)
+        assert seen.sum() > 0.3 * one.mask.sum()
+        assert 0.85 < one.coarse[seen].mean() / one.truth[seen].mean() < 1.1
+        assert np.corrcoef(one.coarse[seen], one.truth[seen])[0, 1] > 0.3
+        assert abs(np.percentile(one.coarse[one.density > 0.1], 99) - 1) < 1e-3
+
+
+def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
+
+    def dataset(cache: Path | None, seed: int = 7) -> SyntheticSubjects:
+        made = make_dataset(spacing_mm=2.5, length=2, seed=seed, patch_size=24, distinct=1, cache=cache)
+        made.augmentation = None  # faster
+        return made
+
+    fresh = dataset(None).sample(0, 1)
+    first = dataset(tmp_path)
+    made = first.sample(0, 1)
+    np.testing.assert_array_equal(made.coarse, fresh.coarse)
+    files = list(tmp_path.iterdir())
+    assert len(files) == 1
+    again = dataset(tmp_path)
+    again._synthesise = None  # type: ignore[method-assign,assignment]  # would fail if anything had to be made
+    for epoch in (0, 3):  # every epoch is the first one again
+        kept = again.sample(epoch, 1)
+        for key in ("coarse", "density", "sharp", "truth"):
+            np.testing.assert_allclose(getattr(kept, key), getattr(fresh, key), rtol=1e-3, atol=1e-6)
+        np.testing.assert_array_equal(kept.mask, fresh.mask)
+        assert (kept.name, kept.n_stacks, kept.residual) == (fresh.name, fresh.n_stacks, fresh.residual)
+    # another spec does not take this one's files, and a damaged file is made again
+    assert dataset(tmp_path, seed=8).cache.load(0, 1) is None
+    files[0].write_bytes(files[0].read_bytes()[:1000])
+    np.testing.assert_array_equal(dataset(tmp_path).sample(0, 1).coarse, fresh.coarse)
+    # patches of one subject differ from epoch to epoch
+    first, later = (dataset(tmp_path)[2 * epoch + 1]["truth"] for epoch in (0, 1))
+    assert not torch.equal(first, later)
+
+
+def test_a_real_atlas(shared_data: Path) -> None:
+    subject = find_subjects(shared_data / "atlas", include=["crl-sta/sta2?"])[0]
+    volume = cropped(load_subject(subject, SPACING_MM), 4)
+    one = synthesise(volume, np.random.default_rng(0))
+    assert one.truth.shape == volume.data.shape
+    assert np.isfinite(one.coarse).all()
+    assert 20 < volume.mask.sum() * SPACING_MM**3 / 1000 < 600
