@@ -19,8 +19,8 @@ PHANTOM_CASES := runs/bench/phantom-cases
 # of `make study-prior.networks`: small patches of subjects that all variants share
 SHORT_TRAINING ?= --data.num_workers=0 --data.patch_size=32 --data.batch_size=2 --data.distinct_epochs=2 \
 	--model.warmup_steps=60 --trainer.check_val_every_n_epoch=2
-PRIOR ?= runs/prior.pt
-POSE ?= runs/pose.pt
+PRIOR ?= runs/prior.safetensors
+POSE ?= runs/pose.safetensors
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")

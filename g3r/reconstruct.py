@@ -5,40 +5,34 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
+from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
-from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.observer import FitObserver
-from g3r.fitting.prior_stage import PriorCloud, VolumeTarget, fit_prior
+from g3r.fitting.prior_stage import PriorCloud
+from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import SliceFit, fit_slices
 from g3r.gaussians import GaussianCloud
-from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.assemble import StageResults, assemble
 from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, preset
 from g3r.planning.stages import Stage, stage_rng
-from g3r.pose_network.checkpoint import PoseCheckpoint, load_pose_network
-from g3r.pose_network.inference import predict_poses
-from g3r.pose_network.network import PoseNetwork
-from g3r.prior.checkpoint import PriorCheckpoint, load_prior
-from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import estimate_prior
+from g3r.pose_network.model import PoseModel
+from g3r.prior.inference import Tiling
+from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.prior_registration import register_to_prior
-from g3r.registration.quality import StackQuality, pose_warnings, stack_qualities
 from g3r.registration.template_search import template_fits
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
@@ -61,18 +55,12 @@ STORED_RECORDS = (
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
-DEFAULT_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "prior.pt"
-DEFAULT_POSE_CHECKPOINT = Path(__file__).parent / "checkpoints" / "weights" / "pose.pt"
-
 NOTE_ON_SINGLE = {
     None: "slices of the single stack stay where the atlas template or the header has them",
     True: "slices of the single stack were registered to the prior volume",
     False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
 }
 """By whether they moved to the prior; None where that was not tried."""
-
-MIN_DISTILLATION = 1e-3
-"""Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
 
 
 class GaussianReconstructor:
@@ -90,10 +78,10 @@ class GaussianReconstructor:
 
     def __init__(
         self,
-        checkpoint: str | os.PathLike[str] | None = None,
+        checkpoint: str | os.PathLike[str] | WeightsFile | None = None,
         settings: ReconstructionSettings | str = "balanced",
         *,
-        pose_checkpoint: str | os.PathLike[str] | None = None,
+        pose_checkpoint: str | os.PathLike[str] | WeightsFile | None = None,
         observer: FitObserver | None = None,
     ) -> None:
         self.settings = preset(settings) if isinstance(settings, str) else settings
@@ -101,15 +89,9 @@ class GaussianReconstructor:
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
-        self.network: DensityGatedPriorNetwork | None = None
-        self.prior_meta: PriorCheckpoint | None = None
-        self.pose_network: PoseNetwork | None = None
-        self.pose_meta: PoseCheckpoint | None = None
-        if self.settings.use_prior:
-            path = Path(checkpoint or DEFAULT_CHECKPOINT)
-            self.network, self.prior_meta = load_prior(path, self.settings.prior_voxel_mm)
-        if self.settings.registration.template or self.settings.registration.network:
-            self.pose_network, self.pose_meta = load_pose_network(Path(pose_checkpoint or DEFAULT_POSE_CHECKPOINT))
+        self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
+        needs_pose_model = self.settings.registration.template or self.settings.registration.network
+        self.pose_model = PoseModel.load(pose_checkpoint) if needs_pose_model else None
 
     def reconstruct(
         self,
@@ -136,21 +118,19 @@ class GaussianReconstructor:
         plan, run = plan or FixedPlan(self.settings), run or RunContext()
         slices, intensity = self._slices(stacks, run)
         poses = self._poses(slices, registration, plan, run)
-        qualities = self._judge(poses, stacks, plan, run)
-        volumes = run.stage(Stage.COARSE, lambda: self._volumes(poses.slices, poses.gain, poses.weight))
+        volumes = self._volumes(poses, run)
         prior = self._prior(volumes, poses, plan, run)
-        cloud = run.droppable_stage(Stage.FIT_TO_PRIOR, lambda: self._fit_to_prior(prior, plan, run))
-        fit = run.stoppable_stage(Stage.FIT_TO_SLICES, lambda: self._fit_to_slices(cloud, prior, poses, plan, run))
+        cloud = self._fit_to_prior(prior, plan, run)
+        fit = self._fit_to_slices(cloud, prior, poses, plan, run)
         found = StageResults(
             stacks=stacks,
             registration=poses,
-            qualities=qualities,
             prior=prior,
             intensity=intensity * prior.scale,
             cloud=cloud,
             fit=fit,
-            prior_record=asdict(self.prior_meta) if self.prior_meta else None,
-            pose_record=self._pose_record(),
+            prior_record=self.prior.record() if self.prior else None,
+            pose_record=self.pose_model.record() if self.pose_model else None,
         )
         return assemble(found, plan, run)
 
@@ -178,19 +158,14 @@ class GaussianReconstructor:
             deadline: when the search has to end.
         """
         settings = settings or self.settings.registration
-        template = self.pose_meta.template if self.pose_meta else None
+        template = self.pose_model.template if self.pose_model else None
         proposals = {}
         wanted = settings.network
         if settings.network_as_reserve:
             wanted &= template is None or not template_fits(slices, template)
-        if self.pose_network is not None and self.pose_meta is not None and wanted:
-            pose = predict_poses(self.pose_network, self.pose_meta, slices)
-            proposals["network"] = pose @ slices.header_pose.inverse()
+        if self.pose_model is not None and wanted:
+            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
-
-    def _pose_record(self) -> dict[str, str] | None:
-        meta = self.pose_meta
-        return {"training_data": meta.training_data, "g3r_version": meta.g3r_version} if meta else None
 
     def _slices(self, stacks: Sequence[Stack], run: RunContext) -> tuple[Slices, float]:
         """The slices at their header poses, in normalised intensities, and what 1 stands for."""
@@ -201,31 +176,30 @@ class GaussianReconstructor:
         return slices, scale
 
     def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:
+        """The slices in their poses."""
         if given is not None:
             run.notes.append("registration was given, not estimated here")
             with run.clock(Stage.REGISTRATION):
                 return with_pixels_of(slices, given)
-        deadline = plan.for_registration()
-        report = run.report(Stage.REGISTRATION)
-        return run.stage(
-            Stage.REGISTRATION, lambda: self.register(slices, plan.settings.registration, report, deadline)
-        )
-
-    def _judge(self, poses: Registration, stacks: Sequence[Stack], plan: Plan, run: RunContext) -> list[StackQuality]:
-        """How far the poses of each stack can be relied on; what cannot is said."""
-        qualities = stack_qualities(poses, len(stacks))
-        run.warnings += pose_warnings(poses, qualities, stacks)
-        if plan.settings.registration.standard_orientation and poses.orientation is None:
+        deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
+        settings = plan.settings.registration
+        poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, settings, report, deadline))
+        if settings.standard_orientation and poses.orientation is None:
             run.notes.append(
                 "standard orientation unknown, the volume stays in scanner space: no atlas template fits the "
-                f"{head_volume_mm3(poses.slices) / 1000:.0f} ml that are masked; check the masks"
+                f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
             )
-        return qualities
+        return poses
 
-    def _volumes(self, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]) -> InitialVolumes:
+    def _volumes(self, poses: Registration, run: RunContext) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
-        voxel_mm = self.prior_meta.voxel_mm if self.prior_meta else self.settings.resolution_mm
-        return InitialVolumes.of(slices, gain, weight, voxel_mm)
+        return run.stage(
+            Stage.COARSE, lambda: InitialVolumes.of(poses.slices, poses.gain, poses.weight, self._voxel_mm)
+        )
+
+    @property
+    def _voxel_mm(self) -> float:
+        return self.prior.voxel_mm if self.prior else self.settings.resolution_mm
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
@@ -243,17 +217,11 @@ class GaussianReconstructor:
         return prior
 
     def _prior_values(self, volumes: InitialVolumes, settings: ReconstructionSettings) -> NDArray[np.float32]:
-        if self.network is None:
+        if self.prior is None:
             return volumes.sharp
-        values = estimate_prior(
-            self.network,
-            volumes.coarse,
-            volumes.density,
-            volumes.sharp,
-            n_views=settings.prior_views,
-            max_whole_voxels=settings.prior_whole_voxels,
-            tile_voxels=settings.prior_tile_voxels,
-            halo_voxels=settings.prior_halo_voxels,
+        tiling = Tiling(settings.prior_whole_voxels, settings.prior_tile_voxels, settings.prior_halo_voxels)
+        values = self.prior.estimate(
+            volumes.coarse, volumes.density, volumes.sharp, n_views=settings.prior_views, tiling=tiling
         )
         release_memory()  # the most that is ever freed at a time
         return values
@@ -266,63 +234,54 @@ class GaussianReconstructor:
         slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
         if not accepted:
             return replace(prior, gain=gain, accepted=False)
-        volumes = self._volumes(slices, gain, weight)
+        volumes = InitialVolumes.of(slices, gain, weight, self._voxel_mm)
         values = self._prior_values(volumes, settings)
         scale = prior.scale * volumes.scale
         return PriorVolume(volumes=volumes, values=values, gain=gain, scale=scale, accepted=True)
 
-    def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud:
-        """Gaussians seeded in the prior volume and fitted to it (Eq. 8)."""
-        volumes, values, coarse_s = prior.volumes, prior.values, run.clock.seconds[Stage.COARSE]
-        n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
-        deadline = plan.for_fit_to_prior(volumes, values, coarse_s, n_output_voxels)
-        settings, report = plan.settings, run.report(Stage.FIT_TO_PRIOR)
-        rng = stage_rng(settings.seed, Stage.FIT_TO_PRIOR)
-        spacing_mm = gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels)
-        if settings.adaptive is not None:
-            cloud, found = fit_adaptive(
-                values,
-                volumes.mask,
-                volumes.grid,
-                spacing_mm,
+    def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud | None:
+        """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None where a stop was requested."""
+        volumes, coarse_s = prior.volumes, run.clock.seconds[Stage.COARSE]
+
+        def fit() -> PriorCloud:
+            n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
+            deadline = plan.for_fit_to_prior(volumes, prior.values, coarse_s, n_output_voxels)
+            settings = plan.settings
+            return fit_to_prior(
+                prior,
+                gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),
                 settings.adaptive,
                 settings.prior_stage,
-                rng,
-                report,
+                stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
+                run.report(Stage.FIT_TO_PRIOR),
                 deadline,
             )
-            counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
-            return PriorCloud(cloud, found.loss, counts)
-        cloud = seed_cloud(values, volumes.mask, volumes.grid, spacing_mm)
-        counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-        target = VolumeTarget.of(values, volumes.mask.astype(np.float32), volumes.grid)
-        cloud, history = fit_prior(cloud, target, settings.prior_stage, rng, report, deadline)
-        return PriorCloud(cloud, history, counts)
+
+        return run.droppable_stage(Stage.FIT_TO_PRIOR, fit)
 
     def _fit_to_slices(
         self, cloud: PriorCloud | None, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
     ) -> SliceFit | None:
-        """Gaussians and poses fitted to the slices, held to the prior where slices are sparse (Eq. 9)."""
+        """Gaussians and poses fitted to the slices (Eq. 9); as far as it came where a stop was requested."""
         if cloud is None:
             return None
-        volumes = prior.volumes
-        settings = adapted(plan.settings, volumes.slices.n_stacks)
-        distil_to = None
-        if settings.use_prior and settings.distillation:
-            # the prior counts where slices are sparse; where they are dense they know better. It was made
-            # of the same slices: from several stacks only 1 - c of what it says there is its own
-            power = 1 if volumes.slices.n_stacks == 1 else 2
-            unmeasured = np.maximum((1 - confidence(volumes.density)) ** power, MIN_DISTILLATION)
-            distil_to = VolumeTarget.of(prior.values, (unmeasured * volumes.mask).astype(np.float32), volumes.grid)
-        return fit_slices(
-            cloud.cloud,
-            volumes.slices,
-            prior.gain,
-            poses.weight,
-            distil_to,
-            settings.slice_stage,
-            stage_rng(settings.seed, Stage.FIT_TO_SLICES),
-            run.report(Stage.FIT_TO_SLICES),
-            run.deadline(plan.for_fit_to_slices()),
-            self.observer,
-        )
+        settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
+
+        def fit() -> SliceFit:
+            return fit_slices(
+                cloud.cloud,
+                prior.volumes.slices,
+                prior.gain,
+                poses.weight,
+                distillation_target(prior) if settings.use_prior and settings.distillation else None,
+                settings.slice_stage,
+                stage_rng(settings.seed, Stage.FIT_TO_SLICES),
+                run.report(Stage.FIT_TO_SLICES),
+                run.deadline(plan.for_fit_to_slices()),
+                self.observer,
+            )
+
+        def steps_of(result: SliceFit) -> tuple[int, int]:
+            return len(result.history), settings.slice_stage.n_steps
+
+        return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, steps_of)

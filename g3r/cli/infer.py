@@ -63,9 +63,9 @@ def _way_on(folder: Path) -> str:
 def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
-    check_files(options, folder, replaces=replaces)  # before any work
+    networks = check_files(options, folder, replaces=replaces)  # before any work
     with log_held_back():
-        task = prepared(options)
+        task = prepared(options, networks)
     for warning in task.warnings:
         logging.getLogger("g3r").warning(warning)
     if options.dry_run:

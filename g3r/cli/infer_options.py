@@ -9,7 +9,7 @@ from g3r._version import __version__
 
 PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
 
-DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
+DEFAULTS = {"preset": "balanced", "space": "standard", "resolution": 0.8, "seed": 0}
 """Of the options that --config takes the place of, --no-prior and --time-budget besides."""
 
 
@@ -32,20 +32,14 @@ def build_parser() -> argparse.ArgumentParser:
         help="slice thickness, one for all or one per stack (default: the distance of slices)",
     )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--ckpt", metavar="PRIOR.pt", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument("--ckpt", metavar="PRIOR.safetensors", help="prior from g3r-export (default: the one shipped)")
     parser.add_argument(
-        "--pose-ckpt", metavar="POSE.pt", help="pose network and mean heads from g3r-export (default: shipped)"
+        "--pose-ckpt", metavar="POSE.safetensors", help="pose network and mean heads from g3r-export (default: shipped)"
     )
     parser.add_argument(
         "--space",
         choices=("standard", "scanner"),
         help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
-    )
-    parser.add_argument(
-        "--prior-voxel",
-        type=float,
-        metavar="MM",
-        help="voxel size that the prior was trained on; a --ckpt of another is refused (default 0.8)",
     )
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
     parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")

@@ -12,6 +12,7 @@ from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
+    from g3r.checkpoints.weights_file import WeightsFile
     from g3r.output.record import Inputs, RunRecord
     from g3r.planning.memory_limit import MemoryPlan
     from g3r.planning.plan import Plan
@@ -47,25 +48,24 @@ class Task:
     warnings: list[str]
 
 
-def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> None:
-    """Refuse what can be seen without reading an image."""
-    from g3r.checkpoints.archive import check_archive
+def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
+    """Refuse what can be seen without reading an image; returns the files of networks, by kind."""
+    from g3r.checkpoints.weights_file import read_weights
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.output_folder import check_output_folder
 
-    networks = {"prior": options.ckpt, "pose": options.pose_ckpt}
-    inputs = [*options.stacks, *(options.masks or ()), *(path for path in networks.values() if path)]
+    paths = {"prior": options.ckpt, "pose": options.pose_ckpt}
+    networks = {kind: Path(path) for kind, path in paths.items() if path}
+    inputs = [*options.stacks, *(options.masks or ()), *networks.values()]
     check_output_folder(folder, OUTPUT_NAMES, replace=replaces, inputs=inputs)
-    for kind, path in networks.items():
-        if path:
-            check_archive(Path(path), kind, "pass a file made by g3r-export, or leave the option out")
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
 
         check_tensorboard(Path(options.tensorboard))
+    return {kind: read_weights(path, kind) for kind, path in networks.items()}
 
 
-def prepared(options: argparse.Namespace) -> Task:
+def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> Task:
     """Read and check everything that the run needs.
 
     Raises:
@@ -80,9 +80,11 @@ def prepared(options: argparse.Namespace) -> Task:
     command = earlier.command if earlier else None
     n_threads = use_threads(options.threads or (command.threads if command else None))
     settings = earlier.settings if earlier else _settings(options)
-    reconstructor = GaussianReconstructor(options.ckpt, settings, pose_checkpoint=options.pose_ckpt)
+    reconstructor = GaussianReconstructor(networks.get("prior"), settings, pose_checkpoint=networks.get("pose"))
     inputs = _inputs(options, reconstructor)
-    memory = plan_for_stacks(stacks, settings, options.max_memory)
+    memory = plan_for_stacks(
+        stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
+    )
     return Task(
         stacks=stacks,
         settings=settings,
@@ -130,7 +132,6 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         preset,
         registration=registration,
         resolution_mm=options.resolution,
-        prior_voxel_mm=options.prior_voxel,
         seed=options.seed,
         use_prior=not options.no_prior,
     )
@@ -138,14 +139,14 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
 def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
     from g3r.output.record import Inputs
-    from g3r.reconstruct import DEFAULT_CHECKPOINT, DEFAULT_POSE_CHECKPOINT
     from g3r.run.provenance import FileHash
 
+    prior, pose = reconstructor.prior, reconstructor.pose_model
     return Inputs(
         stacks=tuple(map(FileHash.of, options.stacks)),
         masks=tuple(map(FileHash.of, options.masks or [])),
-        prior=FileHash.of(options.ckpt or DEFAULT_CHECKPOINT) if reconstructor.network else None,
-        pose_network=FileHash.of(options.pose_ckpt or DEFAULT_POSE_CHECKPOINT) if reconstructor.pose_network else None,
+        prior=FileHash(prior.file_name, prior.file_sha256) if prior else None,
+        pose_network=FileHash(pose.file_name, pose.file_sha256) if pose else None,
     )
 
 

@@ -7,19 +7,20 @@ from typing import Any
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
 
-Train the density-gated prior network, or the pose network (lightning_configs/pose.yaml). Logs go to
-TensorBoard, checkpoints beside them.
+Train the density-gated prior network, or the pose network (lightning_configs/pose.yaml). Logs for
+TensorBoard and checkpoints go to one folder.
 
   fit, validate            what to do
   --config FILE            settings; every one of them can be overridden on the command line
-  --model CLASS            what to train: g3r.training.prior_module.PriorModule (default, also where a config
-                           names no class) or g3r.training.pose_module.PoseModule
+  --model CLASS            what to train, as the configs name it: g3r.training.prior_module.PriorModule or
+                           g3r.training.pose_module.PoseModule
+  --model.network.NAME V   an argument of the network
   --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
   --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit
-  --ckpt_path FILE         go on from a training checkpoint
+  --ckpt_path FILE         resume from a training checkpoint
 
 All options: g3r-pretrain fit --help      Watch: tensorboard --logdir runs
-Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.pt
+Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.safetensors
 """
 
 
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         from lightning.pytorch import LightningDataModule, Trainer
-        from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+        from lightning.pytorch.cli import LightningCLI
 
         from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
     except ModuleNotFoundError as error:
@@ -43,10 +44,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 3
 
     class PretrainCLI(LightningCLI):
-        def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-            # a config that names no class is one of the prior's
-            parser.set_defaults({"model": {"class_path": "g3r.training.prior_module.PriorModule"}})
-
         def instantiate_trainer(self, **options: Any) -> Trainer:
             return super().instantiate_trainer(plugins=[WholeCheckpoints()], **options)
 

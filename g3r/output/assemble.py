@@ -24,10 +24,10 @@ from g3r.geometry.grid import on_grid
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms, stack_records
 from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import Plan
-from g3r.planning.presets import ReconstructionSettings
+from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
 from g3r.registration import Registration
-from g3r.registration.quality import StackQuality, registration_reliable
+from g3r.registration.quality import StackQuality, pose_warnings, registration_reliable, stack_qualities
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
@@ -46,7 +46,6 @@ class StageResults:
     Attributes:
         stacks: as they were given.
         registration: poses of their slices.
-        qualities: what each stack's poses are worth.
         prior: the prior volume and what it was made of.
         intensity: what 1 stands for in the fit.
         cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
@@ -57,7 +56,6 @@ class StageResults:
 
     stacks: Sequence[Stack]
     registration: Registration
-    qualities: Sequence[StackQuality]
     prior: PriorVolume
     intensity: float
     cloud: PriorCloud | None
@@ -78,6 +76,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         NumericalError: the volume is not finite.
     """
     settings, volumes = plan.settings, found.prior.volumes
+    qualities = stack_qualities(found.registration, len(found.stacks))
+    run.warnings += pose_warnings(found.registration, qualities, found.stacks)
     grid = volumes.grid.respaced(settings.resolution_mm)
     fit = found.fit or _no_fit(found)
     uncertainty, prior_share, uncertainty_record = None, None, None
@@ -112,7 +112,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                 prior_share=prior_share,
                 with_prior=settings.use_prior,
                 intensity=found.intensity,
-                reliable=registration_reliable(found.qualities),
+                reliable=registration_reliable(qualities),
             )
         uncertainty, uncertainty_record = estimated.expected_error, estimated.record
     intensity = np.float32(found.intensity)
@@ -132,7 +132,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         ncc=found.registration.ncc,
         uncertainty=uncertainty,
         prior_share=prior_share,
-        record=_record(found, fit, plan, run, uncertainty_record),
+        record=_record(found, fit, qualities, plan, run, uncertainty_record),
     )
 
 
@@ -158,7 +158,12 @@ def _volume(
 
 
 def _record(
-    found: StageResults, fit: SliceFit, plan: Plan, run: RunContext, uncertainty: dict[str, Any] | None
+    found: StageResults,
+    fit: SliceFit,
+    qualities: Sequence[StackQuality],
+    plan: Plan,
+    run: RunContext,
+    uncertainty: dict[str, Any] | None,
 ) -> RunRecord:
     settings, slices = plan.settings, found.prior.volumes.slices
     gaussians = found.cloud.counts if found.cloud else {}
@@ -175,13 +180,13 @@ def _record(
         time_budget=plan.record(),
         prior=found.prior_record,
         pose_network=found.pose_record,
-        stacks=stack_records(found.stacks, found.registration, found.qualities, fit.weight),
-        registration=RegistrationRecord.of(found.registration, found.qualities),
+        stacks=stack_records(found.stacks, found.registration, qualities, fit.weight),
+        registration=RegistrationRecord.of(found.registration, qualities),
         bias_field=fit.bias_field,
         n_gaussians=len(fit.cloud),
         gaussians=gaussians | {"n_final": len(fit.cloud)},
         n_rollbacks=n_rollbacks,
-        inactive_terms=inactive_terms(slices, settings, gaussians),
+        inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks), gaussians),
         loss={Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [], Stage.FIT_TO_SLICES: list(fit.history)},
         uncertainty=uncertainty,
         seconds=run.clock.seconds,

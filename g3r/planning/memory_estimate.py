@@ -66,6 +66,7 @@ def estimate_memory(
     n_threads: int = 1,
     process_bytes: int | None = None,
     *,
+    prior_voxel_mm: float | None = None,
     at_once: bool = False,
 ) -> MemoryEstimate:
     """Memory of every stage, from sizes alone.
@@ -75,9 +76,10 @@ def estimate_memory(
         settings: of the reconstruction.
         n_threads: of the kernels.
         process_bytes: what the process holds before; as it is now when None.
+        prior_voxel_mm: voxel size of the prior; that of the output when None.
         at_once: with `release_memory_eagerly`.
     """
-    sizes = sizes_of(slices, settings)
+    sizes = sizes_of(slices, settings, prior_voxel_mm)
     start = held_bytes() if process_bytes is None else process_bytes
     buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
@@ -121,9 +123,15 @@ OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
 SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
 
 
-def sizes_of(slices: Slices, settings: ReconstructionSettings) -> ProblemSizes:
-    """Sizes of a reconstruction of slices at their header poses."""
-    voxel_mm = settings.prior_voxel_mm if settings.use_prior else settings.resolution_mm
+def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: float | None = None) -> ProblemSizes:
+    """Sizes of a reconstruction.
+
+    Args:
+        slices: at their header poses.
+        settings: of the reconstruction.
+        prior_voxel_mm: voxel size of the prior; that of the output when None.
+    """
+    voxel_mm = prior_voxel_mm if settings.use_prior and prior_voxel_mm else settings.resolution_mm
     grid = grid_around(slices, voxel_mm, MARGIN_MM)
     n_voxels = GRID_SLACK * math.prod(grid.shape)
     spacing_mm = gaussian_spacing_mm(slices, settings.gaussian_spacing_pixels)

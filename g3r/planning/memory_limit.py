@@ -73,6 +73,8 @@ def plan_memory(
     limit_bytes: int | None,
     n_threads: int = 1,
     process_bytes: int | None = None,
+    *,
+    prior_voxel_mm: float | None = None,
 ) -> MemoryPlan:
     """Settings that need no more than a limit: what costs seconds goes first, then what costs rounding.
 
@@ -82,6 +84,7 @@ def plan_memory(
         limit_bytes: None leaves them as they are.
         n_threads: of the kernels.
         process_bytes: what the process holds before; as it is now when None.
+        prior_voxel_mm: voxel size of the prior; that of the output when None.
 
     Raises:
         InputError: nothing that may be given up brings it below the limit.
@@ -89,14 +92,15 @@ def plan_memory(
     start = held_bytes() if process_bytes is None else process_bytes
 
     def estimate(of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
-        return estimate_memory(slices, of, n_threads, start, at_once=at_once)
+        return estimate_memory(slices, of, n_threads, start, prior_voxel_mm=prior_voxel_mm, at_once=at_once)
 
-    plan = _lowered(slices, settings, limit_bytes, estimate)
+    sizes = sizes_of(slices, settings, prior_voxel_mm)
+    plan = _lowered(sizes, settings, limit_bytes, estimate)
     needed = plan.estimate
     if limit_bytes is not None and needed.peak > limit_bytes:
         remedy = "choose a coarser --resolution, crop the masks, or raise --max-memory"
         if settings.use_prior:
-            without = _lowered(slices, replace(settings, use_prior=False), limit_bytes, estimate).estimate
+            without = _lowered(sizes, replace(settings, use_prior=False), limit_bytes, estimate).estimate
             if without.peak <= limit_bytes:
                 remedy = f"raise --max-memory, or take --no-prior ({gigabytes(without.peak)})"
         raise InputError(
@@ -106,15 +110,27 @@ def plan_memory(
     return plan
 
 
-def plan_for_stacks(stacks: Sequence[Stack], settings: ReconstructionSettings, limit_bytes: int | None) -> MemoryPlan:
+def plan_for_stacks(
+    stacks: Sequence[Stack],
+    settings: ReconstructionSettings,
+    limit_bytes: int | None,
+    prior_voxel_mm: float | None = None,
+) -> MemoryPlan:
     """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
+
+    Args:
+        stacks: that will be reconstructed.
+        settings: unconstrained.
+        limit_bytes: None leaves them as they are.
+        prior_voxel_mm: voxel size of the prior; that of the output when None.
 
     Raises:
         InputError: it does not fit, or the stacks cannot be used.
     """
     import numba
 
-    plan = plan_memory(slices_from_stacks(stacks), settings, limit_bytes, numba.get_num_threads())
+    slices, n_threads = slices_from_stacks(stacks), numba.get_num_threads()
+    plan = plan_memory(slices, settings, limit_bytes, n_threads, prior_voxel_mm=prior_voxel_mm)
     if plan.at_once:
         release_memory_eagerly()
     logger.info(plan.estimate.line())
@@ -138,7 +154,9 @@ class Estimator(Protocol):
         ...
 
 
-def _lowered(slices: Slices, settings: ReconstructionSettings, limit: int | None, estimate: Estimator) -> MemoryPlan:
+def _lowered(
+    sizes: ProblemSizes, settings: ReconstructionSettings, limit: int | None, estimate: Estimator
+) -> MemoryPlan:
     """Settings changed until they need no more than the limit, or nothing is left to change."""
     found = estimate(settings)
     if limit is None or found.peak <= limit:
@@ -149,7 +167,7 @@ def _lowered(slices: Slices, settings: ReconstructionSettings, limit: int | None
         changes.append("memory limit: freed memory is given back at once (slower)")
     stages = estimate(settings, at_once).stages
     with_records = max(stages.get(name, 0) for name in STAGES_WITH_PROJECTIONS)
-    less = _fewer_projections(settings, sizes_of(slices, settings), with_records - limit)
+    less = _fewer_projections(settings, sizes, with_records - limit)
     if less is not settings:
         kept = less.slice_stage.projection_bytes
         changes.append(f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)")

@@ -10,7 +10,7 @@ from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
-from g3r.prior.inference import HALO_VOXELS, MAX_WHOLE_VOXELS, TILE_VOXELS
+from g3r.prior.inference import DEFAULT_TILING
 from g3r.registration import RegistrationSettings
 
 ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
@@ -31,7 +31,6 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_stage: stage 2.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
-        prior_voxel_mm: voxel size of the prior volume; a checkpoint trained on another is refused.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
@@ -47,10 +46,9 @@ class ReconstructionSettings:
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     prior_views: int = 4
-    prior_voxel_mm: float = 0.8
-    prior_whole_voxels: int = MAX_WHOLE_VOXELS
-    prior_tile_voxels: int = TILE_VOXELS
-    prior_halo_voxels: int = HALO_VOXELS
+    prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
+    prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
+    prior_halo_voxels: int = DEFAULT_TILING.halo_voxels
     share_probes: int = 2
     use_prior: bool = True
     distillation: bool = True

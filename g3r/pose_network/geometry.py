@@ -162,10 +162,10 @@ def smoothed(volume: Tensor) -> Tensor:
 
 
 def best_age(heads: Tensor, value: Tensor, group: Tensor, n_groups: int) -> Tensor:
-    """Which of A mean heads correlates best with the slices of each set, [G].
+    """The age of the atlas template that correlates best with the slices of each set, [G].
 
     Args:
-        heads: [S, P, A] the mean heads at the pixels.
+        heads: [S, P, A] the template's heads at the pixels.
         value: [S, P] the pixels.
         group: [S] set of each slice.
         n_groups: G.

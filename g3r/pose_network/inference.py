@@ -1,61 +1,34 @@
 """From slices to poses in the atlas frame with a trained pose network."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from g3r.acquisition.planes import Slices
-from g3r.acquisition.slice_images import SliceImages, slice_images
+from g3r.acquisition.slice_images import SliceImages
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid, orthonormal
-
-if TYPE_CHECKING:
-    from g3r.pose_network.checkpoint import PoseCheckpoint
-    from g3r.pose_network.network import PoseNetwork, SliceBatch
+from g3r.pose_network.network import PoseNetwork, SliceBatch
 
 SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0], [25, 25, 0]], dtype=float)
 """Points of a slice over which a pose error is averaged."""
 N_REFINEMENTS = 2
 VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
-"""Turns by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
+"""Rotations by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
 
 The network sees all four and the answers are averaged, which takes a fifth off the error.
 """
 VIEW_SCALE_MM = 3.0
 """Views further than this from the mean count less in it, in proportion."""
 ROTATION_ARM_MM = 25.0
-"""At this distance from a slice's centre a turn is measured in mm."""
+"""Distance from a slice's centre at which a rotation is measured in mm."""
 ROBUST_SCALE_MM = 3.0
 """Slices further than this from their stack's common motion count less in it, in proportion."""
 ROBUST_STEPS = 12
 
 
-def predict_poses(
-    network: "PoseNetwork", meta: "PoseCheckpoint", slices: Slices, time_rank: NDArray[np.float64] | None = None
-) -> RigidPose:
-    """Pose of each slice's own frame (as `slices.planes.pose`) in the atlas frame.
-
-    Args:
-        network: trained, in evaluation mode.
-        meta: what its file says about it.
-        slices: of all stacks; only their header poses are used.
-        time_rank: [K] order of acquisition in each stack from 0 to 1, if it is known.
-
-    Returns:
-        K poses. They do not change if all headers are moved by one rigid motion, and permuting slices or
-        stacks permutes them.
-    """
-    images = slice_images(slices, meta.pixel_mm, meta.image_size)
-    if time_rank is not None:
-        images = replace(images, time_rank=np.asarray(time_rank, dtype=float))
-    return poses_of(network, slice_batch([images])) @ images.frame_in_slice.inverse()
-
-
-def poses_of(network: "PoseNetwork", batch: "SliceBatch") -> RigidPose:
+def poses_of(network: PoseNetwork, batch: SliceBatch) -> RigidPose:
     """Poses of the images of a batch in the atlas frame, averaged over four views of every slice."""
     rotation, translation = [], []
     for view in VIEWS:
@@ -84,7 +57,7 @@ def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
     return RigidPose(mean_rotation, mean_translation)
 
 
-def slice_batch(sets: Sequence[SliceImages]) -> "SliceBatch":
+def slice_batch(sets: Sequence[SliceImages]) -> SliceBatch:
     """The slices of several heads as one dict of tensors; stacks are numbered through all of them."""
     n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
     first = np.cumsum([0, *n_stacks])

@@ -1,12 +1,14 @@
 """The pose network: a set transformer over all slices of all stacks that puts each into the atlas frame."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from monai.networks.blocks import Convolution, ResidualUnit, TransformerBlock
 from torch import Tensor, nn
 
+from g3r.pose_network.blocks import Encoder, SetTransformer
+from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.geometry import (
     best_age,
     group_mean,
@@ -28,7 +30,7 @@ COARSE_SHAPE, COARSE_SPACING_MM = 28, 5.0
 N_CODES = 2 * len(WAVELENGTHS_MM) + 5
 N_POSE_CODES = 12
 SIDE_MM = 4.0
-"""How far beside the slice's plane a refinement also looks at the mean head."""
+"""Distance from the slice's plane, on both sides, at which a refinement also samples the atlas template."""
 N_SEEN = 7
 
 SliceBatch = Mapping[str, Tensor]
@@ -47,7 +49,7 @@ class PoseStep(NamedTuple):
     Attributes:
         rotation: [S, 3, 3].
         translation_mm: [S, 3].
-        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less sure, the smaller.
+        vote: [S, 3, 3] each slice's own vote for its rotation, not orthonormal: the less certain, the smaller.
     """
 
     rotation: Tensor
@@ -55,149 +57,40 @@ class PoseStep(NamedTuple):
     vote: Tensor
 
 
-class Encoder(nn.Module):
-    """Slice image to token: MONAI's residual units, and a linear layer that still knows what lay where.
-
-    Args:
-        channels: of the three halvings of the image.
-        width: of the token.
-        image_size: pixels per edge, a multiple of 8.
-        extra_channels: further channels at half the image's resolution.
-    """
-
-    def __init__(self, channels: Sequence[int], width: int, image_size: int, extra_channels: int = 0) -> None:
-        super().__init__()
-        first, second, third = channels
-        self.stem = Convolution(2, 1, first, strides=2, kernel_size=3, act="relu", norm="batch")
-        self.extra = (
-            Convolution(2, extra_channels, first, kernel_size=3, act="relu", norm="batch") if extra_channels else None
-        )
-        into = first * (2 if extra_channels else 1)
-        self.body = nn.Sequential(
-            ResidualUnit(2, into, second, strides=2, subunits=2, act="relu", norm="batch"),
-            ResidualUnit(2, second, third, strides=2, subunits=2, act="relu", norm="batch"),
-        )
-        self.token = nn.Linear(third * (image_size // 8) ** 2, width)
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def forward(self, image: Tensor, extra: Tensor | None = None) -> Tensor:
-        """Tokens [S, width] of images [S, 1, N, N] and, if so built, [S, E, N / 2, N / 2]."""
-        # bfloat16 halves the time of a training step; the poses are always computed in float32
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.training):
-            # a convolution on a CPU is faster with channels innermost
-            features = self.stem(image.to(memory_format=torch.channels_last))
-            if self.extra is not None and extra is not None:
-                features = torch.cat([features, self.extra(extra)], 1)
-            token = self.token(self.body(features).flatten(1))
-        return token.float()
-
-
-class SetTransformer(nn.Module):
-    """Tokens of slices to votes: attention in turn among the slices of a stack and among those of a head.
-
-    Args:
-        width: of a token.
-        n_codes: numbers that describe a slice beside its image.
-        n_blocks: transformer blocks; the even ones see one stack, the odd ones all stacks of the head.
-        n_heads: attention heads.
-    """
-
-    def __init__(self, width: int, n_codes: int, n_blocks: int, n_heads: int) -> None:
-        super().__init__()
-        self.code = nn.Sequential(nn.Linear(n_codes, width), nn.ReLU(), nn.Linear(width, width))
-        self.blocks = nn.ModuleList(
-            TransformerBlock(width, 2 * width, n_heads, use_flash_attention=True) for _ in range(n_blocks)
-        )
-        self.norm = nn.LayerNorm(width)
-        self.vote = nn.Linear(width, 18)
-        nn.init.normal_(self.vote.weight, std=0.01)
-        nn.init.zeros_(self.vote.bias)
-
-    def forward(self, token: Tensor, code: Tensor, same_stack: Tensor, same_set: Tensor) -> Tensor:
-        """Votes [S, 18]: rotation of the stack (9), its shift (3), the slice's own turn (3) and shift (3)."""
-        x = (token + self.code(code))[None]
-        for number, block in enumerate(self.blocks):
-            x = block(x, attn_mask=(same_set if number % 2 else same_stack)[None, None])
-        return self.vote(self.norm(x[0]))
-
-
 class PoseNetwork(nn.Module):
     """Poses of slices in the atlas frame, by a first guess and refinements.
 
-    Nothing but rotations between stacks is taken from the headers, so turning all of them together changes
-    nothing, and neither does the order of slices or stacks. In each step every slice votes for a rotation and
-    shift of its stack; votes of a stack are summed, those of other stacks added through the header's
-    rotations between stacks (first step) or as they are (refinements), and the sum is made a rotation. Then
-    every slice moves a little on its own. Refinements see, at the current poses, the template's mean head of
-    the best age and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
+    Only rotations between stacks are taken from the headers, so rotating all of them together changes nothing,
+    and neither does the order of slices or stacks. In each step every slice votes for a rotation and a
+    translation of its stack. Votes of a stack are summed; those of other stacks are added through the header's
+    rotations between stacks (first step) or as they are (refinements); the sum is made a rotation. Then every
+    slice moves a little on its own. Refinements see, at the current poses, the atlas template of the best age
+    and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
 
     Args:
-        template_shape: [A, I, J, K] of the template.
-        template_spacing_mm: its voxel size.
-        image_size: N, pixels per edge of a slice image.
-        pixel_mm: edge of these pixels.
-        channels: of the encoder.
-        width: of a token.
-        n_blocks: transformer blocks per step.
-        n_heads: attention heads.
-        n_refinements: refinements with the same weights.
+        config: see `PoseNetworkConfig`.
     """
 
     template: Tensor
 
-    def __init__(
-        self,
-        template_shape: Sequence[int],
-        template_spacing_mm: float = 3.0,
-        image_size: int = 40,
-        pixel_mm: float = 3.0,
-        channels: Sequence[int] = (24, 48, 96),
-        width: int = 128,
-        n_blocks: int = 3,
-        n_heads: int = 4,
-        n_refinements: int = 1,
-    ) -> None:
+    def __init__(self, config: PoseNetworkConfig) -> None:
         super().__init__()
-        if len(template_shape) != 4 or image_size % 8 or len(channels) != 3 or width % n_heads or n_refinements < 1:
-            raise ValueError(
-                f"got {template_shape=}, {image_size=}, {channels=}, {width=}, {n_heads=}, {n_refinements=}"
-            )
-        self._arguments: dict[str, Any] = {
-            "template_shape": [int(n) for n in template_shape],
-            "template_spacing_mm": float(template_spacing_mm),
-            "image_size": int(image_size),
-            "pixel_mm": float(pixel_mm),
-            "channels": [int(n) for n in channels],
-            "width": int(width),
-            "n_blocks": int(n_blocks),
-            "n_heads": int(n_heads),
-            "n_refinements": int(n_refinements),
-        }
-        self.pixel_mm, self.image_size, self.n_refinements = pixel_mm, image_size, n_refinements
-        self.template_spacing_mm = template_spacing_mm
-        ages, *shape = [int(n) for n in template_shape]
-        # [I, J, K, A]: all ages of a voxel side by side, as sampling wants them
+        self.config = config
+        ages, *shape = config.template_shape
+        # [I, J, K, A]: all ages of a voxel next to each other, as sampling wants them
         self.register_buffer("template", torch.zeros(*shape, ages))
-        self.encoder = Encoder(channels, width, image_size)
-        self.transformer = SetTransformer(width, N_CODES, n_blocks, n_heads)
-        self.refining_encoder = Encoder(channels, width, image_size, N_SEEN)
-        self.refining_transformer = SetTransformer(width, N_CODES + N_POSE_CODES, n_blocks, n_heads)
-        # how much the votes of all stacks count beside the stack's own, in the first step and in refinements
+        self.encoder = Encoder(config.channels, config.width, config.image_size)
+        self.transformer = SetTransformer(config.width, N_CODES, config.n_blocks, config.n_heads)
+        self.refining_encoder = Encoder(config.channels, config.width, config.image_size, N_SEEN)
+        self.refining_transformer = SetTransformer(
+            config.width, N_CODES + N_POSE_CODES, config.n_blocks, config.n_heads
+        )
+        # weight of the votes of all stacks relative to the stack's own, in the first step and in refinements
         self.log_share = nn.Parameter(torch.zeros(2))
 
-    def arguments(self) -> dict[str, Any]:
-        """Constructor arguments, in plain values."""
-        return dict(self._arguments)
-
     def set_template(self, volume: Tensor) -> None:
-        """Take over mean heads [A, I, J, K] on a grid about the origin; only A is built into the network.
-
-        Raises:
-            ValueError: another number of heads.
-        """
-        if len(volume) != self._arguments["template_shape"][0]:
-            raise ValueError(f"{len(volume)} mean heads; expected {self._arguments['template_shape'][0]}")
-        self._arguments["template_shape"] = list(volume.shape)
+        """Take over an atlas template [A, I, J, K] on a grid about the origin; no weight depends on its shape."""
+        self.config = replace(self.config, template_shape=tuple(volume.shape))
         self.template = volume.permute(1, 2, 3, 0).contiguous().to(self.template)
 
     def forward(
@@ -207,7 +100,7 @@ class PoseNetwork(nn.Module):
 
         Args:
             batch: slices of one or more heads.
-            n_refinements: None takes the constructor's.
+            n_refinements: None takes that of `config`.
             disturb: changes the poses that a refinement starts from, in training.
         """
         # mixed precision is the encoder's own affair: around it, poses and points keep float32
@@ -233,7 +126,7 @@ class PoseNetwork(nn.Module):
         along = batch["position_mm"].to(code.dtype)[:, None]
         steps = [PoseStep(*_with_residual(rotation, shift + rotation[:, :, 2] * along, vote[:, 12:]), votes)]
 
-        for _ in range(self.n_refinements if n_refinements is None else n_refinements):
+        for _ in range(self.config.n_refinements if n_refinements is None else n_refinements):
             rotation, translation = steps[-1].rotation.detach(), steps[-1].translation_mm.detach()
             if disturb is not None:
                 rotation, translation = disturb(rotation, translation)
@@ -255,23 +148,23 @@ class PoseNetwork(nn.Module):
     def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
         """What the template and the other stacks show at the slices' poses, [S, N_SEEN, N / 2, N / 2].
 
-        The mean head of the age that suits a set's slices best, in the slice's plane and beside it, and a
-        coarse volume of the other stacks; both also as differences from the slice.
+        The atlas template of the age that correlates best with a set's slices, in the slice's plane and on both
+        sides of it, and a coarse volume of the other stacks; both also as differences from the slice.
         """
-        half = self.image_size // 2
+        half, spacing_mm = self.config.image_size // 2, self.config.template_spacing_mm
         value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
-        plane = pixel_points_mm(half, 2 * self.pixel_mm, value)
+        plane = pixel_points_mm(half, 2 * self.config.pixel_mm, value)
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
         heads = smoothed(self.template.permute(3, 0, 1, 2))
         points = moved_points(rotation, translation_mm, plane)
         # a quarter of the pixels is enough to tell an age
-        some = sample_rows(heads.permute(1, 2, 3, 0), points[:, ::4], self.template_spacing_mm)
+        some = sample_rows(heads.permute(1, 2, 3, 0), points[:, ::4], spacing_mm)
         age = best_age(some, value[:, ::4], set_of_stack[stack], int(set_of_stack.max()) + 1)
         head = [
             sample_rows(
                 heads[..., None],
                 moved_points(rotation, translation_mm, plane + plane.new_tensor([0.0, 0.0, side_mm])),
-                self.template_spacing_mm,
+                spacing_mm,
                 age[set_of_stack[stack]],
             )
             for side_mm in (-SIDE_MM, 0.0, SIDE_MM)
@@ -296,7 +189,11 @@ class PoseNetwork(nn.Module):
 
 
 def slice_codes(batch: SliceBatch) -> Tensor:
-    """What is known of a slice beside its image [S, N_CODES]: position, thickness, area, rank in time."""
+    """What is known of a slice apart from its image [S, N_CODES]: position, thickness, area, rank in time.
+
+    The rank is known in trainings only: image files do not say in which order slices were acquired, so that
+    reconstructions always give "unknown" (NaN), which the weights were trained with too.
+    """
     image = batch["image"]
     position, thickness, area, rank = (
         batch[name].to(image.dtype) for name in ("position_mm", "thickness_mm", "area_mm2", "time_rank")
@@ -308,6 +205,6 @@ def slice_codes(batch: SliceBatch) -> Tensor:
 
 
 def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:
-    """A stack's pose of each slice, followed by the slice's own turn and shift in its own frame."""
+    """A stack's pose of each slice, followed by the slice's own rotation and translation in its own frame."""
     shift = (rotation @ (vote[:, 3:] * RESIDUAL_SCALE_MM)[..., None])[..., 0]
     return rotation @ rotation_from_vector(vote[:, :3] * RESIDUAL_SCALE_RAD), translation_mm + shift

@@ -1,6 +1,7 @@
 """Whole-volume estimation of the structural prior, in one go or in tiles."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,11 +10,30 @@ from numpy.typing import NDArray
 from g3r.errors import NumericalError
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 
-MAX_WHOLE_VOXELS = 16_000_000
-"""Above this the volume is cut into tiles: the network needs about 0.12 GB of memory per million voxels."""
-TILE_VOXELS = 160
-HALO_VOXELS = 64
 
+@dataclass(frozen=True)
+class Tiling:
+    """How a large volume is cut for the network, which needs about 0.12 GB of memory per million voxels.
+
+    Args:
+        max_whole_voxels: larger volumes are cut into tiles.
+        tile_voxels: edge length of a tile without its halo; rounded up to the network's stride.
+        halo_voxels: how far a tile sees beyond its edge; rounded up to the network's stride.
+
+    Raises:
+        ValueError: a tile without voxels, or a halo below 0.
+    """
+
+    max_whole_voxels: int = 16_000_000
+    tile_voxels: int = 160
+    halo_voxels: int = 64
+
+    def __post_init__(self) -> None:
+        if self.tile_voxels < 1 or self.halo_voxels < 0:
+            raise ValueError(f"a tile needs voxels and a halo of at least 0; got {self}")
+
+
+DEFAULT_TILING = Tiling()
 
 VIEWS = ((), (0, 1), (1, 2), (0, 2), (0,), (1,), (2,), (0, 1, 2))
 """Axes that are mirrored: half turns first, which show the network a head and not a mirror image."""
@@ -26,9 +46,7 @@ def estimate_prior(
     v_sharp: NDArray[np.float32] | None = None,
     *,
     n_views: int = 1,
-    max_whole_voxels: int = MAX_WHOLE_VOXELS,
-    tile_voxels: int = TILE_VOXELS,
-    halo_voxels: int = HALO_VOXELS,
+    tiling: Tiling = DEFAULT_TILING,
 ) -> NDArray[np.float32]:
     """Return V_prior for a whole volume (Eq. 7).
 
@@ -36,47 +54,43 @@ def estimate_prior(
     them: the mean over some is better than any one ("geometric self-ensemble", Lim et al., CVPRW 2017).
 
     Args:
-        network: from `load_prior`, on any device; its mode is left as it is.
+        network: on any device; its mode is left as it is.
         v_coarse: [I, J, K], already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
         m_rho: [I, J, K], dimensionless density M >= 0.
         v_sharp: [I, J, K], on V_coarse's scale; needed by networks with `use_sharp`.
         n_views: number of mirror images and half turns to average over, 1 to 8.
-        max_whole_voxels: larger volumes are cut into tiles.
-        tile_voxels: edge length of a tile without its halo; rounded up to the network's stride.
-        halo_voxels: how far a tile looks beyond its edge; rounded up likewise.
+        tiling: how large volumes are cut.
 
     Returns:
         V_prior, float32 [I, J, K], in the units of `v_coarse`.
 
     Raises:
-        ValueError: the volumes are not 3D of one shape, a needed one is missing, a tile has no voxels, or the
-            number of views is not 1 to 8.
+        ValueError: the volumes are not 3D of one shape, a needed one is missing, or the number of views is not
+            1 to 8.
         NumericalError: the result is not finite.
 
     Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
-        the whole volume, and no layer has statistics of its own. What differs is only what lies beyond the
-        halo: nothing from `ResidualRefiner.receptive_radius_voxels` on (exact up to rounding), below 1e-3 of
-        the intensity scale from 64 voxels on (tests/prior/test_inference.py).
+        the whole volume, and no layer has statistics of its own. The error comes from what is beyond the halo:
+        none but rounding for a halo of the receptive radius, below 1e-3 of the intensity scale for 64 voxels
+        (tests/prior/test_inference.py).
     """
     if v_coarse.ndim != 3 or v_coarse.shape != m_rho.shape or min(v_coarse.shape) < 1:
         raise ValueError(f"expected two 3D volumes of one shape; got {v_coarse.shape} and {m_rho.shape}")
     volumes = [v_coarse, m_rho]
-    if network.refiner.use_sharp:
+    if network.config.use_sharp:
         if v_sharp is None or v_sharp.shape != v_coarse.shape:
             raise ValueError(f"this prior needs V_sharp of shape {v_coarse.shape}")
         volumes.append(v_sharp)
     if not 1 <= n_views <= len(VIEWS):
         raise ValueError(f"{n_views} views; expected 1 to {len(VIEWS)}")
-    if tile_voxels < 1 or halo_voxels < 0:
-        raise ValueError(f"a tile needs voxels and a halo of at least 0; got {tile_voxels=}, {halo_voxels=}")
-    stride = network.refiner.stride
-    whole = v_coarse.size <= max_whole_voxels
+    stride = network.config.stride
+    whole = v_coarse.size <= tiling.max_whole_voxels
     # only with whole strides does a mirrored tile fall on the same sub-sampled grid as the mirrored volume
     far_end = [(0, -extent % stride) for extent in v_coarse.shape]
     volumes = [np.pad(np.asarray(volume, np.float32), far_end) for volume in volumes]
     shape = volumes[0].shape
-    edge = max(shape) if whole else _round_up(tile_voxels, stride)
-    halo = 0 if whole else _round_up(halo_voxels, stride)
+    edge = max(shape) if whole else _round_up(tiling.tile_voxels, stride)
+    halo = 0 if whole else _round_up(tiling.halo_voxels, stride)
     device = next(network.parameters()).device
 
     prior = np.empty(shape, np.float32)

@@ -1,7 +1,6 @@
 """F of Eq. 7: the residual network that refines a coarse volume, made of MONAI blocks."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,6 +9,7 @@ from monai.networks.utils import pixelunshuffle
 from torch import Tensor, nn
 from torch.nn import functional
 
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.gate import confidence_from_density
 
 # No normalisation layer anywhere: instance statistics would make a voxel's value depend on how the volume
@@ -39,53 +39,29 @@ class ResidualRefiner(nn.Module):
     The last convolution starts at zero, so training starts from V_coarse.
 
     Args:
-        channels: feature channels at 1/2, 1/4, ... resolution; at least one level. Multiples of 16 are
-            fastest on CPUs with 512-bit vectors.
-        units: residual units (two 3x3x3 convolutions each) per level and direction; one number per level.
-        tail_channels: feature channels at full resolution.
-        use_density: False leaves c out (an ablation); the signature of `forward` stays the same.
-        use_sharp: True shows V_sharp to the network, beside V_coarse.
-
-    Raises:
-        ValueError: no level, different numbers of levels, or a count below 1.
+        config: of the whole prior network; F takes what concerns it.
     """
 
-    def __init__(
-        self,
-        channels: Sequence[int] = (32, 64, 96),
-        units: Sequence[int] = (1, 2, 3),
-        tail_channels: int = 8,
-        use_density: bool = True,
-        use_sharp: bool = False,
-    ) -> None:
+    def __init__(self, config: PriorNetworkConfig) -> None:
         super().__init__()
-        if not channels or len(channels) != len(units) or min(*channels, *units, tail_channels) < 1:
-            raise ValueError(
-                f"ResidualRefiner needs one positive entry per level; got {channels=}, {units=}, {tail_channels=}"
-            )
-        self.channels = tuple(int(value) for value in channels)
-        self.units = tuple(int(value) for value in units)
-        self.tail_channels = int(tail_channels)
-        self.use_density = bool(use_density)
-        self.use_sharp = bool(use_sharp)
-        self.stride = 2 ** len(self.channels)
-        in_channels = 1 + self.use_density + self.use_sharp
+        self.config = config
+        channels, units = config.channels, config.units
 
-        self.stem = Convolution(3, 8 * in_channels, self.channels[0], **_BLOCK)
+        self.stem = Convolution(3, 8 * config.n_inputs, channels[0], **_BLOCK)
         self.encoder = nn.ModuleList()
         self.down = nn.ModuleList()
         self.decoder = nn.ModuleList()
         self.up = nn.ModuleList()
-        for level, (width, count) in enumerate(zip(self.channels, self.units, strict=True)):
+        for level, (width, count) in enumerate(zip(channels, units, strict=True)):
             self.encoder.append(_residual_units(width, count))
-            if level + 1 < len(self.channels):
-                deeper = self.channels[level + 1]
+            if level + 1 < len(channels):
+                deeper = channels[level + 1]
                 self.down.append(Convolution(3, width, deeper, strides=2, **_BLOCK))
                 self.up.append(_subpixel_upsample(deeper, width))
                 self.decoder.append(_residual_units(width, count))
-        self.to_full = _subpixel_upsample(self.channels[0], self.tail_channels)
-        self.tail = Convolution(3, self.tail_channels + in_channels, self.tail_channels, **_BLOCK)
-        self.head = nn.Conv3d(self.tail_channels, 1, kernel_size=3, padding=1)
+        self.to_full = _subpixel_upsample(channels[0], config.tail_channels)
+        self.tail = Convolution(3, config.tail_channels + config.n_inputs, config.tail_channels, **_BLOCK)
+        self.head = nn.Conv3d(config.tail_channels, 1, kernel_size=3, padding=1)
         self._initialise()
 
     def _initialise(self) -> None:
@@ -95,7 +71,7 @@ class ResidualRefiner(nn.Module):
                 nn.init.kaiming_normal_(module.weight, a=_LEAKY_SLOPE)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
-        n_units = sum(self.units) + sum(self.units[:-1])
+        n_units = sum(self.config.units) + sum(self.config.units[:-1])
         for module in self.modules():
             if isinstance(module, ResidualUnit):
                 # Without normalisation each unit would double the variance; n of them together add about 1.
@@ -105,36 +81,13 @@ class ResidualRefiner(nn.Module):
                 _tie_subpixels(module.conv_block, factor=8)
         nn.init.zeros_(self.head.weight)  # its bias is zero already
 
-    @property
-    def receptive_radius_voxels(self) -> int:
-        """How far, in full-resolution voxels, a change of the input can reach in the output."""
-        radius = 2  # the two convolutions at full resolution
-        for level, count in enumerate(self.units):
-            per_voxel = 2 ** (level + 1)
-            is_deepest = level + 1 == len(self.units)
-            entry_and_units = 1 + 2 * count * (1 if is_deepest else 2)
-            radius += per_voxel * entry_and_units
-            # Being resampled, a voxel also stands for its whole block.
-            radius += per_voxel
-        return radius
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments as plain Python values, for a checkpoint."""
-        return {
-            "channels": list(self.channels),
-            "units": list(self.units),
-            "tail_channels": self.tail_channels,
-            "use_density": self.use_density,
-            "use_sharp": self.use_sharp,
-        }
-
     def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
         """Return the ungated residual F.
 
         Args:
             v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
             m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
-            v_sharp: [B, 1, I, J, K], on V_coarse's scale; needed with `use_sharp`, not looked at without.
+            v_sharp: [B, 1, I, J, K], on V_coarse's scale; needed with `use_sharp`, ignored without.
 
         Returns:
             [B, 1, I, J, K]; any size works, it is padded with zeros at the far end inside.
@@ -143,15 +96,15 @@ class ResidualRefiner(nn.Module):
             ValueError: `use_sharp` without V_sharp.
         """
         given = [v_coarse]
-        if self.use_density:
+        if self.config.use_density:
             given.append(confidence_from_density(m_rho))
-        if self.use_sharp:
+        if self.config.use_sharp:
             if v_sharp is None:
                 raise ValueError("this network needs V_sharp")
             given.append(v_sharp)
         inputs = torch.cat(given, 1)
         size = inputs.shape[2:]
-        far_end = [padding for extent in reversed(size) for padding in (0, -extent % self.stride)]
+        far_end = [padding for extent in reversed(size) for padding in (0, -extent % self.config.stride)]
         inputs = functional.pad(inputs, far_end)
 
         features = self.stem(_channels_last(pixelunshuffle(inputs, 3, 2)))

@@ -78,10 +78,15 @@ class RunContext:
             self.stopped_at = at if at and at.stage == name else StoppedAt(str(name), 0, 0)
             return None
 
-    def stoppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:
+    def stoppable_stage(
+        self, name: str, make: Callable[[], Result], steps_of: Callable[[Result], tuple[int, int]]
+    ) -> Result | None:
         """A stage whose loop a stop request ends after the step under way; what it gives then is not kept.
 
-        The loop looks at a deadline from `deadline`.
+        Args:
+            name: of the stage.
+            make: does it; its loop looks at a deadline from `deadline`.
+            steps_of: steps done and steps in all of what it gives.
 
         Returns:
             What the stage gives; None where the run was stopped before it.
@@ -91,7 +96,7 @@ class RunContext:
         self.postpone_stop()
         result = self._run(name, make, keep=lambda: not self._stop_is_requested())
         if self._stop_is_requested():
-            self.stopped_at = self._position or StoppedAt(str(name), 0, 0)
+            self.stopped_at = StoppedAt(str(name), *steps_of(result))
         return result
 
     def deadline(self, deadline: Deadline | None) -> Deadline | None:

@@ -1,14 +1,13 @@
-"""What the trainings share: the optimiser annealed over a budget, the pace of the data, the data in words.
+"""What the trainings share: the optimiser annealed over a budget, the throughput, and what an export needs."""
 
-Only the modules with `Module` classes import Lightning; inference never does.
-"""
-
+import inspect
 import math
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,13 +15,14 @@ from lightning.pytorch import LightningModule
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from g3r.checkpoints.trained_model import TRAINING_ENTRY, NetworkConfig
 from g3r.errors import InputError, cannot_be_written
 
 UNFINISHED = ".unfinished"
 
 
 class AnnealedModule(LightningModule):
-    """A module trained by AdamW over whatever budget the trainer has.
+    """A module that trains its `network` by AdamW over whatever budget the trainer has.
 
     The learning rate warms up over `warmup_steps`, then follows half a cosine to 1 % by the budget that
     runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run given 70 minutes ends
@@ -37,6 +37,10 @@ class AnnealedModule(LightningModule):
         ValueError: a rate out of range.
     """
 
+    kind: ClassVar[str]
+    """Of the exported model."""
+    network: Any
+
     def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:
         super().__init__()
         if not (learning_rate > 0 and weight_decay >= 0 and warmup_steps >= 0):
@@ -46,11 +50,43 @@ class AnnealedModule(LightningModule):
         self.warmup_steps = warmup_steps
         self._total_steps = math.inf
         self._timer: Timer | None = None
-        self._pace = _Pace()
+        self._throughput = _Throughput()
+        self._training_data = "not recorded"
 
     def n_samples(self, batch: Any) -> int:
         """Samples of a batch."""
         raise NotImplementedError
+
+    def own_description(self) -> dict[str, Any]:
+        """What the exported model needs apart from its weights, in plain values."""
+        raise NotImplementedError
+
+    def keep_hyperparameters(self, network: NetworkConfig) -> None:
+        """Log the constructor's arguments; call it from the constructor.
+
+        The network's are kept as plain values: a checkpoint that holds a class of ours could not be read safely.
+        """
+        self.save_hyperparameters(ignore=["network"], frame=inspect.currentframe().f_back)  # type: ignore[union-attr]
+        self.save_hyperparameters({"network": asdict(network)})
+
+    def describe_data(self) -> dict[str, Any]:
+        """Note the data module in words; return its settings."""
+        data = getattr(self.trainer, "datamodule", None)
+        settings = dict(getattr(data, "hparams", None) or {})
+        self._training_data = data_in_words(data, settings)
+        return settings
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what `g3r-export` needs, in plain values only."""
+        metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
+        checkpoint[TRAINING_ENTRY] = {
+            "kind": self.kind,
+            "network_arguments": asdict(self.network.config),
+            "training_data": self._training_data,
+            "optimiser_steps": int(self.global_step),
+            "validation": {name: value for name, value in metrics.items() if name.startswith("val/")},
+            **self.own_description(),
+        }
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Note when the data arrived, and begin the step's own random numbers.
@@ -58,23 +94,23 @@ class AnnealedModule(LightningModule):
         They depend on the run's seed and the number of the step alone: a run that was killed and goes on from
         a checkpoint draws what it would have drawn.
         """
-        self._pace.start_batch()
+        self._throughput.start_batch()
         run_seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
         seed = np.random.SeedSequence([run_seed, self.global_step]).generate_state(1, np.uint64)[0]
         torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Log samples per second and the share of time spent waiting for data."""
-        self._pace.end_batch(self.n_samples(batch))
+        self._throughput.end_batch(self.n_samples(batch))
         every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
         if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
-            samples_per_second, waiting = self._pace.read_and_reset()
+            samples_per_second, waiting = self._throughput.read_and_reset()
             self.log("train/samples_per_second", samples_per_second, prog_bar=True)
             self.log("train/waiting_for_data", waiting)
 
     def on_train_epoch_start(self) -> None:
         """Forget the time spent in validation."""
-        self._pace = _Pace()
+        self._throughput = _Throughput()
 
     def configure_optimizers(self) -> Any:
         """Return AdamW with warm-up and a cosine over the trainer's budget."""
@@ -103,9 +139,9 @@ class AnnealedModule(LightningModule):
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a checkpoint beside its place and renames it: a kill leaves the earlier one.
+    """Writes a checkpoint to a temporary file and renames it: a kill leaves the earlier one.
 
-    Lightning's own goes through a temporary file, which is copied where those are on another disk.
+    Lightning's own temporary file may be on another disk, from which it is copied.
     """
 
     def save_checkpoint(
@@ -117,11 +153,11 @@ class WholeCheckpoints(TorchCheckpointIO):
             InputError: it cannot be written.
         """
         path = Path(path)
-        beside = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+        temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(checkpoint, beside)
-            os.replace(beside, path)
+            torch.save(checkpoint, temporary)
+            os.replace(temporary, path)
         except OSError as error:
             raise cannot_be_written(path, error) from None
         except RuntimeError as error:  # what torch makes of a full disk
@@ -129,14 +165,14 @@ class WholeCheckpoints(TorchCheckpointIO):
                 raise
             raise InputError(f"{path}: cannot be written ({error}); free some space") from None
         finally:
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
     def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
-        """Read a checkpoint to go on from; remove what its run, if dead, had not finished writing."""
-        for beside in Path(path).parent.glob(f".*{UNFINISHED}"):
-            process = beside.name.removesuffix(UNFINISHED).rpartition(".")[2]
+        """Read a checkpoint to resume from; remove what its run, if dead, had not finished writing."""
+        for temporary in Path(path).parent.glob(f".*{UNFINISHED}"):
+            process = temporary.name.removesuffix(UNFINISHED).rpartition(".")[2]
             if not (process.isdigit() and _is_alive(int(process))):
-                beside.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
         return super().load_checkpoint(path, *arguments, **options)
 
 
@@ -150,7 +186,7 @@ def _is_alive(process: int) -> bool:
     return True
 
 
-class _Pace:
+class _Throughput:
     """Samples per second, and the share of the time in which training waits for data."""
 
     def __init__(self) -> None:
@@ -178,10 +214,10 @@ def cosine_factor(progress: float, final: float = 0.01) -> float:
     return final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
 
 
-def describe_data(data: object, settings: Mapping[str, Any]) -> str:
+def data_in_words(data: object, settings: Mapping[str, Any]) -> str:
     """Return the data module and its settings in one line, with folders by name only.
 
-    The line ends up in files that are passed on; where the data lay on this machine is nobody's business.
+    The line ends up in files that are passed on, which should not show where the data were on this machine.
     """
     if data is None:
         return "not recorded"

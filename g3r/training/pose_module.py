@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +11,22 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
+from g3r.checkpoints.trained_model import TRAINING_ENTRY
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
+from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.geometry import moved_points, pixel_points_mm, rotation_from_vector, sample_rows
 from g3r.pose_network.inference import SLICE_POINTS_MM, as_pose, pose_errors, poses_of, stack_motions
+from g3r.pose_network.model import PoseModel
 from g3r.pose_network.network import PoseNetwork, PoseStep
-from g3r.training.annealed_module import AnnealedModule, describe_data
+from g3r.training.annealed_module import AnnealedModule
 
 logger = logging.getLogger(__name__)
 
 Batch = Mapping[str, Tensor]
 """A `SliceBatch` with `true_rotation` [S, 3, 3] and `true_translation_mm` [S, 3]."""
 
-POSE_EXPORT_KEY = "g3r_pose"
-"""Where a training checkpoint keeps what `g3r-export` needs, in plain values."""
+DEFAULT_NETWORK = PoseNetworkConfig()
 FULL_AREA_MM2 = 600.0
 """Slices of less area count less in the loss."""
 SECOND_REFINEMENT_SHARE = 0.2
@@ -33,7 +36,7 @@ DISTURBED_SHARE = 0.6
 STACK_ROTATION_RAD, STACK_TRANSLATION_MM = 0.3, 6.0
 SLICE_ROTATION_RAD, SLICE_TRANSLATION_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
-"""Weight of the votes' squared error (0 to 3, no unit) beside the distances."""
+"""Weight of the votes' squared error (0 to 3, no unit) relative to the distances."""
 N_PANEL_SLICES = 12
 RIGHT_WITHIN_DEG = 20.0
 
@@ -42,53 +45,43 @@ class PoseModule(AnnealedModule):
     """Supervised training of the pose network against the slices' true poses.
 
     Loss: mean distance in mm of five points of a slice (its centre and (+-25, +-25) mm) between predicted and
-    true pose, over all steps of the network; slices with little in their mask count less. To it comes the
+    true pose, over all steps of the network; slices with little in their mask count less. Added to it is the
     squared error of every slice's vote, which teaches a vote to be the mean over what the slice may be: long
-    where it is sure, short where it is not.
+    where it is certain, short where it is not.
 
     The poses that a refinement starts from are disturbed: on heads that it is trained on, the first guess is
     better than it will be on others.
 
-    The template of mean heads comes from the data module's `template()`.
+    The atlas template comes from the data module's `template()`.
 
     Args:
-        channels: see `PoseNetwork`.
-        width: see `PoseNetwork`.
-        n_blocks: see `PoseNetwork`.
-        n_heads: see `PoseNetwork`.
+        network: see `PoseNetworkConfig`; the template's shape is that of the data module's template.
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
-        n_ages: number of mean heads in the data module's template.
         start_from: training checkpoint whose weights to begin with.
 
     Raises:
         ValueError: a rate out of range, or from the network.
     """
 
+    kind = PoseModel.kind
     network: PoseNetwork
 
     def __init__(
         self,
-        channels: Sequence[int] = (24, 48, 96),
-        width: int = 128,
-        n_blocks: int = 3,
-        n_heads: int = 4,
+        network: PoseNetworkConfig = DEFAULT_NETWORK,
         learning_rate: float = 1e-3,
         weight_decay: float = 1e-3,
         warmup_steps: int = 200,
-        n_ages: int = 6,
         start_from: str | None = None,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
-        self.save_hyperparameters()
-        self.network = PoseNetwork(
-            (n_ages, 2, 2, 2), channels=channels, width=width, n_blocks=n_blocks, n_heads=n_heads
-        )
+        self.keep_hyperparameters(network)
+        self.network = PoseNetwork(network)
         if start_from is not None:
             self._take_weights(Path(start_from))
         self.weeks: list[float] = []
-        self._training_data = "not recorded"
         self._scores: list[dict[str, np.ndarray]] = []
         self._panel: Tensor | None = None
 
@@ -99,8 +92,6 @@ class PoseModule(AnnealedModule):
     def n_samples(self, batch: Batch) -> int:
         """Heads of a batch."""
         return int(batch["set_of_stack"].max()) + 1
-
-    # ---- training -------------------------------------------------------------------------------------
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the mean point distance of one batch over all steps, and log it for each."""
@@ -117,8 +108,6 @@ class PoseModule(AnnealedModule):
             self.log(f"train/mm_step{number}", losses[number], prog_bar=True, batch_size=n_samples)
             self.log(f"train/vote_step{number}", votes[number], batch_size=n_samples)
         return torch.stack(losses).mean() + VOTE_WEIGHT_MM * torch.stack(votes).mean()
-
-    # ---- validation -----------------------------------------------------------------------------------
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last epoch's scores."""
@@ -139,37 +128,40 @@ class PoseModule(AnnealedModule):
         for board in self.loggers:
             if isinstance(board, TensorBoardLogger) and self._panel is not None:
                 board.experiment.add_image(
-                    "val/slices, and the template where they are put",
+                    "val/slices, and the template at their poses",
                     self._panel,
                     global_step=self.global_step,
                     dataformats="HW",
                 )
 
-    # ---- what an export needs -------------------------------------------------------------------------
-
     def setup(self, stage: str) -> None:
-        """Take the template and a description from the data module.
+        """Take the atlas template from the data module.
 
         Raises:
-            InputError: the data module makes images of another size, or mean heads of another number of ages.
+            InputError: the data module makes images of another size, or a template on another grid.
         """
-        data: Any = getattr(self.trainer, "datamodule", None)
-        settings = dict(getattr(data, "hparams", None) or {})
+        settings = self.describe_data()
+        config = self.network.config
         for name in ("pixel_mm", "image_size"):
-            mine, theirs = getattr(self.network, name), settings.get(name)
+            mine, theirs = getattr(config, name), settings.get(name)
             if theirs is not None and theirs != mine:
                 raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
-        self._training_data = describe_data(data, settings)
+        data: Any = getattr(self.trainer, "datamodule", None)
         if hasattr(data, "template"):
             template = data.template()
-            n_ages = self.network.arguments()["template_shape"][0]
-            if len(template) != n_ages:
-                raise InputError(
-                    f"model.n_ages: {n_ages}, but the data have mean heads of {len(template)} ages; "
-                    f"pass --model.n_ages {len(template)}"
-                )
             self.network.set_template(torch.from_numpy(template.volume))
+            if not np.allclose(template.affine, self.network.config.template_grid.affine, atol=1e-3):
+                raise InputError(
+                    f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
+                    "pass --model.network.config.template_spacing_mm"
+                )
             self.weeks = [float(week) for week in template.weeks]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse to resume a run of another network or template with `InputError`."""
+        before, now = checkpoint.get(TRAINING_ENTRY, {}).get("network_arguments"), asdict(self.network.config)
+        if before is not None and before != now:
+            raise InputError(f"ckpt_path: its network is {before}, now it is {now}; resume with the same data")
 
     def _take_weights(self, path: Path) -> None:
         """Begin with the weights of another run where they fit; the template comes from the data module."""
@@ -188,16 +180,9 @@ class PoseModule(AnnealedModule):
                 "checkpoint of a pose network"
             ) from error
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description from which `g3r-export` makes a pose checkpoint, in plain values only."""
-        metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
-        checkpoint[POSE_EXPORT_KEY] = {
-            "network_arguments": self.network.arguments(),
-            "weeks": self.weeks,
-            "training_data": self._training_data,
-            "optimiser_steps": int(self.global_step),
-            "validation": {name: value for name, value in metrics.items() if name.startswith("val/")},
-        }
+    def own_description(self) -> dict[str, Any]:
+        """What a `PoseModel` needs apart from its weights."""
+        return {"weeks": self.weeks}
 
 
 def point_loss(step: PoseStep, batch: Batch) -> Tensor:
@@ -269,11 +254,11 @@ def summary(scores: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
 
 
 def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
-    """Slices of the first head above what a mean head shows at their poses, [H, W] in [0, 1]."""
+    """Slices of the first head above what the atlas template shows at their poses, [H, W] in [0, 1]."""
     rows = torch.linspace(0, len(batch["image"]) - 1, N_PANEL_SLICES).round().long().unique()
     image = batch["image"][rows, 0].float().cpu()
-    points = pixel_points_mm(network.image_size, network.pixel_mm, pose[0])
+    points = pixel_points_mm(network.config.image_size, network.config.pixel_mm, pose[0])
     where = moved_points(pose[0][rows], pose[1][rows], points)
-    heads = sample_rows(network.template, where, network.template_spacing_mm)
+    heads = sample_rows(network.template, where, network.config.template_spacing_mm)
     shown = heads[..., heads.shape[-1] // 2].reshape(image.shape).float().cpu()
     return torch.cat([torch.cat(list(image), 1), torch.cat(list(shown), 1)], 0).clamp(0.0, 1.0)

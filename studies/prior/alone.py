@@ -12,8 +12,7 @@ from typing import Any
 from g3r.acquisition.images import Volume
 from g3r.evaluation.compare import compare
 from g3r.planning.presets import PRESETS
-from g3r.prior.checkpoint import load_prior
-from g3r.reconstruct import DEFAULT_CHECKPOINT
+from g3r.prior.model import Prior
 from studies.harness import FITS, Record, Row, Study, Task
 from studies.prior.volumes import prior_volumes, slices_at_true_poses, tiling_difference
 from studies.runs import figures
@@ -52,10 +51,10 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
     """Scores of each volume of the first `n_stacks` stacks; poses are true, so nothing is aligned."""
-    network, meta = load_prior(options.ckpt or DEFAULT_CHECKPOINT)
+    prior = Prior.load(options.ckpt)
     case = read_case(folder)
     n_views = PRESETS[options.preset].prior_views
-    made = prior_volumes(network, slices_at_true_poses(case, n_stacks), meta.voxel_mm, n_views)
+    made = prior_volumes(prior.network, slices_at_true_poses(case, n_stacks), prior.voxel_mm, n_views)
     scores = {
         name: figures(compare(Volume(data, made.grid.affine, name), case.truth, case.truth_mask).scores)
         for name, data in made.by_name.items()
@@ -65,19 +64,19 @@ def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
 
 def measure_speed(options: argparse.Namespace) -> Row:
     """Wall seconds on a 36-week brain (the least of a few runs), and what tiles change."""
-    network, meta = load_prior(options.ckpt or DEFAULT_CHECKPOINT)
+    prior = Prior.load(options.ckpt)
     spec = SubjectSpec(name="speed-sta36", volume=SPEED_VOLUME, motion="mild", seed=SPEED_SEED, stretch=0.0)
     case = simulated_case(spec, options.cache)
     slices = slices_at_true_poses(case, len(case.stacks))
-    runs = [prior_volumes(network, slices, meta.voxel_mm) for _ in range(REPEATS)]
-    views = prior_volumes(network, slices, meta.voxel_mm, PRESETS[options.preset].prior_views)
+    runs = [prior_volumes(prior.network, slices, prior.voxel_mm) for _ in range(REPEATS)]
+    views = prior_volumes(prior.network, slices, prior.voxel_mm, PRESETS[options.preset].prior_views)
     return {
         "shape": list(runs[0].grid.shape),
-        "voxel_mm": meta.voxel_mm,
+        "voxel_mm": prior.voxel_mm,
         "seconds": {name: min(run.seconds[name] for run in runs) for name in VOLUMES},
         "all_views_seconds": views.seconds["V_prior"],
         "tile_voxels": TILE_VOXELS,
-        "tiling_difference": tiling_difference(network, runs[-1], TILE_VOXELS),
+        "tiling_difference": tiling_difference(prior.network, runs[-1], TILE_VOXELS),
     }
 
 

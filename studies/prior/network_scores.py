@@ -26,7 +26,7 @@ SPEED_SHAPE = (129, 152, 130)
 """Voxels of a 36-week brain at 0.8 mm with its margin (`studies.prior.alone`)."""
 
 REPEATS = 3
-EXPORTED = "prior.pt"
+EXPORTED = "prior.safetensors"
 
 
 BASELINES = {"V_coarse": "coarse", "V_sharp": "sharp"}
@@ -67,14 +67,14 @@ def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]
     import torch
 
     from g3r.cli import export
-    from g3r.prior.checkpoint import load_prior
+    from g3r.prior.model import Prior
 
     exported = run / EXPORTED
     with contextlib.redirect_stdout(io.StringIO()):
         code = export.main([str(checkpoint), str(exported), "--force"])
     if code != 0:
         raise InputError(f"{checkpoint}: cannot be exported; remove {run} and train again")
-    network, _ = load_prior(exported)
+    network = Prior.load(exported).network
     with torch.inference_mode():
         priors = [network(one["coarse"], one["density"], one["sharp"]) for one in volumes]
     content = torch.load(checkpoint, map_location="cpu", weights_only=True)
@@ -90,30 +90,28 @@ def inference_seconds(exported: Path) -> float:
     """Wall seconds of one view of a whole brain, the least of a few runs."""
     import numpy as np
 
-    from g3r.prior.checkpoint import load_prior
-    from g3r.prior.inference import estimate_prior
+    from g3r.prior.model import Prior
 
-    network, _ = load_prior(exported)
+    prior = Prior.load(exported)
     rng = np.random.default_rng(0)
     inputs = [rng.random(SPEED_SHAPE, dtype=np.float32) for _ in range(3)]
     seconds = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        estimate_prior(network, *inputs)
+        prior.estimate(*inputs)
         seconds.append(time.perf_counter() - start)
     return round(min(seconds), 2)
 
 
 def scores_by_stacks(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> dict[str, dict[str, float]]:
     """Mean L1, PSNR (dB) and SSIM in the mask, for each number of stacks and over all ("all")."""
-    from g3r.training.prior_module import scores_in_mask
+    from g3r.training.prior_validation import sample_scores
 
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for volume, one in zip(made, volumes, strict=True):
-        inside = one["mask"] > 0.5
-        scores = scores_in_mask(volume, one["truth"], inside)
-        l1 = float((volume - one["truth"])[inside].abs().mean())
-        row = (l1, mean(scores["psnr"]), mean(scores["ssim"]))
+        inside = (one["mask"][0] > 0.5).float()
+        scores = sample_scores(volume[0], one["truth"][0], inside, weight=inside)
+        row = (scores["l1"], scores["psnr"], scores["ssim"])
         for key in (str(int(one["n_stacks"][0])), "all"):
             rows.setdefault(key, []).append(row)
     return {

@@ -42,7 +42,7 @@ class Variant:
     Args:
         name: of its folder, and in tables.
         what: how it differs, in words.
-        options: of `PriorModule`, beside those of the configuration.
+        options: of the network, beside those of the configuration.
         is_size: whether it belongs to the curve of error against seconds.
     """
 
@@ -129,7 +129,8 @@ def finish(record: Record, options: argparse.Namespace) -> None:
 
 def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
     """The variants, without a size that is the configuration's own."""
-    model = {"use_gate": True, "use_density": True, "use_sharp": True, "sharp_base": False, **config["model"]}
+    network = config["model"]["init_args"]["network"]
+    model = {"use_gate": True, "use_density": True, "use_sharp": True, "sharp_base": False, **network}
     return [
         variant
         for variant in VARIANTS
@@ -187,7 +188,7 @@ def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) 
     last = newest_checkpoint(run)
     command = [
         *(sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(CONFIG), *arguments),
-        *(f"--model.{name}={json.dumps(value)}" for name, value in variant.options.items()),
+        *(f"--model.network.{name}={json.dumps(value)}" for name, value in variant.options.items()),
         f"--trainer.max_epochs={n_epochs}",
         "--trainer.max_time=null",
         "--trainer.enable_progress_bar=false",

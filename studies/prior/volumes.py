@@ -57,7 +57,7 @@ def prior_volumes(network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: f
     """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have.
 
     Args:
-        network: from `load_prior`.
+        network: of a `Prior`.
         slices: posed.
         voxel_mm: that the network was trained on.
         n_views: see `estimate_prior`.
@@ -79,14 +79,14 @@ def tiling_difference(network: DensityGatedPriorNetwork, volumes: PriorVolumes, 
     """Largest difference, in the normalised scale, between a prior of one view made whole and in tiles.
 
     Args:
-        network: from `load_prior`.
+        network: of a `Prior`.
         volumes: made whole.
         tile_voxels: edge of a tile.
     """
-    from g3r.prior.inference import estimate_prior
+    from g3r.prior.inference import Tiling, estimate_prior
 
     given = volumes.by_name["V_coarse"], volumes.density, volumes.by_name["V_sharp"]
-    tiled = estimate_prior(network, *given, max_whole_voxels=0, tile_voxels=tile_voxels)
+    tiled = estimate_prior(network, *given, tiling=Tiling(0, tile_voxels))
     return float(np.abs(tiled - volumes.by_name["V_prior"]).max())
 
 

@@ -75,7 +75,7 @@ def tables(record: Record) -> dict[str, str]:
         "case": "{case}",
         "budget, s": "{budget_s:g}",
         "took, s": took,
-        "registration as in": "{motion}",
+        "registration as in": "{registration}",
         "Gaussians as in": "{fit}",
         "steps": "{n_steps}",
         "Gaussians": "{n_gaussians:,}",

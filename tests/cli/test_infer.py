@@ -14,12 +14,12 @@ import pytest
 
 from g3r import GaussianReconstructor, load_stack
 from g3r.acquisition.images import load_volume
+from g3r.checkpoints.weights_file import SHIPPED_PRIOR
 from g3r.errors import InputError
 from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
 from g3r.gaussians import GaussianCloud
 from g3r.output.files import OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.planning.presets import PRESETS, ReconstructionSettings
-from g3r.reconstruct import DEFAULT_CHECKPOINT
 
 OUTPUTS = {
     "volume.nii.gz",
@@ -250,7 +250,7 @@ def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not DEFAULT_CHECKPOINT.exists(), reason="the shipped weights are not there yet")
+@pytest.mark.skipif(not SHIPPED_PRIOR.exists(), reason="the shipped weights are not there yet")
 def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path):
     quick = [option for option in QUICK if option != "--no-prior"]
     done = run("infer", *inputs(subject), *quick, "--output", tmp_path / "out")
@@ -303,9 +303,6 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
     elif kind == "output is a file":
         (folder / "out").write_text("mine")
         return [*inputs(subject), *options], "out"
-    elif kind == "prior of another voxel size":
-        expected = "prior.pt: was trained on voxels of 0.8 mm, expected 1.2 mm"
-        return [*inputs(subject), *options[1:], "--prior-voxel", "1.2"], expected
     elif kind == "resolution":
         return [*inputs(subject), *options, "--resolution", "0"], "resolution 0 mm"
     whole = kind in ("one slice", "NaN volume")
@@ -334,7 +331,6 @@ def _like(path: Path, image_path: Path) -> Path:
         "checkpoint is text",
         "output is a file",
         "resolution",
-        "prior of another voxel size",
     ],
 )
 def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path):

@@ -15,29 +15,28 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="session")
-def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Callable[..., object]]:
+def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[type, Callable[..., object]]:
     """Loaders that read a file once; a dry run has imported and compiled all that a command needs."""
-    import g3r.reconstruct
     from g3r.cli.infer import main
+    from g3r.pose_network.model import PoseModel
+    from g3r.prior.model import Prior
 
     folder = tmp_path_factory.mktemp("warm")
     with pytest.MonkeyPatch.context() as patch:
         loaders = {}
-        for name in ("load_prior", "load_pose_network"):
-            loaders[name] = functools.cache(getattr(g3r.reconstruct, name))
-            patch.setattr(g3r.reconstruct, name, loaders[name])
+        for kind in (Prior, PoseModel):
+            loaders[kind] = functools.cache(kind.load)
+            patch.setattr(kind, "load", loaders[kind])
         line = ["--stacks", str(write(folder / "a.nii")), "--output", str(folder / "out"), "--dry-run"]
         assert main(line) == 0
     return loaders
 
 
 @pytest.fixture
-def networks_once(kept_networks: dict[str, Callable[..., object]], monkeypatch: pytest.MonkeyPatch) -> None:
+def networks_once(kept_networks: dict[type, Callable[..., object]], monkeypatch: pytest.MonkeyPatch) -> None:
     """For commands inside this process: nothing is imported, compiled or read that is the same for all."""
-    import g3r.reconstruct
-
-    for name, loader in kept_networks.items():
-        monkeypatch.setattr(g3r.reconstruct, name, loader)
+    for kind, loader in kept_networks.items():
+        monkeypatch.setattr(kind, "load", loader)
 
 
 @pytest.fixture(scope="session")

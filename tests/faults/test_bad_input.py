@@ -178,8 +178,6 @@ VALUES = {
     "--resolution nan": "resolution nan mm; expected 0.3 to 3 mm",
     "--resolution inf": "resolution inf mm; expected 0.3 to 3 mm",
     "--resolution 0.0001": "resolution 0.0001 mm; expected 0.3 to 3 mm",
-    "--prior-voxel nan": "prior.pt: was trained on voxels of 0.8 mm, expected nan mm; pass another",
-    "--prior-voxel 0": "prior.pt: was trained on voxels of 0.8 mm, expected 0 mm; pass another",
     "--threads 1000000": "this machine offers .*; choose at most that",
     "--max-memory 1M": "needs at least .*; choose a coarser --resolution",
     "--tensorboard stack.nii.gz": "stack.nii.gz: is a file; expected a folder",

@@ -78,22 +78,22 @@ def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tall
         case.refused()
 
 
-SAID = {"training_data": "", "optimiser_steps": 1}
+SAID = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
 RUNS = {
     "missing": None,
     "empty": b"",
     "text": b"weights\n",
     "zip": b"PK\x03\x04" + bytes(100),
     "plain values": {"state_dict": {}},
-    "nothing in it": {"state_dict": {}, "g3r_prior": {}},
-    "text for a description": {"state_dict": {}, "g3r_prior": "prior"},
-    "text for weights": {"state_dict": {"network.a": "heavy"}, "g3r_prior": SAID},
-    "list of weights": {"state_dict": [1], "g3r_pose": SAID},
+    "nothing in it": {"state_dict": {}, "g3r_export": {}},
+    "text for a description": {"state_dict": {}, "g3r_export": "prior"},
+    "text for weights": {"state_dict": {"network.a": "heavy"}, "g3r_export": SAID},
+    "list of weights": {"state_dict": [1], "g3r_export": {**SAID, "kind": "pose"}},
     "a list": [1, 2],
     "a tensor": torch.zeros(2),
     "huge numbers": {
         "state_dict": {"network.a": torch.zeros(1)},
-        "g3r_prior": {**SAID, "network_arguments": {"channels": 10**400}},
+        "g3r_export": {**SAID, "validation": {}, "network_arguments": {"channels": 10**400}},
     },
 }
 
@@ -106,7 +106,7 @@ def test_export(name: str, tmp_path: Path, tally: Tally):
     elif content is not None:
         torch.save(content, path)
     with tally.case() as case:
-        outcome = run(export.main, [path, tmp_path / "prior.pt"], tmp_path)
+        outcome = run(export.main, [path, tmp_path / "prior.safetensors"], tmp_path)
         assert_refused(outcome, "g3r-export", "last.ckpt", "expected a training checkpoint|export another")
         case.refused()
 
@@ -130,7 +130,7 @@ REAL = {
     "infer": (["--stacks", "bad.nii.gz", "--output", "out"], 3),
     "evaluate": (["--volume", "bad.nii.gz", "--reference", "good.nii", "--mask", "good.nii"], 3),
     "simulate": (["--volume", "bad.nii.gz", "--mask", "good.nii", "--output", "out"], 3),
-    "export": (["bad.nii.gz", "out.pt"], 3),
+    "export": (["bad.nii.gz", "out.safetensors"], 3),
     "pretrain": (["fit", "--config", "bad.nii.gz"], 2),
 }
 

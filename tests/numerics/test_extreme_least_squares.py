@@ -9,6 +9,7 @@ import torch
 from g3r.acquisition.coarse_volume import coarse_and_density, confidence
 from g3r.gaussians import GaussianCloud, render, solve_amplitudes
 from g3r.gaussians.amplitudes import AmplitudeSystem
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
 from tests.numerics.oracles import naive_amplitudes, naive_render
@@ -159,7 +160,8 @@ def test_confidence_keeps_its_digits_where_the_naive_form_has_none():
 @pytest.mark.parametrize("density", [0.0, 1e-30, 1.0, 1e6])
 def test_the_prior_network_at_every_density(density: float, tally):
     torch.manual_seed(0)
-    network = DensityGatedPriorNetwork((4, 8), (1, 1), 2)
+    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False)
+    network = DensityGatedPriorNetwork(config)
     torch.nn.init.normal_(network.refiner.head.weight)
     coarse = torch.rand(1, 1, 8, 8, 8)
     m = torch.full_like(coarse, density).requires_grad_()

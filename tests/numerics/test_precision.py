@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from g3r.gaussians import GaussianCloud, render
+from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_from_vector
 from g3r.pose_network.network import PoseNetwork
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from tests.numerics.scenes import head_scene, single
 
@@ -47,7 +49,7 @@ def test_a_renderer_under_autocast_would_be_wrong():
 
 def test_poses_under_autocast_are_those_without(tally):
     torch.manual_seed(0)
-    network = PoseNetwork((2, 6, 6, 6), channels=(4, 8, 8), width=16, n_blocks=1, n_heads=2).eval()
+    network = PoseNetwork(PoseNetworkConfig(channels=(4, 8, 8), width=16, n_blocks=1, n_heads=2)).eval()
     network.set_template(torch.rand(2, 6, 6, 6))
     n = 6
     batch = {
@@ -93,7 +95,8 @@ def moved_points_plainly(rotation: torch.Tensor, shift: torch.Tensor, points: to
 def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally):
     """Rounding reaches the residual alone; where slices are dense the gate passes a twentieth of it."""
     torch.manual_seed(0)
-    network = DensityGatedPriorNetwork((4, 8), (1, 1), 2).eval()
+    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False)
+    network = DensityGatedPriorNetwork(config).eval()
     torch.nn.init.normal_(network.refiner.head.weight, std=0.1)
     coarse = torch.rand(1, 1, 16, 16, 16)
     m = torch.full_like(coarse, density)

@@ -10,22 +10,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slice_images import slice_images
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.geometry import RigidPose
-from g3r.pose_network.checkpoint import PoseCheckpoint, centred_grid
-from g3r.pose_network.inference import (
-    VIEWS,
-    mean_pose,
-    pose_errors,
-    poses_of,
-    predict_poses,
-    slice_batch,
-    stack_motions,
-)
+from g3r.pose_network.config import PoseNetworkConfig
+from g3r.pose_network.inference import VIEWS, mean_pose, pose_errors, poses_of, slice_batch, stack_motions
+from g3r.pose_network.model import PoseModel
 from g3r.pose_network.network import PoseNetwork
 
 SHAPE = (2, 9, 9, 9)
@@ -34,7 +26,7 @@ SHAPE = (2, 9, 9, 9)
 @pytest.fixture(scope="module")
 def network():
     torch.manual_seed(3)
-    network = PoseNetwork(SHAPE, channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2).eval()
+    network = PoseNetwork(PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)).eval()
     for part in (network.transformer, network.refining_transformer):
         torch.nn.init.normal_(part.vote.weight, std=0.3)
     network.set_template(torch.rand(SHAPE))
@@ -42,9 +34,8 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def meta(network):
-    template = AtlasTemplate(np.zeros(SHAPE, np.float32), centred_grid(SHAPE, 3.0).affine, np.array([25.0, 31]))
-    return PoseCheckpoint(network.arguments(), template, "nothing")
+def model(network):
+    return PoseModel(network=network, weeks=(25.0, 31.0), training_data="nothing")
 
 
 def blob_stack(rotation, seed, shape=(50, 46, 12)):
@@ -86,25 +77,25 @@ def assert_same(one: RigidPose, other: RigidPose, tolerance_mm: float) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [(0, 0, 90), (180, 0, 0), (20, -50, 130)])
-def test_moving_all_headers_changes_nothing(network, meta, slices, angle_deg):
+def test_moving_all_headers_changes_nothing(model, slices, angle_deg):
     motion = RigidPose.from_rotvec(np.deg2rad([angle_deg]), np.array([[30.0, -200.0, 7.0]]))
-    before = predict_poses(network, meta, slices)
+    before = model.predict(slices)
     assert len(before) == len(slices)
-    assert_same(before, predict_poses(network, meta, moved_headers(slices, motion)), 1e-3)
+    assert_same(before, model.predict(moved_headers(slices, motion)), 1e-3)
 
 
-def test_present_poses_do_not_matter(network, meta, slices):
+def test_present_poses_do_not_matter(model, slices):
     other = slices.with_pose(RigidPose.identity(len(slices)))
-    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, other), 1e-6)
+    assert_same(model.predict(slices), model.predict(other), 1e-6)
 
 
-def test_the_order_does_not_matter(network, meta, slices):
+def test_the_order_does_not_matter(model, slices):
     order = np.random.default_rng(0).permutation(len(slices))
-    before = predict_poses(network, meta, slices).take(order)
-    assert_same(before, predict_poses(network, meta, slices.take(order)), 1e-2)  # sums in another order
+    before = model.predict(slices).take(order)
+    assert_same(before, model.predict(slices.take(order)), 1e-2)  # sums in another order
 
 
-def test_numbers_of_stacks_do_not_matter(network, meta, slices):
+def test_numbers_of_stacks_do_not_matter(model, slices):
     renamed = Slices(
         slices.planes,
         slices.value,
@@ -114,10 +105,10 @@ def test_numbers_of_stacks_do_not_matter(network, meta, slices):
         slices.thickness_mm,
         slices.header_pose,
     )
-    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, renamed), 1e-3)
+    assert_same(model.predict(slices), model.predict(renamed), 1e-3)
 
 
-def test_cropping_does_not_matter(network, meta, slices):
+def test_cropping_does_not_matter(model, slices):
     """The pose is that of the slice's own frame, wherever the cropping put its centre."""
     planes = slices.planes
     parts = [slice(*planes.offset[k : k + 2]) for k in range(len(slices))]
@@ -134,7 +125,7 @@ def test_cropping_does_not_matter(network, meta, slices):
     other = dataclasses.replace(
         slices, planes=wider, value=padded(slices.value), mask=padded(slices.mask), header_pose=header
     )
-    assert_same(predict_poses(network, meta, slices) @ frame, predict_poses(network, meta, other), 1e-3)
+    assert_same(model.predict(slices) @ frame, model.predict(other), 1e-3)
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -164,32 +155,32 @@ def test_mean_pose_leaves_one_wrong_view_aside(rng):
     assert angle_deg.max() < 8
 
 
-def test_scale_of_intensities_does_not_matter(network, meta, slices):
-    assert_same(predict_poses(network, meta, slices), predict_poses(network, meta, slices.scaled(1000.0)), 0.01)
+def test_scale_of_intensities_does_not_matter(model, slices):
+    assert_same(model.predict(slices), model.predict(slices.scaled(1000.0)), 0.01)
 
 
-def test_a_single_slice(network, meta, slices):
-    assert len(predict_poses(network, meta, slices.take([4]))) == 1
+def test_a_single_slice(model, slices):
+    assert len(model.predict(slices.take([4]))) == 1
 
 
-def test_time_is_used_if_known(network, meta, slices):
-    known = predict_poses(network, meta, slices, np.linspace(0, 1, len(slices)))
-    distance_mm, _ = pose_errors(known, predict_poses(network, meta, slices))
+def test_time_is_used_if_known(network, slices):
+    """Trainings know the order of acquisition of some stacks."""
+    images = slice_images(slices, 3.0, 40)
+    known = dataclasses.replace(images, time_rank=np.linspace(0, 1, len(slices)))
+    with_time, without = (poses_of(network, slice_batch([some])) for some in (known, images))
+    distance_mm, _ = pose_errors(with_time, without)
     assert distance_mm.max() > 1e-3
 
 
 def test_quick_enough():
-    network = PoseNetwork((6, 39, 45, 43)).eval()
-    template = AtlasTemplate(
-        np.zeros((6, 39, 45, 43), np.float32), centred_grid((6, 39, 45, 43), 3.0).affine, np.arange(6.0)
-    )
-    meta = PoseCheckpoint(network.arguments(), template, "nothing")
+    network = PoseNetwork(PoseNetworkConfig(template_shape=(6, 39, 45, 43))).eval()
+    model = PoseModel(network=network, weeks=(22.0, 25.0, 28.0, 31.0, 34.0, 37.0), training_data="nothing")
     stacks = [
         blob_stack(turn, seed, (70, 70, 44)) for seed, turn in enumerate(Rotation.random(6, random_state=1).as_matrix())
     ]
     slices = slices_from_stacks(stacks)
     start = time.process_time()
-    predict_poses(network, meta, slices)
+    model.predict(slices)
     assert time.process_time() - start < 3.0 * max(len(slices) / 130, 1)
 
 
@@ -219,7 +210,7 @@ def test_pose_errors():
 
 def test_inference_needs_no_training_packages():
     code = (
-        "import sys, g3r.pose_network.inference, g3r.pose_network.network, g3r.pose_network.checkpoint\n"
+        "import sys, g3r.pose_network.inference, g3r.pose_network.network, g3r.pose_network.model\n"
         "assert not {'lightning', 'torchio', 'pytorch_lightning'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -1,11 +1,14 @@
 """The pose network's pieces against plain references, its symmetries, and that it can learn at all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.geometry import (
     best_age,
     group_mean,
@@ -17,7 +20,7 @@ from g3r.pose_network.geometry import (
 )
 from g3r.pose_network.network import PoseNetwork
 
-SMALL = {"template_shape": (2, 9, 9, 9), "channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2}
+SMALL = PoseNetworkConfig(template_shape=(2, 9, 9, 9), channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
 
 
 def rotations(n, seed=0):
@@ -47,7 +50,7 @@ def random_batch(seed=0, n_slices=6, sets=(2, 1), size=40):
 def lively_network(**changes):
     """A network with random weights large enough to matter."""
     torch.manual_seed(3)
-    network = PoseNetwork(**{**SMALL, **changes}).eval()
+    network = PoseNetwork(replace(SMALL, **changes)).eval()
     for part in (network.transformer, network.refining_transformer):
         torch.nn.init.normal_(part.vote.weight, std=0.3)
     network.set_template(torch.rand(2, 9, 9, 9))
@@ -176,7 +179,7 @@ def test_a_tiny_set_can_be_learnt():
     shift = 10 * torch.randn(8, 3)
     points = torch.tensor(SLICE_POINTS_MM, dtype=torch.float32)
     true = moved_points(rotation, shift, points)
-    network = PoseNetwork(**SMALL).train()
+    network = PoseNetwork(SMALL).train()
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     losses = []
     for _ in range(150):
@@ -193,13 +196,28 @@ def test_a_tiny_set_can_be_learnt():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"image_size": 42}, {"channels": (8, 8)}, {"width": 30, "n_heads": 4}, {"n_refinements": 0}]
+    "changes",
+    [
+        {"image_size": 42},
+        {"pixel_mm": 0.0},
+        {"pixel_mm": float("nan")},
+        {"template_shape": (2, 9, 9)},
+        {"template_shape": (2, 9, 9, 10_000)},
+        {"template_spacing_mm": 1e9},
+        {"channels": (8, 8)},
+        {"channels": (8, 8, 10**6)},
+        {"width": 30, "n_heads": 4},
+        {"width": 10**6},
+        {"n_heads": 0},
+        {"n_blocks": 1000},
+        {"n_refinements": 0},
+    ],
 )
 def test_wrong_arguments(changes):
-    with pytest.raises(ValueError, match="got "):
-        PoseNetwork(**{**SMALL, **changes})
+    with pytest.raises(ValueError, match="no pose network has these arguments"):
+        replace(SMALL, **changes)
 
 
 def test_the_default_is_small():
-    network = PoseNetwork((6, 39, 45, 43))
+    network = PoseNetwork(PoseNetworkConfig(template_shape=(6, 39, 45, 43)))
     assert sum(p.numel() for p in network.parameters()) <= 2_000_000

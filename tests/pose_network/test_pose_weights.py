@@ -1,34 +1,29 @@
 """The pose network that ships with g3r, on simulated subjects of weeks that it has never seen."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
 
-import g3r.prior
 from g3r.acquisition.images import load_mask, load_volume
 from g3r.acquisition.slicing import slices_from_stacks
+from g3r.checkpoints.weights_file import SHIPPED_POSE
 from g3r.evaluation.case import load_case
 from g3r.geometry import RigidPose
-from g3r.pose_network.checkpoint import load_pose_network
-from g3r.pose_network.inference import pose_errors, predict_poses, stack_motions
-
-WEIGHTS = Path(g3r.__file__).parent / "checkpoints" / "weights" / "pose.pt"
+from g3r.pose_network.inference import pose_errors, stack_motions
+from g3r.pose_network.model import PoseModel
 
 
 @pytest.fixture(scope="module")
 def shipped():
-    return load_pose_network(WEIGHTS)
+    return PoseModel.load()
 
 
 def test_the_file_is_small_and_says_what_it_is(shipped):
-    _, meta = shipped
-    assert WEIGHTS.stat().st_size <= 6_000_000
-    assert "sta30" in meta.training_data  # among what was left out
-    assert meta.template.weeks.tolist() == [22, 25, 28, 31, 34, 37]
-    assert {"val/slice_mm", "val/stack_deg", "val/stacks_within_20deg"} <= set(meta.validation)
-    np.testing.assert_allclose(meta.template.volume, meta.template.volume[:, ::-1], atol=2e-3)
+    assert SHIPPED_POSE.stat().st_size <= 6_000_000
+    assert "sta30" in shipped.training_data  # among what was left out
+    assert shipped.template.weeks.tolist() == [22, 25, 28, 31, 34, 37]
+    assert {"val/slice_mm", "val/stack_deg", "val/stacks_within_20deg"} <= set(shipped.validation)
+    np.testing.assert_allclose(shipped.template.volume, shipped.template.volume[:, ::-1], atol=2e-3)
 
 
 @pytest.mark.parametrize("name", ["sta30-none", "sta30-moderate", "sta34-single"])
@@ -37,7 +32,6 @@ def test_stacks_stand_as_they_should(shipped, shared_data, name):
     folder = shared_data / "cases" / name
     if not folder.is_dir():
         pytest.skip(f"{name} is not among the test data")
-    network, meta = shipped
     case = load_case(folder)
     slices = slices_from_stacks(list(case.stacks))
     reference = load_volume(folder / "truth.nii.gz")
@@ -48,7 +42,7 @@ def test_stacks_stand_as_they_should(shipped, shared_data, name):
     atlas_from_world = RigidPose(np.eye(3)[None], -head_mm[None])
     true = atlas_from_world @ motion @ slices.header_pose
 
-    predicted = predict_poses(network, meta, slices)
+    predicted = shipped.predict(slices)
     fitted = stack_motions(predicted, slices.header_pose, slices.stack_id)
     ideal = stack_motions(true, slices.header_pose, slices.stack_id)
     _, angle_deg = pose_errors(fitted, ideal)

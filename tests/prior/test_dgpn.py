@@ -1,14 +1,17 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.network import ResidualRefiner
+from tests.prior.receptive_field import receptive_radius_voxels
 
-SMALL = {"channels": (8, 8, 8), "units": (1, 1, 1), "tail_channels": 4}
+SMALL = PriorNetworkConfig(channels=(8, 8, 8), units=(1, 1, 1), tail_channels=4, use_sharp=False)
 
 
 @pytest.fixture
@@ -28,8 +31,6 @@ def awaken(network):
 class Stub(nn.Module):
     """An F with known values: V + 10 M."""
 
-    use_sharp = False
-
     def forward(self, v_coarse, m_rho, v_sharp=None):
         return v_coarse + 10 * m_rho
 
@@ -37,7 +38,7 @@ class Stub(nn.Module):
 @pytest.mark.parametrize(("alpha", "beta"), [(0.05, 1.0), (0.0, 0.5), (1.0, 1.0)])
 def test_equation_7_with_a_known_residual(volumes, alpha, beta):
     v_coarse, m_rho = (volume.double() for volume in volumes)
-    network = DensityGatedPriorNetwork(**SMALL, alpha=alpha, beta=beta)
+    network = DensityGatedPriorNetwork(replace(SMALL, alpha=alpha, beta=beta))
     network.refiner = Stub()
     c = 1 - torch.exp(-m_rho)
     expected = v_coarse + (alpha * c + beta * (1 - c)) * (v_coarse + 10 * m_rho)
@@ -46,26 +47,26 @@ def test_equation_7_with_a_known_residual(volumes, alpha, beta):
 
 def test_gate_can_be_left_out(volumes):
     v_coarse, m_rho = volumes
-    network = DensityGatedPriorNetwork(**SMALL, use_gate=False)
+    network = DensityGatedPriorNetwork(replace(SMALL, use_gate=False))
     network.refiner = Stub()
     torch.testing.assert_close(network(v_coarse, m_rho), 2 * v_coarse + 10 * m_rho)
 
 
 def test_training_starts_from_the_coarse_volume(volumes):
-    assert torch.equal(DensityGatedPriorNetwork(**SMALL)(*volumes), volumes[0])
+    assert torch.equal(DensityGatedPriorNetwork(SMALL)(*volumes), volumes[0])
 
 
 @pytest.mark.parametrize("use_density", [True, False])
 def test_residual_depends_on_density_only_if_it_may(volumes, use_density):
     v_coarse, m_rho = volumes
-    refiner = awaken(DensityGatedPriorNetwork(**SMALL, use_density=use_density)).refiner
+    refiner = awaken(DensityGatedPriorNetwork(replace(SMALL, use_density=use_density))).refiner
     same = torch.equal(refiner(v_coarse, m_rho), refiner(v_coarse, 0 * m_rho))
     assert same is not use_density
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 9, 13), (8, 8, 8), (3, 33, 17), (24, 1, 25)])
 def test_any_shape_works(shape):
-    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    network = awaken(DensityGatedPriorNetwork(SMALL))
     v_coarse = torch.rand(1, 1, *shape)
     prior = network(v_coarse, torch.ones_like(v_coarse))
     assert prior.shape == v_coarse.shape
@@ -73,13 +74,13 @@ def test_any_shape_works(shape):
 
 
 def test_one_level_works(volumes):
-    network = awaken(DensityGatedPriorNetwork(channels=(8,), units=(1,), tail_channels=4))
+    network = awaken(DensityGatedPriorNetwork(replace(SMALL, channels=(8,), units=(1,))))
     assert not torch.equal(network(*volumes), volumes[0])
 
 
 def test_samples_of_a_batch_do_not_see_each_other(volumes):
     v_coarse, m_rho = volumes
-    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    network = awaken(DensityGatedPriorNetwork(SMALL))
     alone, together = network(v_coarse[:1], m_rho[:1]), network(v_coarse, m_rho)[:1]
     # Rounding of float32 sums of a few hundred terms of size 1; batch statistics would show at 1e-2.
     torch.testing.assert_close(alone, together, rtol=0, atol=2e-5)
@@ -89,7 +90,7 @@ def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes):
     v_coarse = volumes[0].clone().requires_grad_()
     m_rho = torch.zeros_like(v_coarse)
     m_rho[:, :, :8] = 1e6
-    network = awaken(DensityGatedPriorNetwork(**SMALL))
+    network = awaken(DensityGatedPriorNetwork(SMALL))
     network(v_coarse, m_rho).square().sum().backward()
     gradients = [v_coarse.grad, *[parameter.grad for parameter in network.parameters()]]
     assert all(bool(gradient.isfinite().all()) for gradient in gradients)
@@ -98,7 +99,7 @@ def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes):
 def test_activations_keep_their_size_at_the_start():
     """Without normalisation, the initial scale is all there is."""
     torch.manual_seed(0)
-    refiner = ResidualRefiner()
+    refiner = ResidualRefiner(PriorNetworkConfig(use_sharp=False))
     seen = []
     for units in [*refiner.encoder, *refiner.decoder]:
         units.register_forward_hook(lambda module, inputs, output: seen.append(float(output.detach().std())))
@@ -107,31 +108,46 @@ def test_activations_keep_their_size_at_the_start():
 
 
 def test_default_network_is_small_enough_to_ship():
-    n_bytes = sum(4 * parameter.numel() for parameter in DensityGatedPriorNetwork().parameters())
+    n_bytes = sum(4 * parameter.numel() for parameter in DensityGatedPriorNetwork(PriorNetworkConfig()).parameters())
     assert n_bytes < 20e6
 
 
 def test_receptive_radius_is_an_upper_bound():
-    refiner = awaken(DensityGatedPriorNetwork(**SMALL)).refiner
+    refiner = awaken(DensityGatedPriorNetwork(SMALL)).refiner
     extent, center = 160, 80
     v_coarse = torch.rand(1, 1, extent, 8, 8).requires_grad_()
     refiner(v_coarse, torch.ones_like(v_coarse))[0, 0, center].sum().backward()
     reached = v_coarse.grad.abs().sum((0, 1, 3, 4)).nonzero().flatten()
     reach = max(center - int(reached.min()), int(reached.max()) - center)
-    assert refiner.receptive_radius_voxels // 2 < reach <= refiner.receptive_radius_voxels
+    assert receptive_radius_voxels(SMALL) // 2 < reach <= receptive_radius_voxels(SMALL)
 
 
-@pytest.mark.parametrize("wrong", [{"channels": ()}, {"units": (1, 1)}, {"channels": (8, 0, 8)}, {"tail_channels": 0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"channels": ()},
+        {"units": (1, 1)},
+        {"channels": (8, 0, 8)},
+        {"channels": (8, 5000, 8)},
+        {"units": (1, 65, 1)},
+        {"tail_channels": 0},
+    ],
+)
 def test_networks_without_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="one positive entry per level"):
-        ResidualRefiner(**{**SMALL, **wrong})
+        replace(SMALL, **wrong)
+
+
+def test_a_base_that_is_not_shown_is_refused():
+    with pytest.raises(ValueError, match="sharp_base needs use_sharp"):
+        replace(SMALL, sharp_base=True)
 
 
 def test_importing_the_package_stays_light():
     code = (
-        "import sys, g3r.prior\n"
+        "import sys, g3r.prior, g3r.prior.config\n"
         "assert not {'torch', 'monai', 'lightning'} & set(sys.modules)\n"
-        "g3r.prior.DensityGatedPriorNetwork, g3r.prior.estimate_prior, g3r.prior.load_prior\n"
+        "import g3r.prior.model\n"
         "assert not {'lightning', 'pytorch_lightning', 'torchio'} & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -4,15 +4,23 @@ import torch
 from torch import nn
 
 from g3r.errors import NumericalError
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import estimate_prior
+from g3r.prior.inference import Tiling, estimate_prior
+from tests.prior.receptive_field import receptive_radius_voxels
+
+
+def small(n_levels=1, **changes):
+    """A network of 8 channels that sees V_coarse and M."""
+    levels = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
+    return DensityGatedPriorNetwork(PriorNetworkConfig(**levels, **{"use_sharp": False, **changes})).eval()
 
 
 @pytest.fixture(scope="module")
 def network():
     """The default network with a last layer that gives a residual of a tenth of the intensity scale."""
     torch.manual_seed(0)
-    network = DensityGatedPriorNetwork().eval()
+    network = DensityGatedPriorNetwork(PriorNetworkConfig(use_sharp=False)).eval()
     nn.init.normal_(network.refiner.head.weight, std=0.008)
     return network
 
@@ -39,14 +47,14 @@ def test_whole_volume_is_the_network_s_output(network, volumes, whole):
 
 
 def test_tiles_agree_with_the_whole(network, volumes, whole):
-    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=48)
+    tiled = estimate_prior(network, *volumes, tiling=Tiling(max_whole_voxels=0, tile_voxels=48))
     # The default halo, on white noise and random weights, which look further than an image and trained ones.
     assert np.abs(tiled - whole).max() < 1e-3
 
 
 def test_tiles_are_exact_beyond_the_receptive_field(network, volumes, whole):
-    halo = network.refiner.receptive_radius_voxels
-    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=40, halo_voxels=halo)
+    halo = receptive_radius_voxels(network.config)
+    tiled = estimate_prior(network, *volumes, tiling=Tiling(0, tile_voxels=40, halo_voxels=halo))
     # Rounding only: other extents make the convolution add in another order.
     assert np.abs(tiled - whole).max() < 1e-5
 
@@ -54,12 +62,12 @@ def test_tiles_are_exact_beyond_the_receptive_field(network, volumes, whole):
 def test_views_do_not_prefer_a_side(volumes):
     """The mean over all mirror images is mirrored when the head is; whether in tiles or not."""
     torch.manual_seed(0)
-    network = DensityGatedPriorNetwork((8, 8), (1, 1), 4).eval()
+    network = small(n_levels=2)
     nn.init.normal_(network.refiner.head.weight, std=0.05)
     part = [volume[:50] for volume in volumes]
     prior = estimate_prior(network, *part, n_views=8)
     assert np.abs(prior - estimate_prior(network, *part)).max() > 1e-3
-    tiled = estimate_prior(network, *part, n_views=8, max_whole_voxels=0, tile_voxels=20, halo_voxels=32)
+    tiled = estimate_prior(network, *part, n_views=8, tiling=Tiling(0, tile_voxels=20, halo_voxels=32))
     assert np.abs(tiled - prior).max() < 1e-5
     even = [volume[:48, :16, :16] for volume in volumes]  # an odd size is padded at one end only
     turned = [volume[::-1, :, ::-1] for volume in even]
@@ -70,7 +78,7 @@ def test_views_do_not_prefer_a_side(volumes):
 
 
 def test_v_sharp_is_asked_for_and_is_the_base(volumes):
-    network = DensityGatedPriorNetwork((8,), (1,), 4, use_sharp=True, sharp_base=True).eval()
+    network = small(use_sharp=True, sharp_base=True)
     v_sharp = volumes[0][::-1].copy()
     np.testing.assert_array_equal(estimate_prior(network, *volumes, v_sharp), v_sharp)
     with pytest.raises(ValueError, match="needs V_sharp"):
@@ -79,14 +87,14 @@ def test_v_sharp_is_asked_for_and_is_the_base(volumes):
 
 def test_without_a_halo_they_do_not_agree(network, volumes, whole):
     """The two tests above would notice a tile that is cut off."""
-    tiled = estimate_prior(network, *volumes, max_whole_voxels=0, tile_voxels=48, halo_voxels=0)
+    tiled = estimate_prior(network, *volumes, tiling=Tiling(0, tile_voxels=48, halo_voxels=0))
     assert np.abs(tiled - whole).max() > 1e-2
 
 
 def test_odd_tile_sizes_cover_every_voxel():
-    network = DensityGatedPriorNetwork((8,), (1,), 4)
+    network = small()
     v_coarse = np.random.default_rng(0).random((13, 7, 22), dtype=np.float32)
-    prior = estimate_prior(network, v_coarse, 0 * v_coarse, max_whole_voxels=0, tile_voxels=5, halo_voxels=3)
+    prior = estimate_prior(network, v_coarse, 0 * v_coarse, tiling=Tiling(0, tile_voxels=5, halo_voxels=3))
     np.testing.assert_array_equal(prior, v_coarse)
 
 
@@ -107,3 +115,9 @@ def test_nan_is_reported(network):
     v_coarse = np.full((8, 8, 8), np.nan, np.float32)
     with pytest.raises(NumericalError, match="NaN"):
         estimate_prior(network, v_coarse, np.ones_like(v_coarse))
+
+
+@pytest.mark.parametrize("wrong", [{"tile_voxels": 0}, {"halo_voxels": -1}])
+def test_tiles_without_meaning_are_refused(wrong):
+    with pytest.raises(ValueError, match="a tile needs voxels"):
+        Tiling(**wrong)

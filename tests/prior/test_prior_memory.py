@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.inference import _tiles
 from g3r.prior.network import SLAB_ROWS, ResidualRefiner
 
@@ -15,7 +16,8 @@ from g3r.prior.network import SLAB_ROWS, ResidualRefiner
 @pytest.fixture(scope="module")
 def refiner() -> ResidualRefiner:
     torch.manual_seed(0)
-    refiner = ResidualRefiner((8, 16), (1, 1), 4).eval()
+    config = PriorNetworkConfig(channels=(8, 16), units=(1, 1), tail_channels=4, use_sharp=False)
+    refiner = ResidualRefiner(config).eval()
     nn.init.normal_(refiner.head.weight, std=0.1)
     return refiner
 

@@ -32,7 +32,7 @@ def blocked(tmp_path: Path) -> dict[str, str]:
     Permissions do not hold back root; a file in a folder's place does.
     """
     source = tmp_path / "installed" / "g3r"
-    shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns("__pycache__", "*.pt"))
+    shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     for folder in [source, *(path for path in source.rglob("*") if path.is_dir())]:
         (folder / "__pycache__").write_text("")
     home = tmp_path / "home"

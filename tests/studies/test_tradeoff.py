@@ -35,7 +35,7 @@ def test_convergence_measures_every_way_against_the_best_of_all():
 
 def test_budgets_mark_what_is_late_or_worse_and_nothing_else():
     given = [(10, 13.0, 30.0), (20, 24.1, 29.95), (30, 30.0, 29.8)]
-    more = {"case": "one", "motion": "draft", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
+    more = {"case": "one", "registration": "draft", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
     rows = {str(b): {"budget_s": b, "seconds": s, "psnr_db": db, **more} for b, s, db in given}
     text = time_budgets.tables({"rows": rows})["time-budgets"]
     lines = [line for line in text.splitlines() if line.startswith("| one")]

@@ -1,5 +1,7 @@
 """Training of the pose network, its logs, and the way to a pose file."""
 
+from dataclasses import asdict, replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export, pretrain
 from g3r.errors import InputError
-from g3r.pose_network.checkpoint import centred_grid, load_pose_network
+from g3r.pose_network.config import PoseNetworkConfig
+from g3r.pose_network.model import PoseModel
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
@@ -20,7 +24,8 @@ from g3r.pose_network.inference import as_pose  # noqa: E402
 from g3r.pose_network.network import PoseStep  # noqa: E402
 from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss  # noqa: E402
 
-SMALL = {"channels": (4, 8, 8), "width": 32, "n_blocks": 2, "n_heads": 2, "warmup_steps": 1, "n_ages": 2}
+NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
+SMALL = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/pose.yaml"
 
 
@@ -49,14 +54,15 @@ def sample(seed, n_stacks=2, n_slices=5):
 class TinyData(lightning.LightningDataModule):
     """A few heads in memory, and a template of two ages."""
 
-    def __init__(self, n_ages=2, pixel_mm=3.0, source="/some/where/atlas"):
+    def __init__(self, n_ages=2, pixel_mm=3.0, template_mm=3.0, source="/some/where/atlas"):
         super().__init__()
         self.save_hyperparameters()
 
     def template(self):
         shape = (self.hparams["n_ages"], 9, 10, 11)
+        config = PoseNetworkConfig(template_shape=shape, template_spacing_mm=self.hparams["template_mm"])
         heads = np.random.default_rng(0).random(shape).astype(np.float32)
-        return AtlasTemplate(heads, centred_grid(shape, 3.0).affine, np.arange(25.0, 25.0 + shape[0]))
+        return AtlasTemplate(heads, config.template_grid.affine, np.arange(25.0, 25.0 + shape[0]))
 
     def train_dataloader(self):
         return DataLoader([sample(seed) for seed in range(3)], batch_size=None)
@@ -115,46 +121,53 @@ def test_resuming_goes_on(trained, tmp_path):
 
 def test_export_gives_the_same_network(trained, tmp_path, capsys):
     _, checkpoint, module = trained
-    path = tmp_path / "pose.pt"
+    path = tmp_path / "pose.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
-    network, meta = load_pose_network(path)
+    model = PoseModel.load(path)
     batch = sample(5)
     with torch.no_grad():
         torch.testing.assert_close(
-            network(batch)[-1].translation_mm, module.network.eval()(batch)[-1].translation_mm, rtol=0, atol=0.1
+            model.network(batch)[-1].translation_mm, module.network.eval()(batch)[-1].translation_mm, rtol=0, atol=0.1
         )  # float16
-    assert meta.template.weeks.tolist() == [25, 26]
-    assert "TinyData(n_ages=2, pixel_mm=3.0, source=atlas)" in meta.training_data
-    assert "/some/where" not in meta.training_data
-    assert meta.validation["val/slice_mm"] > 0
+    assert model.template.weeks.tolist() == [25, 26]
+    assert "TinyData(n_ages=2, pixel_mm=3.0, template_mm=3.0, source=atlas)" in model.training_data
+    assert "/some/where" not in model.training_data
+    assert model.validation["val/slice_mm"] > 0
     assert "val/slice_mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("alter", "expected"),
     [
-        (lambda content: content.pop("g3r_pose"), "not written by g3r-pretrain"),
-        (lambda content: content["g3r_pose"].update(weeks=[25.0]), "cannot be exported"),
+        (lambda content: content.pop("g3r_export"), "not written by this version of g3r-pretrain"),
+        (lambda content: content["g3r_export"].update(weeks=[25.0]), "cannot be exported"),
+        (lambda content: content["g3r_export"].update(kind="mask"), "cannot be exported"),
         (lambda content: content["state_dict"].popitem(), "cannot be exported"),
-        (lambda content: content.update(format="g3r-pose"), "exported pose already"),
     ],
 )
 def test_export_refuses(trained, tmp_path, capsys, alter, expected):
     content = torch.load(trained[1], weights_only=True)
     alter(content)
     torch.save(content, tmp_path / "run.ckpt")
-    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "pose.pt")]) == 3
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "pose.safetensors")]) == 3
     line = capsys.readouterr().err
     assert expected in line
     assert line.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [({"n_ages": 3}, "model.n_ages: 2"), ({"pixel_mm": 4.0}, "data.pixel_mm: 4.0")]
+    ("settings", "message"),
+    [({"template_mm": 4.0}, "not on a grid of 3 mm"), ({"pixel_mm": 4.0}, "data.pixel_mm: 4.0")],
 )
 def test_data_that_do_not_fit(tmp_path, settings, message):
     with pytest.raises(InputError, match=message):
         trainer(tmp_path).fit(PoseModule(**SMALL), TinyData(**settings))
+
+
+def test_resuming_with_another_template_is_refused(trained, tmp_path):
+    module = PoseModule(**SMALL)
+    with pytest.raises(InputError, match="resume with the same data"):
+        trainer(tmp_path, max_epochs=2).fit(module, TinyData(n_ages=3), ckpt_path=trained[1], weights_only=True)
 
 
 def exact_step(batch):
@@ -198,7 +211,7 @@ def test_starting_from_other_weights(trained, tmp_path):
         torch.testing.assert_close(one, other.cpu())
     with pytest.raises(InputError, match=r"start_from: .* cannot be used"):
         PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
-    wider = PoseModule(**{**SMALL, "width": 64}, start_from=str(trained[1]))  # what fits is taken
+    wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # what fits is taken
     torch.testing.assert_close(
         wider.network.encoder.stem.conv.weight, trained[2].network.encoder.stem.conv.weight.cpu()
     )
@@ -207,7 +220,8 @@ def test_starting_from_other_weights(trained, tmp_path):
 def test_the_configuration_fits(pytestconfig):
     config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
     assert config["model"]["class_path"] == f"{PoseModule.__module__}.{PoseModule.__qualname__}"
-    PoseModule(**config["model"]["init_args"])
+    arguments = config["model"]["init_args"]
+    PoseModule(config_from_plain(PoseNetworkConfig, asdict(NETWORK) | arguments.pop("network")), **arguments)
     from data_synth.pose_data import SliceSetDataModule
 
     SliceSetDataModule(**config["data"]["init_args"])
@@ -215,10 +229,12 @@ def test_the_configuration_fits(pytestconfig):
 
 @pytest.mark.parametrize(("config", "setting"), [("pose", "width"), ("prior", "alpha")])
 def test_one_command_trains_both(pytestconfig, capsys, config, setting):
-    """Settings are read and shown, for a config with a class and for one without."""
+    """Settings are read and shown."""
     path = pytestconfig.rootpath / "lightning_configs" / f"{config}.yaml"
     with pytest.raises(SystemExit) as done:
-        pretrain.main(["fit", "--config", str(path), f"--model.{setting}", "64", "--print_config"])
+        pretrain.main(["fit", "--config", str(path), f"--model.network.{setting}", "64", "--print_config"])
     assert done.value.code == 0
     shown = yaml.safe_load(capsys.readouterr().out)
-    assert shown["model"]["init_args"][setting] == 64
+    network = shown["model"]["init_args"]["network"]
+    assert network[setting] == 64
+    assert network["channels"] == {"pose": [24, 48, 96], "prior": [32, 64, 96]}[config]  # the rest is kept

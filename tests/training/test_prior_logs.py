@@ -18,15 +18,18 @@ accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_a
 from g3r.acquisition.images import save_volume  # noqa: E402
 from g3r.cli import export  # noqa: E402
 from g3r.errors import InputError  # noqa: E402
-from g3r.prior.checkpoint import PriorCheckpoint, load_prior, save_prior_checkpoint  # noqa: E402
+from g3r.prior.config import PriorNetworkConfig  # noqa: E402
+from g3r.prior.model import Prior  # noqa: E402
+from g3r.reconstruct import GaussianReconstructor  # noqa: E402
 from g3r.training import prior_module as training  # noqa: E402
+from g3r.training import prior_validation as validation  # noqa: E402
 
-NETWORK = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4}
+NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 TINY_TRAINING = [
     "--config",
     "lightning_configs/prior.yaml",
-    "--model.channels=[8,8]",
-    "--model.units=[1,1]",
+    "--model.network.channels=[8,8]",
+    "--model.network.units=[1,1]",
     "--data.spacing_mm=3.0",
     "--data.patch_size=16",
     "--data.patches_per_subject=4",
@@ -78,7 +81,7 @@ def log(tmp_path_factory):
         enable_model_summary=False,
         log_every_n_steps=1,
     )
-    run.fit(training.PriorModule(**NETWORK), ValidatedByStacks())
+    run.fit(training.PriorModule(NETWORK), ValidatedByStacks())
     found = accumulators.EventAccumulator(str(folder / "run" / "version_0"))
     found.Reload()
     return found
@@ -87,7 +90,7 @@ def log(tmp_path_factory):
 def test_scores_by_number_of_stacks_are_logged(log):
     tags = set(log.Tags()["scalars"])
     for stacks in ("", "_1stack", "_3stacks"):
-        expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in training.VALIDATED}
+        expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in validation.VALIDATED}
         assert expected | {f"val/psnr_gain{stacks}"} <= tags
     assert not any("2stacks" in tag for tag in tags)
     assert {"train/samples_per_second", "train/waiting_for_data", "train/l1_prior"} <= tags
@@ -107,15 +110,15 @@ def test_scores_are_means_over_volumes(log):
 
 def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
     tags = log.Tags()["images"]
-    assert sorted(tags) == [f"val/{n}: {training.PANEL_TAG}" for n in ("1stack", "3stacks")]
-    assert "confidence, gate" in training.PANEL_TAG
+    assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
+    assert "confidence, gate" in validation.PANEL_TAG
     image = log.Images(tags[0])[-1]
     assert (image.height, image.width) == (12, 7 * 12)
 
 
 def test_panel_of_a_network_without_a_gate():
     batch = volumes(1)
-    shown = training.panel(batch, batch["coarse"], None)
+    shown = validation.panel(batch, batch["coarse"], None)
     coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
     assert bool((gate == 1).all())
     assert 0 < float(confidence.max()) < 1
@@ -124,7 +127,7 @@ def test_panel_of_a_network_without_a_gate():
 
 def test_going_on_at_another_voxel_size_is_refused(tmp_path):
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
-    first = training.PriorModule(**NETWORK)
+    first = training.PriorModule(NETWORK)
     options = {
         "accelerator": "cpu",
         "max_steps": 1,
@@ -136,14 +139,14 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path):
     run = lightning.Trainer(**options)
     run.fit(first, ValidatedByStacks())
     run.save_checkpoint(tmp_path / "run.ckpt")
-    network = first.network
-    save_prior_checkpoint(tmp_path / "prior.pt", network, PriorCheckpoint(network.arguments(), first.voxel_mm, "noise"))
+    path = tmp_path / "prior.safetensors"
+    Prior(network=first.network, voxel_mm=first.voxel_mm, training_data="noise").save(path)
     data = ValidatedByStacks()
     data.spacing_mm = 1.0
-    again = training.PriorModule(**NETWORK, start_from=str(tmp_path / "prior.pt"))
+    again = training.PriorModule(NETWORK, start_from=str(path))
     with pytest.raises(InputError, match=r"start_from: was trained on voxels of 0\.8 mm, the data have 1 mm"):
         lightning.Trainer(**options).fit(again, data)
-    run, fresh = lightning.Trainer(**{**options, "max_steps": 2}), training.PriorModule(**NETWORK)
+    run, fresh = lightning.Trainer(**{**options, "max_steps": 2}), training.PriorModule(NETWORK)
     with pytest.raises(InputError, match=r"ckpt_path: was trained on voxels of 0\.8 mm, the data have 1 mm"):
         run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
 
@@ -215,7 +218,7 @@ def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
     words, _ = process.communicate(timeout=400)
     assert process.returncode == 0, words[-2000:]
     (last,) = (tmp_path / "prior" / "version_0" / "checkpoints").glob("last*.ckpt")
-    assert export.main([str(last), str(tmp_path / "prior.pt")]) == 0
-    assert load_prior(tmp_path / "prior.pt", 3.0)[1].voxel_mm == 3.0
-    with pytest.raises(InputError, match=r"expected 0\.8 mm"):
-        load_prior(tmp_path / "prior.pt", 0.8)
+    assert export.main([str(last), str(tmp_path / "prior.safetensors")]) == 0
+    assert Prior.load(tmp_path / "prior.safetensors").voxel_mm == 3.0
+    with pytest.raises(InputError, match=r"voxels of 3 mm, expected 0\.8 mm"):
+        GaussianReconstructor(tmp_path / "prior.safetensors")

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import asdict, replace
 from datetime import timedelta
 
 import numpy as np
@@ -9,19 +10,25 @@ import pytest
 import torch
 import yaml
 
+from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export
 from g3r.errors import InputError
-from g3r.prior.checkpoint import load_prior
+from g3r.evaluation.metrics import score
+from g3r.prior.config import PriorNetworkConfig
+from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.model import Prior
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
 from torch.utils.data import DataLoader  # noqa: E402
 
-from g3r.prior.checkpoint import PriorCheckpoint, save_prior_checkpoint  # noqa: E402
+from g3r.training import prior_batches as batches  # noqa: E402
 from g3r.training import prior_module as training  # noqa: E402
 from g3r.training.annealed_module import cosine_factor  # noqa: E402
+from g3r.training.prior_validation import sample_scores  # noqa: E402
 
-SMALL = {"channels": [8, 8], "units": [1, 1], "tail_channels": 4, "warmup_steps": 1}
+NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
+SMALL = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 
 
@@ -72,7 +79,7 @@ def trained(tmp_path_factory):
     """A run of two steps: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
-    module = training.PriorModule(**SMALL, alpha=0.1)
+    module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
     run = trainer(folder)
     run.fit(module, TinyData())
     run.save_checkpoint(folder / "last.ckpt")
@@ -96,7 +103,7 @@ def test_training_moves_the_weights(trained):
 
 
 def test_resuming_goes_on(trained, tmp_path):
-    module = training.PriorModule(**SMALL, alpha=0.1)
+    module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
     run = trainer(tmp_path, max_steps=3)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 3
@@ -104,27 +111,27 @@ def test_resuming_goes_on(trained, tmp_path):
 
 def test_export_gives_the_same_network(trained, tmp_path, capsys):
     _, checkpoint, module = trained
-    path = tmp_path / "prior.pt"
+    path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
-    network, meta = load_prior(path)
+    prior = Prior.load(path)
     inputs = torch.rand(3, 1, 1, 12, 16, 9)
     with torch.no_grad():
-        torch.testing.assert_close(network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
-    assert (meta.alpha, meta.voxel_mm) == (0.1, 0.8)
-    assert "TinyData(spacing_mm=0.8, source=atlas)" in meta.training_data
-    assert "/some/where" not in meta.training_data
-    assert meta.validation["val/psnr_prior"] > 0
+        torch.testing.assert_close(prior.network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
+    assert (prior.network.config.alpha, prior.voxel_mm) == (0.1, 0.8)
+    assert "TinyData(spacing_mm=0.8, source=atlas)" in prior.training_data
+    assert "/some/where" not in prior.training_data
+    assert prior.validation["val/psnr_prior"] > 0
     assert "val/psnr_prior" in capsys.readouterr().out
 
 
 def test_export_does_not_overwrite_unless_told(trained, tmp_path, capsys):
-    path = tmp_path / "prior.pt"
+    path = tmp_path / "prior.safetensors"
     path.write_text("precious")
     assert export.main([str(trained[1]), str(path)]) == 3
     assert capsys.readouterr().err.count("\n") == 1
     assert path.read_text() == "precious"
     assert export.main([str(trained[1]), str(path), "--force", "--data-description", "three heads"]) == 0
-    assert load_prior(path)[1].training_data == "three heads"
+    assert Prior.load(path).training_data == "three heads"
 
 
 def without(*keys):
@@ -138,23 +145,28 @@ def spoil(content):
 @pytest.mark.parametrize(
     ("alter", "expected"),
     [
-        (without("g3r_prior"), "not written by g3r-pretrain"),
-        (without("state_dict"), "not written by g3r-pretrain"),
-        (lambda content: content["g3r_prior"].update(voxel_mm=None), "cannot be exported"),
-        (lambda content: content["g3r_prior"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
+        (without("g3r_export"), "not written by this version of g3r-pretrain"),
+        (without("state_dict"), "not written by this version of g3r-pretrain"),
+        (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be exported"),
+        (lambda content: content["g3r_export"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
         (lambda content: content["state_dict"].popitem(), "cannot be exported"),
         (spoil, "NaN or infinity"),
-        (lambda content: content.update(format="g3r-prior"), "exported prior already"),
     ],
 )
 def test_export_refuses(trained, tmp_path, capsys, alter, expected):
     content = torch.load(trained[1], weights_only=True)
     alter(content)
     torch.save(content, tmp_path / "run.ckpt")
-    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.pt")]) == 3
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
     line = capsys.readouterr().err
     assert expected in line
     assert line.count("\n") == 1
+    assert not (tmp_path / "prior.safetensors").exists()
+
+
+def test_export_wants_the_ending_of_its_format(trained, tmp_path, capsys):
+    assert export.main([str(trained[1]), str(tmp_path / "prior.pt")]) == 3
+    assert "expected a name that ends in .safetensors" in capsys.readouterr().err
     assert not (tmp_path / "prior.pt").exists()
 
 
@@ -162,7 +174,7 @@ def test_export_refuses(trained, tmp_path, capsys, alter, expected):
 def test_export_refuses_what_is_no_checkpoint(tmp_path, capsys, content):
     if content is not None:
         (tmp_path / "run.ckpt").write_text(content)
-    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.pt")]) == 3
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -177,15 +189,15 @@ def test_a_patch_can_be_learnt():
     torch.manual_seed(0)
     module = training.PriorModule(**SMALL, learning_rate=3e-3)
     batch = {name: value[None] for name, value in sample(0, size=24).items()}
-    weight = training.loss_weight(batch["mask"], 0.1)
+    weight = batches.loss_weight(batch["mask"], 0.1)
     optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
     for _ in range(60):
         prior = module(batch["coarse"], batch["density"], batch["sharp"])
-        loss = training.weighted_l1(prior, batch["truth"], weight)
+        loss = batches.weighted_l1(prior, batch["truth"], weight)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    coarse_loss = training.weighted_l1(batch["coarse"], batch["truth"], weight)
+    coarse_loss = batches.weighted_l1(batch["coarse"], batch["truth"], weight)
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
 
 
@@ -193,30 +205,30 @@ def test_a_patch_can_be_learnt():
 def test_beginning_with_the_weights_of_another_prior(tmp_path, use_sharp):
     """Channels that the file lacks have no effect at first; on another base the residual begins at zero."""
     torch.manual_seed(0)
-    old = training.DensityGatedPriorNetwork([8, 8], [1, 1], 4, alpha=0.05, use_sharp=use_sharp)
+    old = DensityGatedPriorNetwork(replace(NETWORK, use_sharp=use_sharp))
     torch.nn.init.normal_(old.refiner.head.weight)
-    path = tmp_path / "old.pt"
-    save_prior_checkpoint(path, old, PriorCheckpoint(old.arguments(), 0.8, "noise"))
+    path = tmp_path / "old.safetensors"
+    Prior(network=old, voxel_mm=0.8, training_data="noise").save(path)
     volumes = [torch.rand(1, 1, 8, 8, 8) for _ in range(3)]
-    new = training.PriorModule(**SMALL, alpha=0.05, start_from=str(path)).network
+    new = training.PriorModule(NETWORK, start_from=str(path)).network
     torch.testing.assert_close(new(*volumes), old(*volumes))
-    moved = training.PriorModule(**SMALL, sharp_base=True, start_from=str(path)).network
+    moved = training.PriorModule(replace(NETWORK, sharp_base=True), start_from=str(path)).network
     torch.testing.assert_close(moved(*volumes), volumes[2])
     with pytest.raises(InputError, match="give it the same channels and units"):
-        training.PriorModule(**{**SMALL, "channels": [8, 16]}, start_from=str(path))
+        training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
 
 
 def test_loss_weight_is_one_in_the_mask_and_small_outside():
     mask = torch.zeros(1, 1, 5, 5, 5)
     mask[0, 0, 2, 2, 2] = 1
-    weight = training.loss_weight(mask, 0.1)
+    weight = batches.loss_weight(mask, 0.1)
     assert float(weight[0, 0, 2, 2, 2]) == 1
     assert float(weight.sum()) == pytest.approx(1 + 0.1 * 124)
 
 
 def test_weighted_l1_of_an_empty_mask_without_background_is_zero():
     ones = torch.ones(1, 1, 4, 4, 4)
-    assert float(training.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
+    assert float(batches.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
 
 
 def test_symmetries_turn_all_volumes_alike():
@@ -225,7 +237,7 @@ def test_symmetries_turn_all_volumes_alike():
     seen = set()
     for seed in range(200):
         torch.manual_seed(seed)
-        turned = training.random_cube_symmetry(batch)
+        turned = batches.random_cube_symmetry(batch)
         assert torch.equal(turned["density"], turned["truth"])
         seen.add(turned["truth"].numpy().tobytes())
     assert 40 < len(seen) <= 48
@@ -233,16 +245,27 @@ def test_symmetries_turn_all_volumes_alike():
 
 def test_symmetries_keep_the_shape():
     batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
-    assert {tuple(training.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
+    assert {tuple(batches.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
 
 
-def test_scores_leave_out_samples_without_a_brain():
-    truth = torch.rand(2, 1, 12, 12, 12)
-    mask = torch.zeros_like(truth, dtype=torch.bool)
-    mask[1, :, 2:9] = True
-    scores = training.scores_in_mask(truth + 0.1, truth, mask)
-    assert scores["psnr"] == [pytest.approx(20.0, abs=1e-3)]
-    assert len(scores["ssim"]) == 1
+def test_validation_scores_are_those_of_an_evaluation():
+    truth = sample(3, size=24)["truth"]
+    mask = torch.zeros_like(truth)
+    mask[:, 4:20, 5:21, 6:18] = 1
+    torch.manual_seed(0)
+    made = 0.8 * truth + 0.05 * torch.randn(truth.shape)
+    found = sample_scores(made, truth, mask, weight=mask)
+    expected = score(made[0].numpy(), truth[0].numpy(), mask[0].numpy() > 0)
+    assert (found["psnr"], found["ssim"]) == (expected.psnr_db, expected.ssim)
+    assert found["l1"] == pytest.approx(float((made - truth).abs()[mask > 0].mean()), rel=1e-5)
+
+
+def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan():
+    truth = sample(3)["truth"]
+    assert sample_scores(truth, truth, torch.zeros_like(truth), torch.ones_like(truth)).keys() == {"l1"}
+    found = sample_scores(torch.full_like(truth, torch.nan), truth, torch.ones_like(truth), torch.ones_like(truth))
+    assert all(np.isnan(value) for value in found.values())
+    assert found.keys() == {"l1", "psnr", "ssim"}
 
 
 def test_learning_rate_follows_the_budget_that_ends_first(tmp_path):
@@ -261,8 +284,10 @@ def test_cosine_factor():
 
 def test_the_configuration_fits_the_module(pytestconfig):
     config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
-    module = training.PriorModule(**config["model"])
-    assert module.network.arguments()["alpha"] == config["model"]["alpha"]
+    assert config["model"]["class_path"] == f"{training.PriorModule.__module__}.PriorModule"
+    arguments = config["model"]["init_args"]
+    network = config_from_plain(PriorNetworkConfig, asdict(NETWORK) | arguments.pop("network"))
+    assert training.PriorModule(network, **arguments).network.config.alpha == 0.5
 
 
 @pytest.mark.parametrize("command", ["pretrain", "export"])

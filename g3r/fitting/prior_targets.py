@@ -1,0 +1,63 @@
+"""The prior volume in both stages of the fit: what Gaussians are seeded in, and what they are held to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from g3r.acquisition.coarse_volume import confidence
+from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
+from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings, VolumeTarget, fit_prior
+from g3r.gaussians.seeding import seed_cloud
+from g3r.run.deadline import Deadline
+
+MIN_DISTILLATION = 1e-3
+"""Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
+
+
+def fit_to_prior(
+    prior: PriorVolume,
+    spacing_mm: float,
+    adaptive: AdaptiveSettings | None,
+    stage: PriorStageSettings,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None],
+    deadline: Deadline | None,
+) -> PriorCloud:
+    """Gaussians seeded in the prior volume and fitted to it (G3R Eq. 8).
+
+    Args:
+        prior: V_prior on its grid.
+        spacing_mm: finest distance of Gaussians.
+        adaptive: as many Gaussians as an error bound asks for; None takes the whole lattice of the spacing.
+        stage: how the fit runs.
+        rng: draws the planes of each step.
+        progress: called with (steps done, steps in all).
+        deadline: when the fit has to end.
+    """
+    volumes, values = prior.volumes, prior.values
+    if adaptive is not None:
+        cloud, found = fit_adaptive(
+            values, volumes.mask, volumes.grid, spacing_mm, adaptive, stage, rng, progress, deadline
+        )
+        counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
+        return PriorCloud(cloud, found.loss, counts)
+    cloud = seed_cloud(values, volumes.mask, volumes.grid, spacing_mm)
+    counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
+    target = VolumeTarget.of(values, volumes.mask.astype(np.float32), volumes.grid)
+    cloud, history = fit_prior(cloud, target, stage, rng, progress, deadline)
+    return PriorCloud(cloud, history, counts)
+
+
+def distillation_target(prior: PriorVolume) -> VolumeTarget:
+    """The prior volume with the weight of each voxel in the fit to the slices (the last term of G3R Eq. 9).
+
+    The prior counts where slices are sparse; where they are dense they know better. It was made of the same slices:
+    from several stacks only 1 - c of what it says there is its own.
+    """
+    volumes = prior.volumes
+    power = 1 if volumes.slices.n_stacks == 1 else 2
+    unmeasured = np.maximum((1 - confidence(volumes.density)) ** power, MIN_DISTILLATION)
+    return VolumeTarget.of(prior.values, (unmeasured * volumes.mask).astype(np.float32), volumes.grid)

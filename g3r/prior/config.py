@@ -1,0 +1,67 @@
+"""The arguments of the prior network, as its constructor, its training and its file have them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MAX_LEVELS = 16
+MAX_CHANNELS = 4096
+MAX_UNITS = 64
+"""Beyond these a network takes minutes to build."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorNetworkConfig:
+    """Arguments of `DensityGatedPriorNetwork`.
+
+    Args:
+        channels: feature channels of F at 1/2, 1/4, ... resolution; at least one level. Multiples of 16 are
+            fastest on CPUs with 512-bit vectors.
+        units: residual units (two 3x3x3 convolutions each) per level and direction; one number per level.
+        tail_channels: feature channels of F at full resolution.
+        alpha: gate at high density; the paper's value is the default.
+        beta: gate at zero density; the paper's value is the default.
+        use_gate: False sets G = 1 everywhere (an ablation).
+        use_density: False hides the density from F (an ablation); the gate still uses it.
+        use_sharp: True shows V_sharp to F, in addition to V_coarse; False is Eq. 7 as printed.
+        sharp_base: True adds the residual to V_sharp instead of V_coarse (an ablation).
+
+    Raises:
+        ValueError: no level, different numbers of levels, a count out of range, or `sharp_base` without `use_sharp`.
+    """
+
+    channels: tuple[int, ...] = (32, 64, 96)
+    units: tuple[int, ...] = (1, 2, 3)
+    tail_channels: int = 8
+    alpha: float = 0.05
+    beta: float = 1.0
+    use_gate: bool = True
+    use_density: bool = True
+    use_sharp: bool = True
+    sharp_base: bool = False
+
+    def __post_init__(self) -> None:
+        limited = [(n, MAX_CHANNELS) for n in (*self.channels, self.tail_channels)]
+        limited += [(n, MAX_UNITS) for n in self.units]
+        if not 1 <= len(self.channels) == len(self.units) <= MAX_LEVELS or not all(1 <= n <= m for n, m in limited):
+            raise ValueError(
+                f"a prior network needs one positive entry per level, at most {MAX_CHANNELS} channels and {MAX_UNITS} "
+                f"units; got {self.channels}, {self.units}, tail {self.tail_channels}"
+            )
+        if self.sharp_base and not self.use_sharp:
+            raise ValueError("sharp_base needs use_sharp")
+
+    @property
+    def n_inputs(self) -> int:
+        """Volumes that F sees: V_coarse, and as chosen the confidence and V_sharp."""
+        return 1 + self.use_density + self.use_sharp
+
+    @property
+    def stride(self) -> int:
+        """Voxels of the input per voxel of the deepest level, along each axis."""
+        return 2 ** len(self.channels)
+
+    def min_values(self) -> float:
+        """A lower bound on the number of the network's weights: its residual units and its tail."""
+        levels = zip(self.channels, self.units, strict=True)
+        return 27 * (sum(2 * n * width**2 for width, n in levels) + self.tail_channels**2)
