@@ -34,9 +34,9 @@ from g3r.prior.checkpoint import PriorCheckpoint, load_prior
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.inference import estimate_prior
 from g3r.registration import Registration, register
+from g3r.registration.atlas_search import template_fits
 from g3r.registration.prior_registration import register_to_prior
 from g3r.registration.quality import pose_warnings, stack_qualities
-from g3r.registration.template_search import template_fits
 from g3r.run.allocator import release_memory
 from g3r.run.deadline import Deadline
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng

@@ -191,6 +191,10 @@ class Slices:
         """The same slices at other poses (world from plane)."""
         return replace(self, planes=self.planes.with_pose(pose))
 
+    def with_motion(self, motion: RigidPose) -> Slices:
+        """The same slices at motions [K] relative to their header poses (world from header)."""
+        return self.with_pose(motion @ self.header_pose)
+
     def scaled(self, factor: float) -> Slices:
         """The same slices with their values multiplied by a factor."""
         return replace(self, value=(self.value * np.float32(factor)).astype(np.float32))

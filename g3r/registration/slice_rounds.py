@@ -1,4 +1,4 @@
-"""Volume and slices in turns: every slice a rigid body of its own, coarse to fine."""
+"""Volume and slice poses in alternation: every slice its own rigid body, coarse to fine."""
 
 from __future__ import annotations
 
@@ -24,14 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SliceRounds:
-    """How long slices are registered.
-
-    Args:
-        n_rounds: alternations of volume and slices.
-        steps_per_round: Gauss-Newton steps of the slices in a round.
-        finest_voxel_mm: voxel of the last rounds.
-        max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
-    """
+    """How long slices are registered; the fields are those of `RegistrationSettings`."""
 
     n_rounds: int
     steps_per_round: int
@@ -40,12 +33,12 @@ class SliceRounds:
 
 
 MIN_ROUNDS = 3
-"""One round for each voxel size, however little time there is."""
+"""One round for each voxel size, whatever the deadline."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FittedSlices:
-    """Slices at their last poses with gain, weight and correlation [K], and a line of figures a round."""
+    """Slices at their last poses with gain, weight and correlation [K], and figures of each round."""
 
     slices: Slices
     gain: NDArray[np.float64]
@@ -60,12 +53,12 @@ def refine_slices(
     progress: Callable[[int, int], None] = lambda done, total: None,
     deadline: Deadline | None = None,
 ) -> FittedSlices:
-    """Register every slice to the volume of all, which is made anew in each round.
+    """Register every slice to the volume of all, which each round makes anew.
 
     Args:
         slices: at poses right to a few millimetres.
         rounds: how long.
-        progress: called with (rounds done, rounds in all).
+        progress: called with the rounds done and their total.
         deadline: fewer rounds if they would end after it.
     """
     gain = np.ones(len(slices))
@@ -75,7 +68,7 @@ def refine_slices(
     history: list[dict[str, float]] = []
     for number, done in timed_steps(rounds.n_rounds, deadline, least=MIN_ROUNDS):
         progress(number, rounds.n_rounds)
-        # the last round has 1; rounded, so that the steps below do not hang on the last digit
+        # 1 in the last round; rounded, so that the steps below do not depend on the last digit
         fraction = round(min(1.0, done * rounds.n_rounds / max(1, rounds.n_rounds - 1)), 9)
         # coarse to fine: the capture range is about a voxel of the volume's blur
         voxel = rounds.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
@@ -105,7 +98,7 @@ def refine_slices(
         logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
     progress(rounds.n_rounds, rounds.n_rounds)
     ncc = correlation_with_all(slices, gain, weight, rounds.finest_voxel_mm)
-    return FittedSlices(slices, gain, weight, ncc, history)
+    return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
 
 
 def _volume_of(
@@ -133,7 +126,14 @@ def _volume_of(
 def correlation_with_all(
     slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
 ) -> NDArray[np.float64]:
-    """Correlation of each slice [K] with a volume made of all of them."""
+    """Correlation of each slice [K] with a volume made of all of them.
+
+    Args:
+        slices: at their present poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        voxel_mm: of the volume.
+    """
     grid = grid_around(slices, voxel_mm)
     volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
     return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc

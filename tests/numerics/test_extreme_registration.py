@@ -11,7 +11,7 @@ import pytest
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.geometry import RigidPose
-from g3r.registration.normal_equations import correlation
+from g3r.registration.similarity import correlation
 from g3r.registration.slice_rounds import SliceRounds, refine_slices
 from studies.numerics.fits import slices_of_small_head
 

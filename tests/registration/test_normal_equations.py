@@ -9,7 +9,8 @@ from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import rotation_matrix
-from g3r.registration.normal_equations import SliceModel, correlation
+from g3r.registration.normal_equations import SliceModel
+from g3r.registration.similarity import correlation
 
 AFFINE = np.eye(4)
 AFFINE[:3, :3] = Rotation.from_rotvec([0.4, -0.2, 0.3]).as_matrix() * [1.0, -1.1, 0.9]
@@ -122,17 +123,6 @@ def test_stride_takes_every_nth_pixel_and_residuals_match():
     expected = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
     np.testing.assert_allclose(model.residuals(slices.planes, gain), expected[::3], atol=1e-5)
     assert model.evaluate(slices.planes, gain, 1.0).moments[:, 0].sum() == len(expected[::3])
-
-
-def test_pixel_weights_count():
-    slices, gain = make_slices(4)
-    weight = np.where(slices.pixel_plane == 1, 0.0, 2.0).astype(np.float32)
-    plain = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
-    weighted = SliceModel(slices, smooth_volume(), GRID, weight=weight).evaluate(slices.planes, gain, 0.1)
-    assert (weighted.hessian[1] == 0).all()
-    assert weighted.loss[1] == 0
-    np.testing.assert_allclose(weighted.hessian[0], 2 * plain.hessian[0], rtol=1e-6)
-    np.testing.assert_allclose(weighted.loss[0], plain.loss[0], rtol=1e-6)
 
 
 def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero():
