@@ -88,14 +88,14 @@ def draw_slice_set(
         image = _random_intensities(image, inside, true, pixel_mm, rng)
     bright = np.percentile(image[inside > 0.5], 99) if (inside > 0.5).any() else 1.0
     images = SliceImages(
-        (image / max(bright, 1e-6)).astype(np.float32),
-        inside.sum((1, 2)) * pixel_mm**2,
-        -translation_mm[:, 2],
-        thickness_mm,
-        time_rank,
-        stack_id.astype(np.int64),
-        header.rotation,
-        frame,
+        image=(image / max(bright, 1e-6)).astype(np.float32),
+        area_mm2=inside.sum((1, 2)) * pixel_mm**2,
+        position_mm=-translation_mm[:, 2],
+        thickness_mm=thickness_mm,
+        time_rank=time_rank,
+        stack_id=stack_id.astype(np.int64),
+        header_rotation=header.rotation,
+        frame_in_slice=frame,
     )
     return SliceSet(images, true)
 

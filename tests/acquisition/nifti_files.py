@@ -41,7 +41,8 @@ def write(path: Path, data: np.ndarray, affine: np.ndarray) -> Path:
 
 
 def stacks_of_two() -> list[Stack]:
+    (image, mask), (other, other_mask) = arrays(0), arrays(1, (9, 16, 5))
     return [
-        Stack(*arrays(0), affine_of(AXES["RAS"]), 3.0, "first"),
-        Stack(*arrays(1, (9, 16, 5)), affine_of(AXES["oblique"]), 2.0, "second"),
+        Stack(image=image, mask=mask, affine=affine_of(AXES["RAS"]), thickness_mm=3.0, name="first"),
+        Stack(image=other, mask=other_mask, affine=affine_of(AXES["oblique"]), thickness_mm=2.0, name="second"),
     ]

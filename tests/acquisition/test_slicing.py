@@ -85,7 +85,7 @@ def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through:
 def test_values_outside_the_mask_may_be_nan(tmp_path: Path):
     image, mask = arrays()
     image[~mask] = np.nan
-    stack = Stack(image, mask, affine_of(AXES["RAS"]), 3.0)
+    stack = Stack(image=image, mask=mask, affine=affine_of(AXES["RAS"]), thickness_mm=3.0)
     assert np.isfinite(stack.image).all()
     assert np.isfinite(slices_from_stacks([stack]).value).all()
 
@@ -94,11 +94,11 @@ def test_slices_with_hardly_a_pixel_are_left_out():
     image, mask = arrays()
     mask[:, :, 2] = False
     mask[5:8, 5:8, 2] = True
-    slices = slices_from_stacks([Stack(image, mask, affine_of(AXES["RAS"]), 3.0)])
+    slices = slices_from_stacks([Stack(image=image, mask=mask, affine=affine_of(AXES["RAS"]), thickness_mm=3.0)])
     assert 2 not in slices.slice_index
     mask[:] = False
     mask[5:8, 5:8] = True
-    lonely = Stack(image, mask, affine_of(AXES["RAS"]), 3.0, "lonely")
+    lonely = Stack(image=image, mask=mask, affine=affine_of(AXES["RAS"]), thickness_mm=3.0, name="lonely")
     with pytest.raises(InputError, match=r"lonely.*12 masked pixels"):
         slices_from_stacks([lonely])
 

@@ -30,11 +30,11 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
     rng = np.random.default_rng(seed)
     spacing = np.full((n, 2), 1.3)
     planes = Planes(
-        Rotation.random(n, rng=rng).as_matrix(),
-        GRID.center_mm + rng.normal(0, 1.5, (n, 3)),
-        spacing,
-        np.full((n, 2), 9),
-        psf_variance_mm2(spacing, np.full(n, 3.0)),
+        rotation=Rotation.random(n, rng=rng).as_matrix(),
+        center_mm=GRID.center_mm + rng.normal(0, 1.5, (n, 3)),
+        spacing_mm=spacing,
+        shape=np.full((n, 2), 9),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(n, 3.0)),
     )
     volume = smooth_volume()
     gain = rng.uniform(0.7, 1.4, n)
@@ -42,7 +42,15 @@ def make_slices(seed: int = 0, n: int = 4) -> tuple[Slices, np.ndarray]:
     value = value + rng.normal(0, 0.05, planes.n_pixels)
     mask = rng.random(planes.n_pixels) < 0.8
     stack = np.zeros(n, np.int64)
-    slices = Slices(planes, value.astype(np.float32), mask, stack, np.arange(n), np.full(n, 3.0), planes.pose)
+    slices = Slices(
+        planes=planes,
+        value=value.astype(np.float32),
+        mask=mask,
+        stack_id=stack,
+        slice_index=np.arange(n),
+        thickness_mm=np.full(n, 3.0),
+        header_pose=planes.pose,
+    )
     # not at the optimum, where the gradient would vanish
     start = RigidPose(
         planes.rotation @ rotation_matrix(rng.normal(0, 0.05, (n, 3))), planes.center_mm + rng.normal(0, 0.5, (n, 3))

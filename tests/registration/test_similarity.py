@@ -20,15 +20,23 @@ def few_slices(n: int = 7) -> Slices:
     rng = np.random.default_rng(5)
     shape = rng.integers(3, 40, (n, 2))
     planes = Planes(
-        Rotation.random(n, rng=rng).as_matrix(),
-        rng.normal(0, 8, (n, 3)) + CENTER_MM,
-        rng.uniform(0.7, 1.5, (n, 2)),
-        shape,
-        np.zeros((n, 3)),
+        rotation=Rotation.random(n, rng=rng).as_matrix(),
+        center_mm=rng.normal(0, 8, (n, 3)) + CENTER_MM,
+        spacing_mm=rng.uniform(0.7, 1.5, (n, 2)),
+        shape=shape,
+        psf_var_mm2=np.zeros((n, 3)),
     )
     value = rng.random(planes.n_pixels).astype(np.float32)
     mask = rng.random(planes.n_pixels) < 0.7
-    return Slices(planes, value, mask, np.arange(n) % 2, np.arange(n), np.full(n, 3.0), planes.pose)
+    return Slices(
+        planes=planes,
+        value=value,
+        mask=mask,
+        stack_id=np.arange(n) % 2,
+        slice_index=np.arange(n),
+        thickness_mm=np.full(n, 3.0),
+        header_pose=planes.pose,
+    )
 
 
 def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
@@ -54,11 +62,24 @@ def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
 
 def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too():
     planes = Planes(
-        np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones((2, 2)), [[1, 50], [20, 20]], np.zeros((2, 3))
+        rotation=np.tile(np.eye(3), (2, 1, 1)),
+        center_mm=np.zeros((2, 3)),
+        spacing_mm=np.ones((2, 2)),
+        shape=[[1, 50], [20, 20]],
+        psf_var_mm2=np.zeros((2, 3)),
     )
     mask = np.zeros(450, bool)
     pixels = SearchPixels.of(
-        Slices(planes, np.ones(450, np.float32), mask, np.zeros(2, int), np.arange(2), np.ones(2), planes.pose), 16
+        Slices(
+            planes=planes,
+            value=np.ones(450, np.float32),
+            mask=mask,
+            stack_id=np.zeros(2, int),
+            slice_index=np.arange(2),
+            thickness_mm=np.ones(2),
+            header_pose=planes.pose,
+        ),
+        16,
     )
     assert (np.diff(pixels.start) >= 10).all()
     assert (pixels.value == 0).all()

@@ -187,7 +187,7 @@ def head(rng):
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)
     mask = np.linalg.norm((index - (np.array(shape) - 1) / 2) / (15, 17, 13), axis=-1) < 1
     grid = VolumeGrid.isotropic([0, 0, 0], 1.5 * (np.array(shape) - 1), 1.5)
-    case = SimulatedCase("head", Path(), (), PoseTable((), RigidPose.identity(0)), {})
+    case = SimulatedCase(name="head", folder=Path(), stacks=(), true=PoseTable((), RigidPose.identity(0)), points_mm={})
     case.__dict__.update(truth=Volume(truth, grid.affine, "truth"), truth_mask=mask)  # cached properties
     return case
 
