@@ -21,7 +21,7 @@ from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
-from g3r.registration.slice_rounds import FittedSlices, SliceRounds, correlation_with_all, refine_slices
+from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, refine_slices
 from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
 from g3r.run.deadline import Deadline
 
@@ -99,12 +99,7 @@ def register(
         search_deadline = deadline.part(SEARCH_SHARE) if deadline else None
         found = GlobalSearch(slices, samples, settings, template).run(proposals or {}, search_deadline)
     n_segments, interleave = _segments_of(samples, found.motion)
-    rounds = SliceRounds(
-        n_rounds=0 if single else settings.n_rounds,
-        steps_per_round=settings.steps_per_round,
-        finest_voxel_mm=settings.finest_voxel_mm,
-        max_pixels=settings.max_pixels,
-    )
+    rounds = replace(settings, n_rounds=0) if single else settings
     rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
     fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline)
     held_out = None
