@@ -32,17 +32,17 @@ PIXELS_OF_VOLUME = 100_000
 """At most about this many pixels make a volume of the search."""
 
 
-def volume_without(slices: Slices, stack: int | None, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
+def volume_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume from all slices except those of one stack, zero outside the masks; and its grid.
 
     A slice would register to its own blur if it had helped to make the volume.
 
     Args:
         slices: all slices at their present poses.
-        stack: the one to hold out; None takes all.
+        stack: the one to hold out.
         spacing_mm: voxel size.
     """
-    others = slices if stack is None else slices.take(slices.stack_id != stack)
+    others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // PIXELS_OF_VOLUME))
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 3))

@@ -71,7 +71,7 @@ def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose])
     again, again_grid = volume_without(replace(slices, value=brighter), 1, 3.2)
     np.testing.assert_array_equal(volume, again)
     np.testing.assert_array_equal(grid.affine, again_grid.affine)
-    everything, _ = volume_without(replace(slices, value=brighter), None, 3.2)
+    everything, _ = volume_without(replace(slices, value=brighter), -1, 3.2)
     assert everything.max() > 1.3 * volume.max()
 
 
