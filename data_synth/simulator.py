@@ -204,11 +204,11 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
     middle = np.tile((shape - 1) / 2, (n_slices, 1))
     middle[:, 2] = np.arange(n_slices)
     nominal = Planes(
-        np.tile(frame, (n_slices, 1, 1)),
-        middle @ affine[:3, :3].T + affine[:3, 3],
-        np.tile(spacing[:2], (n_slices, 1)),
-        np.tile(shape[:2], (n_slices, 1)),
-        np.zeros((n_slices, 3)),  # the profile is the simulator's own
+        rotation=np.tile(frame, (n_slices, 1, 1)),
+        center_mm=middle @ affine[:3, :3].T + affine[:3, 3],
+        spacing_mm=np.tile(spacing[:2], (n_slices, 1)),
+        shape=np.tile(shape[:2], (n_slices, 1)),
+        psf_var_mm2=np.zeros((n_slices, 3)),  # the profile is the simulator's own
     )
     planes = nominal.moved(true_pose)
     seen = np.flatnonzero(VoxelOperator(planes, head.mask_grid, None, (1, 1, 1)).forward(head.reach) > 0.01)
@@ -232,7 +232,9 @@ def _simulate_stack(head: _Head, settings: StackSettings, rng: np.random.Generat
     if not mask3d.any():
         raise InputError(f"simulation: {name} sees nothing of the head; use less motion or another seed")
     pixels = np.ascontiguousarray(image.transpose(in_file), dtype=np.float32)
-    stack = Stack(pixels, np.ascontiguousarray(mask3d), affine, settings.thickness_mm, name)
+    stack = Stack(
+        image=pixels, mask=np.ascontiguousarray(mask3d), affine=affine, thickness_mm=settings.thickness_mm, name=name
+    )
     return SimulatedStack(stack, true_pose, gain, dropout)
 
 

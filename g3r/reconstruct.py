@@ -32,8 +32,8 @@ from g3r.prior.inference import Tiling
 from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
+from g3r.registration.atlas_search import template_fits
 from g3r.registration.prior_registration import register_to_prior
-from g3r.registration.template_search import template_fits
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline

@@ -1,4 +1,4 @@
-"""Mean heads in standard orientation, to which slices of an unknown head can be compared."""
+"""Atlas templates: mean heads in standard orientation, with which slices of an unknown head are compared."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class AtlasTemplate:
     The atlas frame is RAS in mm with the head's centre at the origin and the mid-sagittal plane at x = 0.
 
     Args:
-        volume: [A, I, J, K] float32 intensities; the 99.5th percentile in each head is 1, outside it is 0.
+        volume: [A, I, J, K] float32; the 99.5th percentile in each head is 1, the background 0.
         affine: [4, 4] RAS+ mm from index.
         weeks: [A] gestational ages.
 

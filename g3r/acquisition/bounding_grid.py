@@ -1,4 +1,4 @@
-"""The grid that registration works on."""
+"""The voxel grid around posed slices."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from g3r.geometry import VolumeGrid
 
 def grid_around(slices: Slices, spacing_mm: float, margin_mm: float = 6.0) -> VolumeGrid:
     """The axis-aligned grid that covers every masked pixel and a margin.
+
+    Args:
+        slices: at their present poses.
+        spacing_mm: edge of the voxels.
+        margin_mm: added on every side.
 
     Raises:
         ValueError: no pixel is masked.

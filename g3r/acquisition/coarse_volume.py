@@ -19,7 +19,7 @@ INTENSITY_CONVENTION = "p99-coarse-v1"
 """The 99th percentile of V_coarse, over voxels with M above 0.1, is one; see `normalisation_scale`."""
 
 SUPPORT_DENSITY = 1e-3
-"""Below this density nothing was measured: V_coarse is zero there."""
+"""V_coarse is zero below this density, where nothing was measured."""
 
 
 def coarse_and_density(
@@ -28,18 +28,18 @@ def coarse_and_density(
     gain: NDArray[np.floating] | None = None,
     weight: NDArray[np.floating] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """V_coarse and M_rho: pixels spread through their PSF onto a grid.
+    """V_coarse and M_rho: pixels accumulated through their PSF on a grid (G3R Eq. 6).
 
-    A pixel stands for the volume that it covers, its area times the slice *thickness*. M is the sum of these
-    volumes, spread by the unit-integral PSF, over the volume of a voxel: dimensionless, 1 where one gapless
-    stack covers once, whatever the pixel size and the grid. (Eq. 6 as printed has the unit 1/mm. With the
-    slice spacing in place of the thickness a gap would add density; for gapless stacks both agree.)
+    A pixel counts with the volume that it covers, its area times the slice *thickness*. M is the sum of these
+    volumes, spread by the unit-integral PSF, divided by the volume of a voxel: dimensionless, 1 where one
+    gapless stack covers once, whatever the pixel size and the grid. (Eq. 6 as printed has the unit 1/mm. With
+    the slice spacing instead of the thickness a gap would add density; for gapless stacks both agree.)
 
     Args:
         slices: K slices.
         grid: where to accumulate.
         gain: [K] intensity factor of each slice, divided out.
-        weight: [P'] trust in each masked pixel, from 0 to 1; lowers both density and influence.
+        weight: [P'] of each masked pixel, from 0 to 1; scales its density and its influence.
 
     Returns:
         V_coarse (zero where M < 1e-3) and M_rho, both [I, J, K] float32.

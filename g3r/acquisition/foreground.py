@@ -1,4 +1,4 @@
-"""Which voxels the slices' masks call brain, once the slices are in place."""
+"""The brain mask of the volume, from the masks of registered slices."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 INSIDE_SHARE = 1 / 3
-"""Share of the slices over a voxel that must call it brain: one of three stacks. At one half, where the edge
-of a mask lies, the volume is right to 1 %, but the outermost voxels are lost here and there, and with them 1
-to 4 dB; this is generous by about a quarter of the distance of slices (docs/method.md, "Mask")."""
+"""Share of the slices over a voxel whose masks must contain it: one of three stacks. At one half, the edge of a
+mask, the volume of the brain is right to 1 %, but some outermost voxels are lost, and with them 1 to 4 dB; one
+third is generous by about a quarter of the slice spacing (docs/method.md, "Mask")."""
 
 MIN_DENSITY = 0.1
-"""Coverage (1 is one gapless stack) below which nobody is asked: what no slice has seen is not brain."""
+"""Coverage (1 is one gapless stack) below which a voxel is not brain, because no slice has seen it."""
 
 RIM_MM = 6.0
-"""How far beyond its mask's bounding box a slice says that there is no brain."""
+"""How far around the bounding box of its mask a slice counts as background."""
 
 
 def foreground_mask(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
-    """Brain mask [I, J, K]: where most of the slices that cover a voxel have it in their masks.
+    """Brain mask [I, J, K]: voxels that enough of the slices covering them have in their masks.
 
-    Masked and unmasked pixels are spread through their PSF; what lies beyond the first and the last slice of
-    a stack counts as unmasked. Both are smoothed over half the distance of slices (so that gaps close). The
-    largest piece is taken, without holes.
+    Masked and unmasked pixels are spread through their PSF; the space beyond the first and the last slice of a
+    stack counts as unmasked. Both are smoothed over half the slice spacing, which closes gaps. The largest
+    connected component is taken, and its holes are filled.
 
     Args:
         slices: K slices in place.
         grid: of the mask.
-        weight: [K] trust in each slice; one that lies wrongly should have no vote.
+        weight: [K] slice weights, so that misplaced slices have no vote.
 
     Raises:
         InputError: no voxel is covered.
@@ -58,7 +58,7 @@ def foreground_mask(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floatin
 
 
 def _with_surroundings(slices: Slices) -> tuple[Planes, NDArray[np.bool_], NDArray[np.int64]]:
-    """The slices' planes with a rim, and planes without brain beyond the ends of each stack.
+    """The planes with a margin of background, and planes of background beyond the ends of each stack.
 
     Returns:
         L planes, their masks [P], and which slice each was made from [L].
@@ -70,11 +70,11 @@ def _with_surroundings(slices: Slices) -> tuple[Planes, NDArray[np.bool_], NDArr
     center = planes.center_mm[source]
     center[len(slices) :] += steps
     wide = Planes(
-        planes.rotation[source],
-        center,
-        planes.spacing_mm[source],
-        (planes.shape + 2 * rim)[source],
-        planes.psf_var_mm2[source],
+        rotation=planes.rotation[source],
+        center_mm=center,
+        spacing_mm=planes.spacing_mm[source],
+        shape=(planes.shape + 2 * rim)[source],
+        psf_var_mm2=planes.psf_var_mm2[source],
     )
     mask = np.zeros(wide.n_pixels, bool)
     for k in range(len(slices)):
@@ -85,7 +85,7 @@ def _with_surroundings(slices: Slices) -> tuple[Planes, NDArray[np.bool_], NDArr
 
 
 def _ends(slices: Slices) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The first and last slice of each stack, and the step (mm) from each to where the next one would lie."""
+    """The first and last slice of each stack, and the step (mm) from each to the next one outside the stack."""
     ends, steps = [], []
     for stack in np.unique(slices.stack_id):
         rows = np.flatnonzero(slices.stack_id == stack)

@@ -13,12 +13,12 @@ import nibabel as nib
 from g3r.acquisition.nifti import open_nifti
 
 TEXT_FIELDS = ("descrip", "aux_file", "intent_name", "db_name", "data_type")
-"""Of a header; NIfTI-2 has the first three."""
+"""Text fields of a NIfTI-1 header; NIfTI-2 has the first three."""
 
 
 @dataclass(frozen=True)
 class HeaderText:
-    """What a header says in words.
+    """The free text of a header.
 
     Args:
         fields: `TEXT_FIELDS` that are not empty.
@@ -60,7 +60,7 @@ def read_header_text(path: str | os.PathLike[str]) -> HeaderText:
 
 
 def _code_and_bytes(extension: Any) -> tuple[int, bytes]:
-    """An extension as it stands in the file; what nibabel makes of its content depends on the version."""
+    """An extension as in the file; nibabel's interpretation of its content depends on the version."""
     written = BytesIO()
     extension.write_to(written, False)
     return int(extension.get_code()), written.getvalue()[8:].rstrip(b"\0")

@@ -1,4 +1,4 @@
-"""Reading and writing NIfTI volumes, with every check a file from a scanner calls for."""
+"""Reading and writing of NIfTI volumes and masks, checked."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 """Masks are drawn on copies whose headers lost digits: corners may differ by this much."""
 
 MAX_LABELS = 256
-"""A mask with more different values above 1 than this is taken for an image."""
+"""A mask with more distinct values above 1 than this is an image."""
 
 
 @dataclass(frozen=True)
 class Volume:
     """A 3D image: data float32 [I, J, K], affine [4, 4] (RAS+ mm from index), and its file's name.
 
-    `remarks` are lines about its header that somebody who relies on its orientation should read.
+    `remarks` are lines about its header that matter to users who rely on its orientation.
     """
 
     data: NDArray[np.float32]
@@ -43,7 +43,7 @@ class Volume:
 def load_volume(path: str | os.PathLike[str]) -> Volume:
     """Read a 3D NIfTI image (or a 4D one with a single frame), scaled as its header says.
 
-    Values that are not finite are kept; who uses them decides. The axes are not reordered.
+    Values that are not finite are kept. The axes are not reordered.
 
     Raises:
         InputError: missing or unreadable file, not a NIfTI, more than one frame, complex or colour data,
@@ -85,7 +85,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
 
 
 def _check_mask_values(mask: Volume) -> None:
-    """Refuse what is no mask: neither 0 and one value, nor a probability, nor labels."""
+    """Raise `InputError` for an image: neither 0 and one value, nor a probability, nor labels."""
     above = mask.data[mask.data > 1]
     if not above.size or above.max() < 2 or (above == above[0]).all():  # a spline overshoots 1
         return
@@ -103,7 +103,7 @@ def save_volume(
     affine: NDArray[np.float64],
     header_text: HeaderText | None = None,
 ) -> None:
-    """Write a volume as NIfTI: float32, or uint8 for masks, int16 as it is. Whole or not at all.
+    """Write a volume as NIfTI, atomically: float32, or uint8 for masks; int16 stays.
 
     Args:
         path: of the file.

@@ -1,4 +1,4 @@
-"""In which order the slices of a stack are taken."""
+"""The order in which the slices of a stack are acquired."""
 
 from __future__ import annotations
 

@@ -25,16 +25,16 @@ def sharpened_volume(
 ) -> NDArray[np.float32]:
     """V_sharp: V_coarse after a few conjugate-gradient steps towards the slices.
 
-    V_coarse (Eq. 6) shows the head blurred twice by the slice profile: as it was measured, and as it was
-    spread. A few steps of regularised least squares take back what the slices determine; the rest is left to
-    the prior network. Few steps and smoothness keep the noise down.
+    V_coarse (Eq. 6) is blurred twice by the slice profile: when it was measured and when it was accumulated.
+    A few steps of regularised least squares undo what the slices determine and leave the rest to the prior
+    network. Few steps and smoothness limit the noise.
 
     Args:
         slices: K slices.
         grid: of the volume.
         coarse: V_coarse [I, J, K], in the slices' intensities.
         gain: [K] intensity factor of each slice, divided out.
-        weight: [P'] trust in each masked pixel, from 0 to 1.
+        weight: [P'] of each masked pixel, from 0 to 1.
 
     Returns:
         V_sharp [I, J, K] float32; unlike V_coarse it may be negative, and goes a little beyond its support.
@@ -63,8 +63,8 @@ def solve_volume(
 ) -> NDArray[np.float32]:
     """Minimise sum_p weight_p (A V - value)_p^2 + s ||grad V||^2 over volumes V [I, J, K].
 
-    Conjugate gradients; few steps are a regulariser of their own. The smoothness is relative to how often a
-    voxel is seen on average, so it depends neither on the number of slices nor on the grid.
+    Conjugate gradients, of which few steps regularise by themselves. The smoothness is relative to the mean
+    coverage of a voxel, so it depends neither on the number of slices nor on the grid.
 
     Args:
         operator: voxel forward operator for the P' pixels.

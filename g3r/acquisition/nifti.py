@@ -1,4 +1,4 @@
-"""Opening NIfTI files of unknown origin: every claim of a header is checked before memory is taken for it."""
+"""Opening NIfTI files of unknown origin: a header is checked before memory is allocated for its claims."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 MAX_VOXEL_COUNT = 2**28
-"""A header that claims more voxels than this (1 GB as float32) is refused before any memory is taken."""
+"""Headers that claim more voxels than this (1 GB as float32) are refused."""
 
 MAX_VOXEL_BYTES = 8 * MAX_VOXEL_COUNT
 
 GZIP_RATIO = 1032
-"""Deflate makes of a byte at most this many, so a compressed file cannot hold more (zlib's documentation)."""
+"""Largest expansion of deflate (zlib's documentation), which bounds what a compressed file can hold."""
 
 BLOCK_BYTES, MAX_BLOCKS_BEYOND = 2**20, 64
-"""What may follow the voxels of a compressed file is read to its end, but not for ever."""
+"""What follows the voxels of a compressed file is read in such blocks, up to this many."""
 
 NIFTI_ENDINGS = (".nii", ".hdr", ".img")
-"""Of NIfTI files, alone or before .gz; .hdr and .img are the two halves of a pair."""
+"""File endings, alone or before .gz; .hdr and .img are the two files of a pair."""
 
 LENGTH_UNITS = {1: "metres", 3: "micrometres"}
 """Codes of a header's xyzt_units that are not millimetres (2) and not unknown (0)."""
 
 HEADERS_AGREE_VOXELS = 0.5
-"""Corners by sform and by qform may differ by this much before it is worth a line."""
+"""Largest difference of the corners by sform and by qform that is not reported."""
 
 NO_SIZE = "setting 0 dims to 1"
-"""What nibabel says of voxels without a size, which only an sform can then give."""
+"""nibabel's message for a pixdim of zero, where only an sform gives the voxel size."""
 
 NiftiImage = nib.Nifti1Image | nib.Nifti2Image | nib.Nifti1Pair
 
 
 def open_nifti(path: str | os.PathLike[str]) -> tuple[NiftiImage, list[str]]:
-    """A NIfTI image whose header has been read and whose voxels have not.
+    """Read the header of a NIfTI image, but not its voxels.
 
     Returns:
-        The image, and what was repaired in its header, as lines.
+        The image, and a line for each repair of its header.
 
     Raises:
         InputError: no such file, not a file, not NIfTI, or a header that cannot be read.
@@ -72,11 +72,11 @@ def open_nifti(path: str | os.PathLike[str]) -> tuple[NiftiImage, list[str]]:
 
 
 def checked_grid(image: NiftiImage, name: str) -> VolumeGrid:
-    """The grid of an image with one frame of real numbers that its file can hold.
+    """The grid of an image with one frame of real numbers.
 
     Raises:
-        InputError: more than one frame, colour or complex data, an empty axis, more voxels than are in the
-            file or than anybody needs, lengths in other units, a bad affine.
+        InputError: more than one frame, colour or complex data, an empty axis, more voxels than the file or
+            `MAX_VOXEL_COUNT` allows, lengths in other units, a bad affine.
     """
     shape = tuple(int(n) for n in image.shape)
     if len(shape) > 3 and all(n == 1 for n in shape[3:]):
@@ -103,6 +103,11 @@ def checked_grid(image: NiftiImage, name: str) -> VolumeGrid:
 def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray[np.float32]:
     """Values [I, J, K] as float32, scaled as the header says.
 
+    Args:
+        image: see `open_nifti`.
+        shape: of its grid, see `checked_grid`.
+        name: for messages.
+
     Raises:
         InputError: a file that is cut off or damaged.
     """
@@ -118,7 +123,7 @@ def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray
 
 
 def _read(image: NiftiImage) -> NDArray[np.float32]:
-    """Scaled values; of a compressed file up to its end, where the checksum stands."""
+    """Scaled values; a compressed file is read to its end, where the checksum is."""
     file = Path(str(image.file_map["image"].filename))
     if not file.name.lower().endswith(".gz"):
         return np.asarray(image.dataobj, dtype=np.float32)
@@ -133,7 +138,7 @@ def _read(image: NiftiImage) -> NDArray[np.float32]:
 
 
 def orientation_remarks(image: NiftiImage, grid: VolumeGrid) -> list[str]:
-    """What a header says about orientation that a user should know, as lines."""
+    """Lines about the orientation in a header that a user should know."""
     header = image.header
     sform, qform = int(header["sform_code"]), int(header["qform_code"])
     if sform <= 0 and qform <= 0:
@@ -159,7 +164,7 @@ def one_line(error: BaseException) -> str:
 
 
 def _check_file(path: Path) -> None:
-    """Raise `InputError` for what is not a file that could be NIfTI, without reading more than two bytes."""
+    """Raise `InputError` for anything but a file that could be NIfTI; reads two bytes at most."""
     try:
         status = path.stat()
     except FileNotFoundError:
@@ -197,7 +202,7 @@ def _check_file(path: Path) -> None:
 
 
 def _check_size(image: NiftiImage, shape: tuple[int, ...], voxel_bytes: int, name: str) -> None:
-    """Refuse what nobody needs, and what is not in the file."""
+    """Raise `InputError` for more voxels than allowed, or than the file can hold."""
     n_voxels = 1
     for extent in shape:  # in whole numbers, which do not overflow
         n_voxels *= extent
@@ -223,7 +228,7 @@ def _check_size(image: NiftiImage, shape: tuple[int, ...], voxel_bytes: int, nam
 
 @contextmanager
 def _remarks() -> Iterator[list[str]]:
-    """Collect what nibabel and numpy would print about a file, as lines."""
+    """Collect what nibabel and numpy would log or warn about a file, as lines."""
     lines: list[str] = []
 
     class Collector(logging.Handler):

@@ -12,7 +12,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Planes:
     """K rectangular pixel grids in space.
 
@@ -100,7 +100,7 @@ class Planes:
 
     def take(self, index: Selection) -> Planes:
         """The planes at an index array, a mask or a slice."""
-        return Planes(*(getattr(self, field)[index] for field in self.__dataclass_fields__))
+        return Planes(**{field: getattr(self, field)[index] for field in self.__dataclass_fields__})
 
     def moved(self, pose: RigidPose) -> Planes:
         """The planes after rigid motions [K] (or one) of the world."""
@@ -117,7 +117,7 @@ class Planes:
         return np.pad((self.shape * self.spacing_mm)[:, None] * unit, ((0, 0), (0, 0), (0, 1)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Slices:
     """The acquired slices of all stacks: planes with their pixels, permuted and taken as one record.
 
@@ -178,18 +178,22 @@ class Slices:
             [np.arange(self.planes.offset[k], self.planes.offset[k + 1]) for k in chosen] or [np.zeros(0, int)]
         )
         return Slices(
-            self.planes.take(chosen),
-            self.value[pixels],
-            self.mask[pixels],
-            self.stack_id[chosen],
-            self.slice_index[chosen],
-            self.thickness_mm[chosen],
-            self.header_pose.take(chosen),
+            planes=self.planes.take(chosen),
+            value=self.value[pixels],
+            mask=self.mask[pixels],
+            stack_id=self.stack_id[chosen],
+            slice_index=self.slice_index[chosen],
+            thickness_mm=self.thickness_mm[chosen],
+            header_pose=self.header_pose.take(chosen),
         )
 
     def with_pose(self, pose: RigidPose) -> Slices:
         """The same slices at other poses (world from plane)."""
         return replace(self, planes=self.planes.with_pose(pose))
+
+    def with_motion(self, motion: RigidPose) -> Slices:
+        """The same slices at motions [K] relative to their header poses (world from header)."""
+        return self.with_pose(motion @ self.header_pose)
 
     def scaled(self, factor: float) -> Slices:
         """The same slices with their values multiplied by a factor."""
@@ -214,11 +218,11 @@ def volume_planes(grid: VolumeGrid) -> Planes:
     n_i, n_j, n_k = grid.shape
     index = np.stack([np.full(n_k, (n_i - 1) / 2), np.full(n_k, (n_j - 1) / 2), np.arange(n_k)], axis=1)
     return Planes(
-        np.tile(frame, (n_k, 1, 1)),
-        grid.world(index),
-        np.tile(spacing[:2], (n_k, 1)),
-        np.tile([n_i, n_j], (n_k, 1)),
-        np.zeros((n_k, 3)),
+        rotation=np.tile(frame, (n_k, 1, 1)),
+        center_mm=grid.world(index),
+        spacing_mm=np.tile(spacing[:2], (n_k, 1)),
+        shape=np.tile([n_i, n_j], (n_k, 1)),
+        psf_var_mm2=np.zeros((n_k, 3)),
     )
 
 

@@ -1,4 +1,4 @@
-"""Slices as small square images of one pixel size: what the pose network looks at."""
+"""Slices as small square images of one pixel size, the input of the pose network."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 
 SUBPIXELS = 2
-"""Every acquired pixel is spread as this many points per axis, to make averages over large pixels even."""
+"""Every acquired pixel is sampled at this many points per axis, so that averages over large pixels are even."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SliceImages:
     """K slices of one head as masked images, and the geometry that does not depend on the scanner's axes.
 
-    All slices of a stack are cut out around the same in-plane point, the stack's centroid by its header, so
-    that an image also says where in its stack's field of view something lies.
+    All slices of a stack are cut out around the same in-plane point, the centroid of the stack by its header,
+    so that an image also shows where in the field of view of its stack the head is.
 
     Args:
         image: [K, N, N] float32; first axis along the slice's x, second along y; zero outside the mask, the
@@ -56,7 +56,7 @@ def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:
     """The slices at their header poses, averaged over pixels of one size.
 
     Args:
-        slices: of all stacks. What lies outside of `size` pixels about a stack's centroid is cut off.
+        slices: of all stacks, cropped to `size` pixels around the centroid of their stack.
         pixel_mm: edge of the square pixels.
         size: N, pixels per edge.
     """
@@ -95,12 +95,12 @@ def slice_images(slices: Slices, pixel_mm: float, size: int) -> SliceImages:
     bright = float(np.percentile(slices.masked_value, 99)) if len(pixel) else 0.0
     images /= bright if bright > 0 else 1.0
     return SliceImages(
-        images.reshape(-1, size, size).astype(np.float32),
-        area,
-        -shift[:, 2],
-        slices.thickness_mm,
-        np.full(len(slices), np.nan),
-        stack_id.astype(np.int64),
-        slices.header_pose.rotation,
-        frame,
+        image=images.reshape(-1, size, size).astype(np.float32),
+        area_mm2=area,
+        position_mm=-shift[:, 2],
+        thickness_mm=slices.thickness_mm,
+        time_rank=np.full(len(slices), np.nan),
+        stack_id=stack_id.astype(np.int64),
+        header_rotation=slices.header_pose.rotation,
+        frame_in_slice=frame,
     )

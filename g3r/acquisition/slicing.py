@@ -52,15 +52,21 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             thickness.append(stack.thickness_mm)
     if not rotation:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
-    planes = Planes(np.array(rotation), np.array(center), np.array(spacing), np.array(shape), np.array(psf))
+    planes = Planes(
+        rotation=np.array(rotation),
+        center_mm=np.array(center),
+        spacing_mm=np.array(spacing),
+        shape=np.array(shape),
+        psf_var_mm2=np.array(psf),
+    )
     return Slices(
-        planes,
-        np.concatenate(values).astype(np.float32),
-        np.concatenate(masks),
-        np.array(stack_id, dtype=np.int64),
-        np.array(slice_index, dtype=np.int64),
-        np.array(thickness),
-        planes.pose,
+        planes=planes,
+        value=np.concatenate(values).astype(np.float32),
+        mask=np.concatenate(masks),
+        stack_id=np.array(stack_id, dtype=np.int64),
+        slice_index=np.array(slice_index, dtype=np.int64),
+        thickness_mm=np.array(thickness),
+        header_pose=planes.pose,
     )
 
 

@@ -1,4 +1,4 @@
-"""A stack of parallel slices as it comes from the scanner, checked once when it is made."""
+"""A stack of parallel slices as it comes from the scanner, checked when it is made."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ ORTHOGONALITY_TOLERANCE = 1e-3
 THICKNESS_RANGE_MM = (0.1, 20.0)
 
 SPACING_RANGE_MM = (0.05, 50.0)
-"""Of pixels and of slices; headers in metres or micrometres lie outside."""
+"""Allowed spacing of pixels and slices; headers in metres or micrometres are outside."""
 
 INTENSITY_RANGE = (1e-30, 1e30)
-"""Largest value inside a mask: what float32 can be divided by."""
+"""Allowed range of the largest value inside a mask, so that float32 can be divided by it."""
 
 MIN_POSITIVE_SHARE = 0.01
-"""Of the masked values; intensities are normalised by their 99th percentile."""
+"""Share of the masked values; intensities are normalised by their 99th percentile."""
 
 FARTHEST_MM = 500.0
-"""Between the heads of two stacks by their headers; scans of one session share a frame."""
+"""Largest distance between the heads of two stacks by their headers; scans of one session share a frame."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stack:
     """Parallel slices with one header.
 
     Args:
         image: [I, J, K] float32, arbitrary units; K counts the slices.
-        mask: [I, J, K] bool, what belongs to the brain.
-        affine: [4, 4] float64, RAS+ mm from index; left-handed and oblique ones are welcome.
-        thickness_mm: thickness of a slice; the distance of slices is in the affine and may differ.
-        name: what messages call it.
+        mask: [I, J, K] bool, the brain.
+        affine: [4, 4] float64, RAS+ mm from index; may be left-handed or oblique.
+        thickness_mm: thickness of a slice; the slice spacing is in the affine and may differ.
+        name: for messages.
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
             that are not finite, not positive or all the same inside the mask, a thickness outside 0.1-20 mm,
-            voxels that are not of a size in mm.
+            a voxel size that cannot be in mm.
     """
 
     image: NDArray[np.float32]
@@ -133,10 +133,14 @@ def load_stack(
 ) -> Stack:
     """Read a stack and its mask.
 
-    The slices lie along the axis whose spacing is clearly (a tenth) above the others, else along the third;
-    image, mask and affine are permuted together so that this axis becomes the last. A slice keeps its number.
-    Without a mask every positive voxel counts. Without a thickness the distance of slices is taken, and a
-    line is logged, because a gap cannot be seen in a header.
+    The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third; image, mask
+    and affine are permuted together so that it becomes the last. A slice keeps its number.
+
+    Args:
+        path: of the NIfTI image.
+        mask_path: of the brain mask; without one every positive voxel counts.
+        thickness_mm: of the slices; without one the slice spacing is taken, and a line is logged, because a
+            header does not show gaps.
 
     Raises:
         InputError: what `load_volume`, `load_mask` and `Stack` refuse.
@@ -162,11 +166,11 @@ def load_stack(
         thickness_mm = float(spacing[through])
         logger.info("%s: thickness taken as the distance of slices, %.2f mm", volume.name, thickness_mm)
     stack = Stack(
-        np.ascontiguousarray(volume.data.transpose(order)),
-        np.ascontiguousarray(mask.transpose(order)),
-        affine,
-        thickness_mm,
-        volume.name,
+        image=np.ascontiguousarray(volume.data.transpose(order)),
+        mask=np.ascontiguousarray(mask.transpose(order)),
+        affine=affine,
+        thickness_mm=thickness_mm,
+        name=volume.name,
     )
     if stack.thickness_mm < stack.spacing_mm[:2].min():
         logger.warning(
@@ -185,9 +189,14 @@ def load_stacks(
 ) -> list[Stack]:
     """Read the stacks of one head, see `load_stack`.
 
+    Args:
+        paths: of the NIfTI images.
+        mask_paths: one for each stack, or none.
+        thickness_mm: one for each stack, or none.
+
     Raises:
-        InputError: a stack that cannot be used, the same image twice, or stacks that lie too far apart.
-        ValueError: as many masks or thicknesses as stacks were expected.
+        InputError: a stack that cannot be used, the same image twice, or stacks too far apart.
+        ValueError: another number of masks or thicknesses than of stacks.
     """
     masks = mask_paths or [None] * len(paths)
     thickness = thickness_mm or [None] * len(paths)
@@ -201,12 +210,12 @@ def load_stacks(
 
 
 def spaced(lengths: NDArray[np.float64]) -> str:
-    """For people: 0.8 x 0.8 x 3."""
+    """Lengths for messages, such as 0.8 x 0.8 x 3."""
     return " x ".join(f"{x:.3g}" for x in lengths)
 
 
 def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> None:
-    """Raise `InputError` for one image given twice, which would be believed twice, and for strangers."""
+    """Raise `InputError` for one image given twice, which would count twice, and for heads too far apart."""
     if path.resolve() == other_path.resolve():
         raise InputError(f"{stack.name}: is given twice; pass each stack once")
     if stack.image.shape == other.image.shape and np.array_equal(stack.image, other.image):

@@ -1,6 +1,6 @@
-"""The voxel forward operator (a slice pixel as a PSF-weighted mean of a volume) and its exact adjoint.
+"""The voxel forward operator, a slice pixel as a PSF-weighted mean of a volume (G3R Eq. 2), and its exact adjoint.
 
-Both directions run the same loop over the same trilinear weights, one reading and one adding, so that
+Both directions run the same loop over the same trilinear weights, one gathers and one scatters, so that
 <A x, y> = <x, A^T y> holds to rounding.
 """
 
@@ -16,7 +16,7 @@ from g3r.acquisition.planes import Planes
 from g3r.geometry import VolumeGrid
 
 MAX_SCATTER_BUFFERS = 4
-"""Each thread that scatters needs its own volume; more than four cost more memory than they save time."""
+"""Each scattering thread needs its own volume; more than four cost more memory than they save time."""
 
 
 def psf_nodes(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -39,7 +39,7 @@ class VoxelOperator:
     Args:
         planes: K planes.
         grid: voxel grid of the volume; outside it the volume is zero.
-        pixel_index: numbers [P'] of the pixels wanted; all of them when None.
+        pixel_index: [P'] numbers of the pixels to compute; all when None.
         psf_points: number of quadrature nodes along the planes' x, y and normal.
     """
 
@@ -61,7 +61,7 @@ class VoxelOperator:
         self.move(planes)
 
     def move(self, planes: Planes) -> None:
-        """Take the poses of these planes (the same pixel grids elsewhere)."""
+        """Take the poses of these planes, the same pixel grids elsewhere."""
         inverse = self.grid.index_from_world
         self.index_from_plane = np.ascontiguousarray(inverse[:3, :3] @ planes.rotation)  # [K, 3, 3]
         self.index_center = planes.center_mm @ inverse[:3, :3].T + inverse[:3, 3]
@@ -73,7 +73,7 @@ class VoxelOperator:
         return len(self.plane)
 
     def forward(self, volume: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Pixels [P'] of a volume [I, J, K], in the volume's dtype.
+        """Pixels [P'] of a volume [I, J, K], in the dtype of the volume (G3R Eq. 2 on voxels).
 
         Raises:
             ValueError: the volume is not on the operator's grid.
@@ -94,7 +94,7 @@ class VoxelOperator:
         return pixels
 
     def adjoint(self, pixels: NDArray[np.floating]) -> NDArray[np.floating]:
-        """A^T: adds pixel values [P'] onto a volume [I, J, K] with the weights of `forward`.
+        """A^T: adds pixel values [P'] to a volume [I, J, K] with the weights of `forward`.
 
         Raises:
             ValueError: another number of pixels.

@@ -70,16 +70,22 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
     k = len(stack)
     spacing = np.full((k, 2), PIXEL_MM)
     planes = Planes(
-        np.array(rotation),
-        np.array(center),
-        spacing,
-        np.array(shape, dtype=np.int64),
-        psf_variance_mm2(spacing, np.full(k, THICKNESS_MM)),
+        rotation=np.array(rotation),
+        center_mm=np.array(center),
+        spacing_mm=spacing,
+        shape=np.array(shape, dtype=np.int64),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(k, THICKNESS_MM)),
     )
     value = rng.random(planes.n_pixels, dtype=np.float32)
     index = np.arange(k)
     slices = Slices(
-        planes, value, np.ones(len(value), bool), np.array(stack), index, np.full(k, THICKNESS_MM), planes.pose
+        planes=planes,
+        value=value,
+        mask=np.ones(len(value), bool),
+        stack_id=np.array(stack),
+        slice_index=index,
+        thickness_mm=np.full(k, THICKNESS_MM),
+        header_pose=planes.pose,
     )
     return KernelScene(cloud, slices)
 

@@ -74,24 +74,24 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
     side = max(2, round(size.n_pixels**0.5))
     variance = psf_variance_mm2(np.full(2, PIXEL_MM), THICKNESS_MM)
     planes = Planes(
-        np.array(rotation),
-        np.array(center),
-        np.full((size.n_slices, 2), HEAD_MM / side),
-        np.full((size.n_slices, 2), side),
-        np.tile(variance, (size.n_slices, 1)),
+        rotation=np.array(rotation),
+        center_mm=np.array(center),
+        spacing_mm=np.full((size.n_slices, 2), HEAD_MM / side),
+        shape=np.full((size.n_slices, 2), side),
+        psf_var_mm2=np.tile(variance, (size.n_slices, 1)),
     )
     value = render(cloud, planes).numpy()
     value = value + 0.02 * rng.standard_normal(len(value)).astype(np.float32) * value.mean()
     index = np.concatenate([np.arange(n) for n in per_stack])
     stack_id = np.repeat(np.arange(N_STACKS), per_stack)
     return Slices(
-        planes,
-        value.astype(np.float32),
-        np.ones(len(value), bool),
-        stack_id,
-        index,
-        np.full(size.n_slices, THICKNESS_MM),
-        planes.pose,
+        planes=planes,
+        value=value.astype(np.float32),
+        mask=np.ones(len(value), bool),
+        stack_id=stack_id,
+        slice_index=index,
+        thickness_mm=np.full(size.n_slices, THICKNESS_MM),
+        header_pose=planes.pose,
     )
 
 

@@ -1,7 +1,7 @@
 """Rigid alignment of a reconstruction to a reference, and resampling on the reference's grid (SimpleITK).
 
 A reconstruction is determined only up to one rigid motion of the whole head, so it is compared after
-that motion is removed. ITK thinks in LPS; everything that enters or leaves this file is RAS+.
+that motion is removed. ITK works in LPS; the interface of this module is RAS+.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ START_ANGLES_DEG = (-25.0, 0.0, 25.0)
 """Start rotations about each axis; with the reach of a coarse level (about 20 degrees) they cover 45."""
 
 GOOD_ENOUGH_NCC = 0.95
-"""Where the first start reaches this at the coarse level, the others are not tried."""
+"""If the first start reaches this at the coarse level, the others are not tried."""
 
 COARSE_SHRINK = 4
 SAMPLED_SHARE = 0.15
-"""Share of the voxels that the metric looks at, on a regular lattice that ITK jitters."""
+"""Share of the voxels that the metric uses, on a regular lattice that ITK jitters."""
 
 SAMPLING_SEED = 1
-"""Of that jitter; ITK's own default is the clock, and then no two runs agree."""
+"""Seed of that jitter; ITK's default is the clock, and then no two runs agree."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,14 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> A
 
 
 def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | None = None) -> NDArray[np.float32]:
-    """A volume's values [I, J, K] at the voxels of another grid, by cubic B-splines; zero where it ends.
+    """A volume's values [I, J, K] at the voxels of another grid, by cubic B-splines; zero outside.
 
-    Where the grids are the same and nothing moves, the values are returned untouched.
+    On the same grid without a motion the values are returned untouched.
+
+    Args:
+        volume: to be read; values that are not finite count as zero.
+        grid: of the answer.
+        volume_from_grid: one motion of world space, from the grid to the volume; none when None.
     """
     same = volume.data.shape == grid.shape and np.allclose(volume.affine, grid.affine, atol=1e-4)
     if volume_from_grid is None and same:

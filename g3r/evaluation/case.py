@@ -1,4 +1,4 @@
-"""A simulated subject in a folder: stacks, the volume they were taken of, the true pose of each slice."""
+"""A simulated subject in a folder: stacks, the true volume, the true pose of each slice."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from g3r.evaluation.pose_error import (
 from g3r.geometry import RigidPose
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SimulatedCase:
     """What a folder of `g3r-simulate` holds (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
 
@@ -55,7 +55,7 @@ class SimulatedCase:
         return load_mask(self.folder / "truth-mask.nii.gz", self.truth)
 
     def header_error(self) -> PoseError:
-        """Error of believing the headers."""
+        """Error of the header poses."""
         still = RigidPose.identity(len(self.true.keys))
         return target_registration_error(self.points_mm, self.true, PoseTable(self.true.keys, still))
 
@@ -82,7 +82,9 @@ def load_case(folder: str | os.PathLike[str], thickness_mm: float | None = None)
     if thickness_mm is None:
         thickness_mm = _recorded_thickness_mm(folder)
     stacks = tuple(load_stack(path, mask, thickness_mm) for path, mask in zip(paths, masks, strict=True))
-    return SimulatedCase(folder.name, folder, stacks, read_true_poses(folder), slice_points(masks))
+    return SimulatedCase(
+        name=folder.name, folder=folder, stacks=stacks, true=read_true_poses(folder), points_mm=slice_points(masks)
+    )
 
 
 def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:

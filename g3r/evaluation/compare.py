@@ -18,11 +18,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores, the motion that was removed before (if any), and the volume as it was judged.
+    """Scores, the motion that was removed before (if any), and the volume as it was scored.
 
     Attributes:
         scores: see `Scores`.
-        alignment: None where the headers were believed.
+        alignment: None where the headers were used as they are.
         volume: float32 [I, J, K] on the reference's grid, intensities fitted to the reference.
     """
 
@@ -32,7 +32,13 @@ class Comparison:
 
 
 def compare(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align: bool = False) -> Comparison:
-    """Score a volume against a reference in the reference's mask, by the headers or after rigid alignment.
+    """Score a volume against a reference in the mask of the reference.
+
+    Args:
+        volume: the volume to score.
+        reference: the volume to compare with.
+        mask: bool [I, J, K] on the grid of the reference.
+        align: remove a rigid motion first; otherwise the headers are used as they are.
 
     Raises:
         InputError: a volume without finite values, a reference that is not finite or not positive in the

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
+from g3r.geometry.grid import bounding_box
+
 PSNR_CAP_DB = 100.0
 """Reported where the volumes agree to float32 rounding; keeps infinity out of tables and JSON."""
 
@@ -17,7 +19,7 @@ RANGE_PERCENTILE = 99.9
 SSIM_WINDOW_VOXELS = 7
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scores:
     """Scores over the voxels of a mask.
 
@@ -47,8 +49,13 @@ def fit_intensity(
 ) -> tuple[float, float]:
     """Gain and offset that bring a volume nearest to the reference in the mask (least squares).
 
-    A reconstruction has an arbitrary intensity scale; judging it as it stands would judge the scale.
-    A constant volume gets gain 0.
+    A reconstruction has an arbitrary intensity scale, which scores should not depend on. A constant volume
+    gets gain 0.
+
+    Args:
+        volume: [I, J, K].
+        reference: [I, J, K].
+        mask: [I, J, K].
     """
     x = volume[mask].astype(np.float64)
     y = reference[mask].astype(np.float64)
@@ -65,7 +72,12 @@ def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: N
     """Compare a volume with the reference on one grid [I, J, K], inside the mask.
 
     The reference is divided by its `RANGE_PERCENTILE` in the mask, the volume is fitted to it affinely,
-    and both are set to zero outside the mask, so that SSIM windows at the rim see the same there.
+    and both are set to zero outside the mask, so that they agree in SSIM windows at its edge.
+
+    Args:
+        volume: [I, J, K].
+        reference: [I, J, K].
+        mask: [I, J, K].
 
     Raises:
         ValueError: shapes differ, the mask is empty, a value in the mask is not finite, or the reference
@@ -81,7 +93,7 @@ def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: N
     if data_range <= 0:
         raise ValueError(f"the reference's {RANGE_PERCENTILE}th percentile in the mask is {data_range:.3g}")
     gain, offset = fit_intensity(volume, reference, mask)
-    box = _window_box(mask)
+    box = bounding_box(mask, SSIM_WINDOW_VOXELS // 2)  # every window centred in the mask
     inside = mask[box]
     truth = np.where(inside, reference[box].astype(np.float64) / data_range, 0.0)
     fitted = np.where(inside, (volume[box].astype(np.float64) * gain + offset) / data_range, 0.0)
@@ -118,11 +130,3 @@ def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum()) / norm if norm > 0 else 0.0
-
-
-def _window_box(mask: NDArray[np.bool_]) -> tuple[slice, ...]:
-    """The box around the mask that holds every SSIM window centred in it."""
-    reach = SSIM_WINDOW_VOXELS // 2
-    index = np.argwhere(mask)
-    low, high = index.min(0) - reach, index.max(0) + reach + 1
-    return tuple(slice(max(0, int(lo)), int(hi)) for lo, hi in zip(low, high, strict=True))

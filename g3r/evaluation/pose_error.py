@@ -19,7 +19,7 @@ from g3r.geometry.rigid import fit_rigid_robust
 POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 MIN_PIXELS = 30
-"""Slices with fewer mask pixels are left out: no method can place them, and they hold no anatomy."""
+"""Slices with fewer mask pixels are not scored: no method can place them, and they show no anatomy."""
 
 POINTS_PER_SLICE = 64
 
@@ -32,22 +32,22 @@ SliceKey = tuple[int, int]
 
 @dataclass(frozen=True)
 class PoseTable:
-    """Slice poses as files hold them: a point at x by the stack's header is taken to be at R x + t."""
+    """Slice poses as in files: a point at x by the header of the stack is estimated to be at R x + t."""
 
     keys: tuple[SliceKey, ...]
     pose: RigidPose
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PoseError:
     """Target registration error over slices (mm), each slice the mean over its points.
 
     Attributes:
-        mean_mm, median_mm, p90_mm: over the slices that were compared.
-        n_slices: how many those are.
+        mean_mm, median_mm, p90_mm: over the compared slices.
+        n_slices: number of compared slices.
         n_missing: slices with brain in them that have no estimate.
         per_slice_mm: error of each slice.
-        common: the motion that was removed, one pose; takes the estimate's frame to that of the truth.
+        common: the motion that was removed, one pose; takes the frame of the estimate to that of the truth.
     """
 
     mean_mm: float
@@ -73,7 +73,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
     """Read a table of slice poses (`slices.tsv`, `poses.tsv`): stack slice rx ry rz tx ty tz (rad, mm).
 
     Raises:
-        InputError: no such file, a column is missing, a value is no number, or a slice stands there twice.
+        InputError: no such file, a column is missing, a value is not a number, or a slice is listed twice.
     """
     path = Path(path)
     if not path.is_file():
@@ -98,7 +98,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
 
 
 def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
-    """Where the headers put the brain: up to ~128 points [n, 3] (mm) of each slice with enough mask."""
+    """Brain points by the headers: up to about 128 points [n, 3] (mm) of each slice with enough mask."""
     points: dict[SliceKey, NDArray[np.float64]] = {}
     for stack, path in enumerate(mask_paths):
         mask = load_volume(path)
@@ -113,21 +113,21 @@ def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey,
 def target_registration_error(
     points_mm: Mapping[SliceKey, NDArray[np.float64]], true: PoseTable, estimated: PoseTable
 ) -> PoseError:
-    """Distance between where slices are and where they are thought to be, up to one common rigid motion.
+    """Distance between the true and the estimated places of slices, up to one common rigid motion.
 
     Args:
         points_mm: points of each slice by the header, as `slice_points` gives them; slices without an entry
-            here or without a true pose are not judged.
-        true: the poses the slices were simulated with.
-        estimated: the poses that were found.
+            here or without a true pose are not scored.
+        true: the poses of the simulation.
+        estimated: the poses to score.
 
     Raises:
         InputError: no slice is in all three.
     """
     true_row = {key: n for n, key in enumerate(true.keys)}
     estimated_row = {key: n for n, key in enumerate(estimated.keys)}
-    judged = [key for key in points_mm if key in true_row]
-    keys = [key for key in judged if key in estimated_row]
+    scored = [key for key in points_mm if key in true_row]
+    keys = [key for key in scored if key in estimated_row]
     if not keys:
         raise InputError("pose tables have no slice in common; check that they belong to the same stacks")
     count = [len(points_mm[key]) for key in keys]
@@ -142,7 +142,7 @@ def target_registration_error(
         median_mm=float(np.median(per_slice)),
         p90_mm=float(np.percentile(per_slice, 90)),
         n_slices=len(keys),
-        n_missing=len(judged) - len(keys),
+        n_missing=len(scored) - len(keys),
         per_slice_mm=dict(zip(keys, per_slice.tolist(), strict=True)),
         common=common,
     )

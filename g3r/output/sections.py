@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g3r.errors import cannot_be_written
+from g3r.geometry.grid import bounding_box
 from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
@@ -123,13 +124,11 @@ def _crop(
     inside: NDArray[np.bool_], spacing_mm: NDArray[np.float64], *, has_mask: bool
 ) -> tuple[tuple[slice, ...], NDArray[np.intp]]:
     """The box to show and, within it, the voxel the sections go through (the middle of the mask)."""
-    index = np.argwhere(inside)
-    low, high = index.min(0), index.max(0) + 1
-    middle = (low + high) // 2
+    box = bounding_box(inside)
+    middle = np.array([(axis.start + axis.stop) // 2 for axis in box])
     if has_mask:
-        margin = np.ceil(MARGIN_MM / spacing_mm).astype(int)
-        low, high = np.maximum(low - margin, 0), np.minimum(high + margin, inside.shape)
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True)), middle - low
+        box = bounding_box(inside, np.ceil(MARGIN_MM / spacing_mm).astype(int))
+    return box, middle - [axis.start for axis in box]
 
 
 def _draw(

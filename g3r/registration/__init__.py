@@ -1,4 +1,21 @@
-"""Poses of stacks and slices from the images."""
+"""Poses of stacks and slices by classical registration, in the order of the data.
+
+`estimate.register` is the whole of it, `settings` chooses its layers, `thresholds` holds its tuned decisions.
+
+1. `bias_correction` removes the slow trend of intensity from each stack.
+2. `global_search` tries several initialisations of all poses: the headers; `stack_registration` (stack to
+   stack); `atlas_search` (atlas templates); proposals of the pose network. `held_out` scores each by how well
+   a volume of the other stacks predicts a stack, and the best one is taken.
+3. `segment_search` refines it: the slices of a stack are placed in `motion_segments`, constant between two
+   jerks. Both searches rest on `pose_sampling` (candidate motions), `so3_search` (all orientations),
+   `similarity` (thinned pixels against a volume) and `placement` (the best segments among candidates).
+4. `slice_rounds` alternates between a volume of all slices and `slice_registration`, Gauss-Newton steps of
+   every slice by the `normal_equations` of the slice model.
+5. `atlas_frame` moves the result into the standard orientation or keeps the frame of the scanner; `quality`
+   says which stacks are registered.
+
+`prior_registration` is used later, for single stacks alone: their slices move towards the prior volume.
+"""
 
 from g3r.registration.estimate import Registration, register
 from g3r.registration.settings import RegistrationSettings

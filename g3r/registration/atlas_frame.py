@@ -1,4 +1,4 @@
-"""The frame of the result: the atlas' standard orientation, or where the scanner says the head is."""
+"""The frame of the result: the standard orientation of the atlas, or the frame of the scanner."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ import numpy as np
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
-from g3r.registration.candidates import aligned_to
-from g3r.registration.normal_equations import correlation
-from g3r.registration.pose_samples import SearchPixels, perturbed
-from g3r.registration.template_search import FittedTemplate
+from g3r.registration.atlas_search import FittedTemplate
+from g3r.registration.pose_sampling import perturbed
+from g3r.registration.segment_search import aligned_to
+from g3r.registration.similarity import SearchPixels, correlation
+from g3r.registration.thresholds import MIN_ATLAS_CORRELATION
 
 logger = logging.getLogger(__name__)
 
 HEADER_REACH_MM = 2.0
-"""Slices further than this from the common motion hardly take part in finding it."""
-
-RELIABLE_CORRELATION = 0.6
-"""Correlation with the mean head, outline included, below which the standard orientation is not known:
-0.7 to 0.8 for simulated heads of 24 to 34 weeks, 0.4 for heads lying the wrong way."""
+"""Distance from the common motion at which a slice counts half in finding it."""
 
 ROUNDS = ((10.0, 4.0), (5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
+"""Random rotations (degrees) and translations (mm) of the whole head, round by round."""
 N_CANDIDATES = 1000
 
 
@@ -34,9 +32,9 @@ class Orientation:
     """Poses of all slices in the atlas frame (RAS, the mid-sagittal plane at x = 0), and how well they fit.
 
     Args:
-        pose: [K] of the slices' own frames.
-        correlation: with the mean head, outline included.
-        weeks: age of the mean head.
+        pose: [K] world from plane.
+        correlation: with the atlas template, outline included.
+        weeks: age of the template.
         scale: by which it was enlarged to fit.
     """
 
@@ -47,13 +45,13 @@ class Orientation:
 
 
 def standard_orientation(
-    slices: Slices, heads: Sequence[FittedTemplate], start: RigidPose, rng: np.random.Generator
+    slices: Slices, templates: Sequence[FittedTemplate], start: RigidPose, rng: np.random.Generator
 ) -> Orientation | None:
-    """Turn all slices together so that the head stands as a mean head does.
+    """Move all slices together so that the head is oriented as an atlas template.
 
     Args:
         slices: at their final poses, in any frame.
-        heads: mean heads of the subject's size; the one that fits best decides.
+        templates: atlas templates of the subject's size; the one that fits best decides.
         start: motions [K] (world from header) into the atlas frame, roughly.
         rng: source of randomness.
 
@@ -63,31 +61,31 @@ def standard_orientation(
     present = slices.world_from_header()
     common = aligned_to(slices, start, present) @ present.inverse()
     pixels = SearchPixels.of(slices)
-    found = [(*_turned_to(head, pixels, common.take([0]), rng), head) for head in heads]
-    best, motion, head = max(found, key=lambda one: one[0])
-    logger.info("standard orientation: correlation %.2f with the mean head of %.0f weeks", best, head.weeks)
-    if best < RELIABLE_CORRELATION:
+    found = [(*_moved_to(template, pixels, common.take([0]), rng), template) for template in templates]
+    best, motion, template = max(found, key=lambda one: one[0])
+    logger.info("standard orientation: correlation %.2f with the atlas template of %.0f weeks", best, template.weeks)
+    if best < MIN_ATLAS_CORRELATION:
         return None
-    return Orientation(motion @ slices.planes.pose, best, head.weeks, head.scale)
+    return Orientation(motion @ slices.planes.pose, best, template.weeks, template.scale)
 
 
-def _turned_to(
-    head: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
+def _moved_to(
+    template: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
 ) -> tuple[float, RigidPose]:
-    """Best correlation of all slices with a head, and the motion that gives it."""
+    """Best correlation of all slices with a template, and the motion that gives it."""
     agreement = np.zeros(1)
     for rotation_deg, translation_mm in ROUNDS:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
-        agreement = correlation(pixels.moments(head.volume, head.grid, candidate).sum(1))
+        agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
         motion = candidate.take([int(agreement.argmax())])
     return float(agreement.max()), motion
 
 
 def centred_on_headers(slices: Slices) -> Slices:
-    """Take out the motion that all slices share, as their headers see it.
+    """Remove the motion that all slices share relative to their headers.
 
     Poses are determined up to one rigid motion of the whole head. This choice keeps the volume where the
-    scanner's coordinates say it is, on (robust) average over all slices.
+    scanner's coordinates put it, on (robust) average over all slices.
     """
     corners = slices.planes.corners_mm()
     here = slices.planes.pose.apply(corners).reshape(-1, 3)

@@ -1,9 +1,9 @@
-"""A first guess of each stack's shading from its own intensities, before any pose is known.
+"""A first estimate of each stack's bias field from its own intensities, before any pose is known.
 
-Coils make one side of a stack brighter. Registration compares intensities of stacks that were shaded
-differently, so even 15 % of shading moves whole stacks to wrong places. A second-order polynomial fitted to a
-stack's log intensities removes it together with the anatomy's own slow trend, which registration does not
-need. Only registration sees the bias_corrected slices: the fit to the slices models the shading itself.
+Receive coils make one side of a stack brighter. Registration compares intensities of stacks with different
+bias fields, and a field of 15 % already moves whole stacks to wrong places. A second-order polynomial fitted
+to the log intensities of a stack removes it together with the slow trend of the anatomy, which registration
+does not need. Only registration uses the corrected slices: the fit to the slices models the field itself.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from g3r.acquisition.bias_basis import LENGTH_MM, N_TERMS, quadratic_terms, stac
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 
-DARKEST = 0.1
-"""Pixels under this share of a stack's mean count as this bright: a logarithm has no zero."""
+MIN_INTENSITY = 0.1
+"""Darker pixels count with this share of the stack's mean intensity, for the sake of the logarithm."""
 
 FIELD_RANGE = (0.4, 2.5)
-"""A field outside of this is the fit's extrapolation, not a coil's."""
+"""A field outside this range is an extrapolation of the fit, not a coil."""
 
 N_ROUNDS = 10
 
 FITTED_PIXELS = 20_000
-"""Of a stack, evenly: five coefficients need no more."""
+"""Evenly spread pixels of a stack; five coefficients need no more."""
 
 
 def bias_corrected(slices: Slices) -> Slices:
     """The slices with the slow in-plane trend of each stack's intensities divided out.
 
-    The trend is x, y, x^2, xy, y^2 (in the stack's header frame, about the middle of its masked pixels)
-    fitted to log intensity, Cauchy-weighted so that anatomy far from the mean counts little; slices keep
+    The trend is quadratic in the header frame of the stack, about the middle of its masked pixels. It is
+    fitted to log intensities, Cauchy-weighted so that anatomy far from the mean counts little; slices keep
     their gains.
     """
     value = slices.value.copy()
@@ -46,13 +46,13 @@ def bias_corrected(slices: Slices) -> Slices:
             continue
         some = np.flatnonzero(inside)
         some = some[np.linspace(0, len(some) - 1, min(len(some), FITTED_PIXELS)).astype(int)]
-        coefficients = _robust_fit(terms[some], np.log(np.maximum(bright[some], DARKEST * level)))
+        coefficients = _robust_fit(terms[some], np.log(np.maximum(bright[some], MIN_INTENSITY * level)))
         value[pixels] = bright / np.exp(terms @ coefficients).clip(*FIELD_RANGE)
     return replace(slices, value=value.astype(np.float32))
 
 
 def _robust_fit(terms: NDArray[np.float64], log_value: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients [5] of the terms [P, 5], beside a free constant."""
+    """Coefficients [5] of the terms [P, 5], fitted with a free constant."""
     basis = np.c_[terms, np.ones(len(terms))]
     weight = np.ones(len(basis))
     ridge = 1e-6 * len(basis) * np.eye(basis.shape[1])  # a stack that is a line of pixels has no y

@@ -1,4 +1,4 @@
-"""Motion of every slice: rival hypotheses, runs between jerks, then each slice for itself, coarse to fine."""
+"""Poses of all slices: global search of motion segments, then each slice for itself, coarse to fine."""
 
 from __future__ import annotations
 
@@ -13,34 +13,42 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
+from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
-from g3r.registration.candidates import aligned_to, estimate_interleave, held_out_score, moved, with_rows
-from g3r.registration.global_search import search, search_single
-from g3r.registration.placement import StackSamples
-from g3r.registration.segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.global_search import GlobalSearch, search_single
+from g3r.registration.held_out import estimate_interleave, held_out_score
+from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
-from g3r.registration.slice_rounds import FittedSlices, SliceRounds, correlation_with_all, refine_slices
-from g3r.registration.template_search import template_fits
+from g3r.registration.similarity import StackSamples
+from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, refine_slices
+from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
 
+SEARCH_SHARE, ROUNDS_SHARE = 0.6, 0.7
+"""Share of the available time for the search, and of the rest for the rounds of slices. What remains is for
+scoring the rigid stacks and for the orientation."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Registration:
-    """Slices in estimated poses with gain [K], trust [K] in (0, 1] and correlation [K] with the volume.
+    """Slices in estimated poses (the pose of every slice in G3R Eq. 1), and how well they fit.
 
     Args:
         slices: in the frame of the result.
-        gain, weight, ncc: see above.
+        gain: [K] intensity factors.
+        weight: [K] slice weights in (0, 1].
+        ncc: [K] correlation of each slice with the volume.
         held_out: for each stack the correlation with a volume made of the other stacks, outline included;
             None for a single stack.
-        initialisation: where the search started.
-        initialisations: held-out correlation of every hypothesis, stack by stack.
-        interleave: of each stack, as its motion suggests; None where it lay still, which suggests nothing.
-        n_segments: of each stack, between jerks; 1 where it lay still.
-        orientation: how the result was turned; None where it stays in scanner space.
-        history: one line of figures a round.
+        initialisation: name of the one that the search started from.
+        initialisations: held-out correlation of every initialisation, stack by stack.
+        interleave: of each stack, as its motion suggests; None for a rigid stack.
+        n_segments: motion segments of each stack; 1 for a rigid stack.
+        orientation: the standard orientation; None where the result stays in the scanner frame.
+        history: figures of each round.
     """
 
     slices: Slices
@@ -55,6 +63,11 @@ class Registration:
     orientation: Orientation | None
     history: list[dict[str, float]] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        frame = "scanner frame" if self.orientation is None else "atlas frame"
+        ncc = f"median NCC {np.median(self.ncc):.2f}"
+        return f"Registration({self.slices!r} from {self.initialisation}, {frame}, {ncc})"
+
 
 def register(
     slices: Slices,
@@ -68,16 +81,14 @@ def register(
     """Poses of all slices, from their header poses.
 
     Args:
-        slices: intensities of order one (the 99th percentile near 1), at their header poses.
-        settings: which layers, and how long.
-        progress: called with (rounds done, rounds in all).
-        template: mean heads; None leaves that layer out.
+        slices: normalised (the 99th percentile near 1), at their header poses.
+        settings: which layers run, and how long.
+        progress: called with the rounds done and their total.
+        template: atlas template; None skips that initialisation.
         proposals: motions [K] (world from header) by other means, such as the pose network, by name.
-        deadline: registration shortens its search and its rounds to end by then, if it can.
+        deadline: search and rounds are shortened to end by then, if they can.
     """
-    given = slices
-    if settings.bias_correction:
-        slices = bias_corrected(slices)
+    given, slices = slices, bias_corrected(slices)
     samples = StackSamples.of_all(slices, settings.n_candidates)
     single = len(samples) == 1
     if template is not None and not (settings.template and template_fits(slices, template)):
@@ -85,96 +96,79 @@ def register(
     if single:
         found = search_single(slices, samples[0], settings, template)
     else:
-        by_then = deadline.part(SEARCH_SHARE) if deadline else None
-        found = search(slices, samples, settings, template, proposals or {}, by_then)
-    motion, placed = found.motion, found.placed
-    n_segments, interleave = _segments_of(samples, motion)
-    posed = moved(slices, motion)
-    rounds = SliceRounds(
-        0 if single else settings.n_rounds, settings.steps_per_round, settings.finest_voxel_mm, settings.max_pixels
-    )
-    fitted = refine_slices(posed, rounds, progress, deadline.part(ROUNDS_SHARE) if deadline else None)
+        search_deadline = deadline.part(SEARCH_SHARE) if deadline else None
+        found = GlobalSearch(slices, samples, settings, template).run(proposals or {}, search_deadline)
+    n_segments, interleave = _segments_of(samples, found.motion)
+    rounds = replace(settings, n_rounds=0) if single else settings
+    rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
+    fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline)
     held_out = None
     if not single:
-        still = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
-        fitted, held_out = _kept_where_better(slices, samples, still, motion, fitted, settings.finest_voxel_mm)
+        rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
+        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found.motion, fitted, settings.finest_voxel_mm)
     orientation = None
-    if placed is not None and settings.standard_orientation:
-        start = placed.motion(len(slices), samples)
+    if found.placed is not None and settings.standard_orientation:
+        start = found.placed.motion(len(slices), samples)
         rng = np.random.default_rng(settings.seed)
-        orientation = standard_orientation(fitted.slices, placed.heads, start, rng)
+        orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
     pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
-    result = given.with_pose(pose)
     return Registration(
-        result,
-        fitted.gain,
-        fitted.weight,
-        fitted.ncc,
-        held_out,
-        found.initialisation,
-        found.initialisations,
-        interleave,
-        n_segments,
-        orientation,
-        fitted.history,
+        slices=given.with_pose(pose),
+        gain=fitted.gain,
+        weight=fitted.weight,
+        ncc=fitted.ncc,
+        held_out=held_out,
+        initialisation=found.initialisation,
+        initialisations=found.initialisations,
+        interleave=interleave,
+        n_segments=n_segments,
+        orientation=orientation,
+        history=fitted.history,
     )
 
 
-SEARCH_SHARE, ROUNDS_SHARE = 0.6, 0.7
-"""Of the time that there is, how much the search may take; and of what is left then, how much the rounds may.
-The rest is for the judgement of stacks that lay still and for the orientation."""
-
-MAX_LOSS = 0.02
-"""A still stack whose held-out correlation falls by more than this as its slices move goes back in line."""
-
-MIN_GAIN_NCC = 0.015
-"""... and so does one whose slices correlate better with the volume of all by less than this, in the median:
-0.004 to 0.010 where nothing moved (they fit noise), 0.02 to 0.05 with mild motion."""
-
-
-def _kept_where_better(
+def _with_rigid_stacks(
     slices: Slices,
     samples: list[StackSamples],
-    still: list[int],
+    rigid: list[int],
     motion: RigidPose,
     fitted: FittedSlices,
     voxel_mm: float,
 ) -> tuple[FittedSlices, list[float]]:
-    """The fitted slices, still stacks that lost by it back in line, and held-out correlations of all.
+    """Make stacks rigid again that gained nothing from slice poses of their own; held-out correlations of all.
 
-    Small and thick slices fit noise, and where nothing moved there is nothing to gain. Stacks that did move
+    Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
     are not asked: a few slices that went astray lower their correlation, while all others gain.
     """
     before = held_out_score(slices, samples, motion)
     refined = fitted.slices.world_from_header()
     equal = np.ones(len(slices))
-    rigid_stack = correlation_with_all(moved(slices, motion), equal, equal, voxel_mm)
+    rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
     after = held_out_score(slices, samples, refined)
-    lost = [
+    reverted = [
         sample
-        for sample, old, new in zip(samples, before.prediction, after.prediction, strict=True)
-        if sample.stack in still
+        for sample, old, new in zip(samples, before.correlations, after.correlations, strict=True)
+        if sample.stack in rigid
         and (
-            new.correlation < old.correlation - MAX_LOSS
-            or np.median(fitted.ncc[sample.rows]) < np.median(rigid_stack[sample.rows]) + MIN_GAIN_NCC
+            new < old - MAX_HELD_OUT_LOSS
+            or np.median(fitted.ncc[sample.rows]) < np.median(rigid_ncc[sample.rows]) + MIN_NCC_GAIN
         )
     ]
-    if not lost:
-        return fitted, [p.correlation for p in after.prediction]
-    # the refined slices as a whole may have drifted from the runs; stacks that go back must follow
+    if not reverted:
+        return fitted, after.correlations
+    # the refined slices as a whole may have drifted from the segments; stacks that revert must follow
     motion = aligned_to(slices, refined, motion)
     gain, weight = fitted.gain.copy(), fitted.weight.copy()
-    for sample in lost:
-        logger.info("stack %d: slices go back in line", sample.stack)
-        refined = with_rows(refined, sample.rows, motion.take(sample.rows))
-        gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # what the refined poses said of them
-    final = held_out_score(slices, samples, refined)
-    kept = replace(fitted, slices=moved(slices, refined), gain=gain, weight=weight)
-    return kept, [p.correlation for p in final.prediction]
+    for sample in reverted:
+        logger.info("stack %d: is rigid, slices keep its motion", sample.stack)
+        refined = refined.with_rows(sample.rows, motion.take(sample.rows))
+        gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
+    kept = replace(fitted, slices=slices.with_motion(refined), gain=gain, weight=weight)
+    return kept, held_out_score(slices, samples, refined).correlations
 
 
 def _segments_of(samples: list[StackSamples], motion: RigidPose) -> tuple[list[int], list[int | None]]:
-    """Number of runs of each stack, and the acquisition order under which they are fewest."""
+    """Number of motion segments of each stack, and the interleave under which they are fewest."""
     n_segments, interleave = [], list[int | None]()
     for sample in samples:
         own = motion.take(sample.rows)

@@ -1,4 +1,4 @@
-"""The search for where stacks and their runs of slices lie: every hypothesis tried, the best one followed."""
+"""The global search: several initialisations are scored by held-out stacks, the best is refined by segments."""
 
 from __future__ import annotations
 
@@ -11,127 +11,117 @@ import numpy as np
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.candidates import (
-    MARGIN,
-    HeldOutScore,
-    aligned_to,
-    best_initialisation,
-    collapse_to_rigid,
-    held_out_score,
-    one_motion_or_segments,
-    refine_segments,
-)
-from g3r.registration.placement import StackSamples
+from g3r.registration.atlas_search import AtlasPlacement, place_in_atlas
+from g3r.registration.held_out import HeldOutScore, best_initialisation, held_out_score
+from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments, rigid_or_segments
 from g3r.registration.settings import RegistrationSettings
+from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
-from g3r.registration.template_search import TemplatePlacement, place_in_template
+from g3r.registration.thresholds import MIN_COST_GAIN, MIN_COST_GAIN_SINGLE, RETRY_BELOW_CORRELATION
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
 
-SINGLE_MARGIN = 450.0
-"""How much cheaper runs must be for a single stack, which only a mean head holds together: to 277 with mild
-motion, where one motion for all slices is nearer to the truth (0.7-0.9 mm instead of 0.8-2.6), 691 to 1950
-with jerks (15 stacks of development and validation subjects)."""
-
-SETTLED = 0.68
-"""Held-out correlation that every stack must reach; below it the search is begun again by other random
-numbers. Stacks in place reach 0.66 to 0.9, so that a few of them are searched for again in vain."""
-
 
 @dataclass(frozen=True)
-class Searched:
-    """What a search found.
+class SearchResult:
+    """What the search found.
 
     Args:
         motion: [K] world from header.
-        initialisation: where it started.
-        initialisations: held-out correlation of every hypothesis, stack by stack.
-        placed: the slices in the mean head; None without a template.
+        initialisation: the name of the one it started from.
+        initialisations: held-out correlation of every initialisation, stack by stack.
+        placed: the slices in the atlas template; None without one.
     """
 
     motion: RigidPose
     initialisation: str
     initialisations: dict[str, list[float]]
-    placed: TemplatePlacement | None
+    placed: AtlasPlacement | None
 
 
-def search(
-    slices: Slices,
-    samples: list[StackSamples],
-    settings: RegistrationSettings,
-    template: AtlasTemplate | None,
-    proposals: Mapping[str, RigidPose],
-    deadline: Deadline | None = None,
-) -> Searched:
-    """Motions of the slices of two or more stacks.
+@dataclass(frozen=True)
+class GlobalSearch:
+    """The search for the poses of two or more stacks.
 
     Args:
         slices: of all stacks.
-        samples: the same, as a search sees them.
-        settings: which hypotheses, how many attempts.
-        template: mean heads; None leaves them out.
-        proposals: motions [K] (world from header) by other means, by name.
-        deadline: no attempt begins after it, and the first one ends by it if it can.
+        samples: the thinned pixels of each stack.
+        settings: which initialisations, how many attempts.
+        template: atlas template; None skips that initialisation.
     """
-    fixed = {"headers": RigidPose.identity(len(slices))}
-    if settings.network:
-        fixed |= dict(proposals)
-    if settings.stacks:
-        fixed["stacks"] = register_stacks(slices)[0].world_from_header()
-    best: tuple[HeldOutScore, Searched] | None = None
-    for attempt in range(max(1, settings.attempts)):
-        rng = np.random.default_rng([settings.seed, attempt])
-        judgement, found = _attempt(slices, samples, settings, template, fixed, rng, deadline)
-        if best is None or judgement.cost < best[0].cost:
-            best = judgement, found
-        least = min(p.correlation for p in best[0].prediction)
-        if least >= SETTLED or not settings.segments or (deadline is not None and deadline.has_passed()):
-            break
-        logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, least)
-    assert best is not None
-    return best[1]
 
+    slices: Slices
+    samples: list[StackSamples]
+    settings: RegistrationSettings
+    template: AtlasTemplate | None
 
-def _attempt(
-    slices: Slices,
-    samples: list[StackSamples],
-    settings: RegistrationSettings,
-    template: AtlasTemplate | None,
-    fixed: Mapping[str, RigidPose],
-    rng: np.random.Generator,
-    deadline: Deadline | None,
-) -> tuple[HeldOutScore, Searched]:
-    initialisations, placed = dict(fixed), None
-    if template is not None:
-        placed = place_in_template(slices, samples, template, rng)
-        initialisations["template"] = placed.motion(len(slices), samples)
-    name, judgements = best_initialisation(slices, samples, initialisations)
-    judged = {key: [p.correlation for p in value.prediction] for key, value in judgements.items()}
-    start = initialisations[name]
-    motion, judgement = start, judgements[name]
-    if settings.segments:
-        rivals = [aligned_to(slices, start, other) for key, other in initialisations.items() if key != name]
-        settled, placements = refine_segments(slices, samples, start, rivals, rng, deadline)
-        settled, _ = collapse_to_rigid(slices, samples, settled, [one.segments.interleave for one in placements])
-        after = held_out_score(slices, samples, settled)
-        if after.cost <= judgement.cost - MARGIN:
-            motion, judgement = settled, after
-    return judgement, Searched(motion, name, judged, placed)
+    def run(self, proposals: Mapping[str, RigidPose], deadline: Deadline | None = None) -> SearchResult:
+        """Search until every stack is well predicted by the others, or the attempts are used up.
+
+        Args:
+            proposals: motions [K] (world from header) by other means, by name.
+            deadline: no attempt begins after it, and the first one ends by it if it can.
+        """
+        initialisations = {"headers": RigidPose.identity(len(self.slices))}
+        if self.settings.network:
+            initialisations |= dict(proposals)
+        if self.settings.stacks:
+            initialisations["stacks"] = register_stacks(self.slices)[0].world_from_header()
+        best: tuple[HeldOutScore, SearchResult] | None = None
+        for attempt in range(max(1, self.settings.attempts)):
+            rng = np.random.default_rng([self.settings.seed, attempt])
+            score, found = self._attempt(initialisations, rng, deadline)
+            if best is None or score.cost < best[0].cost:
+                best = score, found
+            lowest = min(best[0].correlations)
+            finished = lowest >= RETRY_BELOW_CORRELATION or not self.settings.segments
+            if finished or (deadline is not None and deadline.has_passed()):
+                break
+            logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
+        assert best is not None
+        return best[1]
+
+    def _attempt(
+        self, initialisations: dict[str, RigidPose], rng: np.random.Generator, deadline: Deadline | None
+    ) -> tuple[HeldOutScore, SearchResult]:
+        slices, samples, placed = self.slices, self.samples, None
+        if self.template is not None:
+            placed = place_in_atlas(slices, samples, self.template, rng)
+            initialisations = {**initialisations, "template": placed.motion(len(slices), samples)}
+        name, scores = best_initialisation(slices, samples, initialisations)
+        motion, score = initialisations[name], scores[name]
+        if self.settings.segments:
+            others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
+            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline)
+            interleave = [placement.segments.interleave for placement in placements]
+            segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave)
+            after = held_out_score(slices, samples, segmented)
+            if after.cost <= score.cost - MIN_COST_GAIN:
+                motion, score = segmented, after
+        correlations = {key: value.correlations for key, value in scores.items()}
+        return score, SearchResult(motion, name, correlations, placed)
 
 
 def search_single(
     slices: Slices, sample: StackSamples, settings: RegistrationSettings, template: AtlasTemplate | None
-) -> Searched:
-    """Motions of the slices of one stack: no other stack holds it together, a mean head does, roughly."""
+) -> SearchResult:
+    """Motions of the slices of one stack, which only the atlas template holds together, and roughly.
+
+    Args:
+        slices: of one stack.
+        sample: its thinned pixels.
+        settings: whether motion segments are searched.
+        template: atlas template; None leaves the slices at their headers.
+    """
     motion = RigidPose.identity(len(slices))
     if template is None:
-        return Searched(motion, "headers", {}, None)
-    placed = place_in_template(slices, [sample], template, np.random.default_rng([settings.seed, 0]))
+        return SearchResult(motion, "headers", {}, None)
+    placed = place_in_atlas(slices, [sample], template, np.random.default_rng([settings.seed, 0]))
     if not settings.segments:
-        return Searched(motion, "headers", {}, placed)
-    only, head = placed.placement[0], placed.head
-    motion, is_one = one_motion_or_segments(
-        slices, sample, only.motion, only.segments.interleave, head.volume, head.grid, SINGLE_MARGIN
+        return SearchResult(motion, "headers", {}, placed)
+    (placement,), head = placed.placement, placed.template
+    motion, is_rigid = rigid_or_segments(
+        slices, sample, placement.motion, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
     )
-    return Searched(motion, "headers" if is_one else "template", {}, placed)
+    return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

@@ -1,9 +1,9 @@
 """Normal equations of rigid slice-to-volume registration, all slices at once, through the PSF.
 
 For a slice in pose (R, t) with gain g the model of a pixel at u is g sum_q w_q V(R (u + u_q) + t), with the
-PSF's quadrature nodes u_q. Parameters of a slice are a body-frame turn w (R <- R exp[w]), a body-frame shift
-v (t <- t + R v) and the logarithm of the gain; with the gradient h = R^T grad V the derivatives are
-u x h, h and the model itself. Residuals count with the Cauchy loss of a common width.
+quadrature nodes u_q of the PSF (G3R Eq. 2). Parameters of a slice are a body-frame rotation w (R <- R exp[w]),
+a body-frame translation v (t <- t + R v) and the logarithm of the gain; with the gradient h = R^T grad V the
+derivatives are u x h, h and the model itself. Residuals count with a Cauchy loss of one width for all slices.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
+from g3r.registration.similarity import correlation
 
 N_PARAMETERS = 7
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Per slice: hessian [K, 7, 7] and right-hand side [K, 7], and statistics of the fit.
+    """Normal equations and statistics of the fit, slice by slice.
 
-    loss [K] is the mean Cauchy loss; ncc [K] the normalised cross-correlation of slice and model;
-    moments [K, 6] the sums n, y, m, yy, mm, ym from which it comes.
+    Args:
+        hessian: [K, 7, 7].
+        gradient: [K, 7] right-hand side.
+        loss: [K] mean Cauchy loss.
+        moments: [K, 6] sums n, y, m, yy, mm, ym over the pixels y of a slice and the model m.
     """
 
     hessian: NDArray[np.float64]
@@ -41,47 +45,34 @@ class NormalEquations:
         return correlation(self.moments)
 
 
-def correlation(moments: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation coefficients from sums n, y, m, yy, mm, ym [..., 6]; 0 where a variance vanishes."""
-    n, y, m, yy, mm, ym = np.moveaxis(moments, -1, 0)
-    n = np.maximum(n, 1.0)
-    var_y, var_m = yy - y * y / n, mm - m * m / n
-    product = var_y * var_m
-    defined = (var_y > 1e-12 * yy) & (var_m > 1e-12 * mm) & (product > 0)
-    return np.where(defined, (ym - y * m / n) / np.sqrt(np.where(defined, product, 1.0)), 0.0)
-
-
 class SliceModel:
-    """Everything that stays the same while poses change: pixels, PSF nodes, the volume.
+    """What stays the same while poses change: pixels, PSF nodes, the volume.
 
     Args:
         slices: K slices.
         volume: [I, J, K] on the grid.
         grid: voxel grid.
-        stride: use every n-th masked pixel (coarse levels).
+        stride: every n-th masked pixel is used (coarse levels).
         psf_points: quadrature nodes through the slice.
-        weight: [P'] of every masked pixel, before the stride.
     """
 
     def __init__(
-        self,
-        slices: Slices,
-        volume: NDArray[np.float32],
-        grid: VolumeGrid,
-        *,
-        stride: int = 1,
-        psf_points: int = 5,
-        weight: NDArray[np.float32] | None = None,
+        self, slices: Slices, volume: NDArray[np.float32], grid: VolumeGrid, *, stride: int = 1, psf_points: int = 5
     ) -> None:
         index = slices.pixel_index[::stride]
         self.operator = VoxelOperator(slices.planes, grid, index, (1, 1, psf_points))
         self.value = slices.value[index]
-        self.weight = np.ones(len(index), np.float32) if weight is None else weight[::stride]
         self.volume = np.ascontiguousarray(volume, dtype=np.float32)
         self.start = np.searchsorted(self.operator.plane, np.arange(len(slices) + 1))
 
     def evaluate(self, planes: Planes, gain: NDArray[np.float64], width: float) -> NormalEquations:
-        """Linearise at poses and gains; `width` is the residual at which the Cauchy loss bends."""
+        """Linearise at poses and gains.
+
+        Args:
+            planes: the slices' pixel grids in their present poses.
+            gain: [K] intensity factors.
+            width: residual at which the Cauchy loss bends.
+        """
         self.operator.move(planes)
         n = len(planes)
         hessian, gradient = np.zeros((n, N_PARAMETERS, N_PARAMETERS)), np.zeros((n, N_PARAMETERS))
@@ -92,7 +83,6 @@ class SliceModel:
             self.start,
             op.uv_mm,
             self.value,
-            self.weight,
             op.index_from_plane,
             op.index_center,
             op.node_index,
@@ -108,7 +98,7 @@ class SliceModel:
         return NormalEquations(hessian, gradient, loss, moments)
 
     def residuals(self, planes: Planes, gain: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Slice minus model for every pixel in use."""
+        """Slice minus model for every used pixel."""
         self.operator.move(planes)
         model = gain[self.operator.plane] * self.operator.forward(self.volume)
         return self.value - model.astype(np.float32)
@@ -120,7 +110,6 @@ def _accumulate(
     start,
     uv,
     value,
-    weight,
     index_from_plane,
     index_center,
     node_index,
@@ -138,7 +127,6 @@ def _accumulate(
         m = index_from_plane[k]
         jac = np.zeros(N_PARAMETERS)
         total = 0.0
-        n_used = 0.0
         for p in range(start[k], start[k + 1]):
             x0 = index_center[k, 0] + m[0, 0] * uv[p, 0] + m[0, 1] * uv[p, 1]
             y0 = index_center[k, 1] + m[1, 0] * uv[p, 0] + m[1, 1] * uv[p, 1]
@@ -179,22 +167,21 @@ def _accumulate(
             observed = value[p]
             residual = observed - gain[k] * model
             ratio = residual / width
-            slice_weight = weight[p]
-            factor = slice_weight / (1.0 + ratio * ratio)
-            total += slice_weight * math.log1p(ratio * ratio)
-            n_used += slice_weight
+            factor = 1.0 / (1.0 + ratio * ratio)
+            total += math.log1p(ratio * ratio)
             for a in range(N_PARAMETERS):
                 da = gain[k] * jac[a]
                 gradient[k, a] += factor * da * residual
                 for b in range(a, N_PARAMETERS):
                     hessian[k, a, b] += factor * da * gain[k] * jac[b]
-            moments[k, 0] += slice_weight
-            moments[k, 1] += slice_weight * observed
-            moments[k, 2] += slice_weight * model
-            moments[k, 3] += slice_weight * observed * observed
-            moments[k, 4] += slice_weight * model * model
-            moments[k, 5] += slice_weight * observed * model
+            moments[k, 0] += 1.0
+            moments[k, 1] += observed
+            moments[k, 2] += model
+            moments[k, 3] += observed * observed
+            moments[k, 4] += model * model
+            moments[k, 5] += observed * model
         for a in range(N_PARAMETERS):
             for b in range(a):
                 hessian[k, a, b] = hessian[k, b, a]
+        n_used = start[k + 1] - start[k]
         loss[k] = total / n_used if n_used > 0 else 0.0

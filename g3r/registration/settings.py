@@ -5,28 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RegistrationSettings:
     """Which layers run, and how long they search.
 
     Args:
-        flatten: divide slow trends of intensity out of each stack before it is registered.
-        template: place runs of slices in mean heads (needs a template); gives the standard orientation.
-        network: consider the pose network's proposal.
-        network_as_reserve: ... only where no mean head is of the subject's size.
-        stacks: consider stacks registered to each other from many starts.
-        segments: place runs of slices again in the volume of the other stacks.
-        n_candidates: random motions tried for a stack in one go of the search.
-        attempts: searches with other random numbers, at most, where stacks do not predict each other.
-        n_rounds: alternations of volume and slices; 0 leaves the slices where the runs are.
+        template: initialisation by atlas templates; it also gives the standard orientation.
+        network: initialisation by the pose network.
+        network_as_reserve: ... only where no atlas template is of the subject's size.
+        stacks: initialisation by stacks registered to each other from many starts.
+        segments: place motion segments again in the volume of the other stacks.
+        n_candidates: random motions tried at once for a stack in the search.
+        attempts: at most this many searches with other random numbers while stacks do not predict each other.
+        n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
         max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
-        standard_orientation: turn the result into the atlas frame; otherwise it stays in scanner space.
+        standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
         seed: of the random search.
     """
 
-    bias_correction: bool = True
     template: bool = True
     network: bool = True
     network_as_reserve: bool = False

@@ -1,4 +1,4 @@
-"""Slice-to-volume registration: batched damped Gauss-Newton of all slices, robust, with gain."""
+"""Slice-to-volume registration: Levenberg-Marquardt on all slices at once, robust, with gain."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.06, 2.0
 """Trust region of one step of a slice."""
 
 GAIN_PRIOR_SIGMA = 0.3
-"""Spread of the logarithm of slice gains before the image speaks (a prior; keeps dark slices finite)."""
+"""Standard deviation of the prior on the logarithm of slice gains; keeps dark slices finite."""
 
 NEIGHBOURS = (-2, -1, 1, 2)
+"""Steps to the slices of a stack that count as neighbours."""
 
 TIE_SHARE = 0.01
-"""Stiffness of the tie between neighbours, as a share of the median slice's own stiffness: a slice through
-the middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
+"""Stiffness of the tie between neighbours, as a share of the median stiffness of a slice: a slice through the
+middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
 
 TIE_REACH_MM = 3.0
-"""Neighbours that would put a slice further away than this count less: after a jerk, and between the passes
-of an interleaved stack, neighbours lie elsewhere for good reason."""
+"""Neighbours whose motion would move a slice further than this count less: after a jerk, and between the
+passes of an interleaved stack, neighbours are elsewhere for good reason."""
 
 
 def register_slices(
     model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, n_steps: int, width: float
 ) -> tuple[Slices, NDArray[np.float64], NormalEquations]:
-    """Levenberg-Marquardt steps for every slice at once, each with a damping of its own.
+    """Levenberg-Marquardt steps for every slice at once, each with its own damping.
 
     Args:
-        model: the slices' pixels and the volume.
+        model: the pixels of the slices and the volume.
         slices: K slices at their present poses.
         gain: [K] present intensity factors.
         n_steps: number of evaluations.
@@ -59,17 +60,23 @@ def register_slices(
         trial_log_gain = log_gain + step[:, 6]
         trial = model.evaluate(slices.planes.with_pose(trial_pose), np.exp(trial_log_gain), width)
         better = _objective(trial, width) + tie.cost(trial_pose) < _objective(current, width) + tie.cost(pose)
-        pose = _choose(better, trial_pose, pose)
+        pose = _where(better, trial_pose, pose)
         log_gain = np.where(better, trial_log_gain, log_gain)
-        current = _choose_equations(better, trial, current)
+        current = _where_equations(better, trial, current)
         damping = np.where(better, np.maximum(damping / 3, 1e-4), damping * 6)
     return slices.with_pose(pose), np.exp(log_gain - log_gain.mean()), current
 
 
 def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, width: float) -> tuple[Slices, int]:
-    """Offer every slice the motions of its neighbours in the stack, and keep what fits clearly better.
+    """Give every slice the motion of a neighbour in the stack where that fits clearly better.
 
-    A slice that locked on wrongly sees no gradient towards its place; its neighbours mostly lie there.
+    A slice in a wrong local minimum sees no gradient towards its place; its neighbours are mostly near it.
+
+    Args:
+        model: the pixels of the slices and the volume.
+        slices: K slices at their present poses.
+        gain: [K] intensity factors.
+        width: residual at which the Cauchy loss bends.
 
     Returns:
         The slices, and how many took another motion.
@@ -86,20 +93,21 @@ def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64],
         source = np.where(valid, source, np.arange(len(slices)))
         candidate = motion.take(source) @ slices.header_pose
         loss = model.evaluate(slices.planes.with_pose(candidate), gain, width).loss
-        # a margin, because each slice helped to make the volume and so prefers its present place
+        # a margin, because each slice helped to make the volume and so fits best where it is
         better = valid & (loss < 0.97 * best)
-        best_pose = _choose(better, candidate, best_pose)
+        best_pose = _where(better, candidate, best_pose)
         best = np.where(better, loss, best)
     return slices.with_pose(best_pose), int((best < current).sum())
 
 
 @dataclass(frozen=True)
 class NeighbourTie:
-    """A spring from every slice to where its neighbours in the stack would put it.
+    """A quadratic penalty that ties every slice to where its neighbours in the stack would put it.
 
-    target [K]: mean of the neighbours' motions, weighted by how well each is determined, applied to the
-    slice's header pose; precision [K, 6] of the spring for turns (1/rad^2) and shifts (1/mm^2), in the units
-    of the squared residuals.
+    Args:
+        target: [K] mean of the neighbours' motions, weighted by how well each is determined, applied to the
+            header pose of the slice.
+        precision: [K, 6] of rotations (1/rad^2) and translations (1/mm^2), in units of the squared residuals.
     """
 
     target: RigidPose
@@ -112,7 +120,7 @@ class NeighbourTie:
         motion = slices.world_from_header()
         pose = slices.planes.pose
         information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
-        # a turn is judged by how far it moves the slice's rim; slices of a few pixels have hardly any
+        # a rotation counts by how far it moves the edge of the slice; slices of a few pixels have hardly any
         half_mm = slices.planes.shape * slices.planes.spacing_mm / 2
         radius_mm = np.maximum(np.sqrt((half_mm**2).mean(1)), 10.0)
         rotation = np.zeros((n, 3, 3))
@@ -123,8 +131,9 @@ class NeighbourTie:
             source = np.clip(source, 0, n - 1)
             valid &= slices.stack_id[source] == slices.stack_id
             candidate = motion.take(source) @ slices.header_pose
-            turn = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
-            away_mm = np.hypot(np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1), radius_mm * turn)
+            angle = Rotation.from_matrix(pose.rotation.transpose(0, 2, 1) @ candidate.rotation).magnitude()
+            shift_mm = np.linalg.norm(candidate.translation_mm - pose.translation_mm, axis=1)
+            away_mm = np.hypot(shift_mm, radius_mm * angle)
             weight = np.where(valid, information[source] / (1 + (away_mm / TIE_REACH_MM) ** 2), 0.0)
             rotation += weight[:, None, None] * candidate.rotation
             translation += weight[:, None] * candidate.translation_mm
@@ -140,14 +149,14 @@ class NeighbourTie:
         return cls(target, np.repeat(precision, 3, axis=1))
 
     def twist(self, pose: RigidPose) -> NDArray[np.float64]:
-        """Body-frame turn and shift [K, 6] from poses to the target."""
+        """Body-frame rotation and translation [K, 6] from poses to the target."""
         back = pose.rotation.transpose(0, 2, 1)
-        turn = Rotation.from_matrix(back @ self.target.rotation).as_rotvec()
-        shift = np.einsum("kij,kj->ki", back, self.target.translation_mm - pose.translation_mm)
-        return np.concatenate([turn, shift], axis=1)
+        rotation = Rotation.from_matrix(back @ self.target.rotation).as_rotvec()
+        translation = np.einsum("kij,kj->ki", back, self.target.translation_mm - pose.translation_mm)
+        return np.concatenate([rotation, translation], axis=1)
 
     def cost(self, pose: RigidPose) -> NDArray[np.float64]:
-        """Energy of the springs [K]."""
+        """Penalty of each slice [K]."""
         return 0.5 * (self.precision * self.twist(pose) ** 2).sum(1)
 
 
@@ -171,7 +180,7 @@ def _solve(
     gradient[:, :6] += tie.precision * tie.twist(pose)
     hessian[:, np.arange(6), np.arange(6)] += tie.precision
     diagonal = np.einsum("kii->ki", hessian)
-    # relative to the largest turn or shift, so that an edge slice without contrast stays where it is
+    # relative to the largest rotation or translation, so that an edge slice without contrast stays in place
     floor = np.repeat([1e-3, 1e-3, 1.0], [3, 3, 1]) * np.repeat(
         np.stack([diagonal[:, :3].max(1), diagonal[:, 3:6].max(1), diagonal[:, 6]], 1), [3, 3, 1], axis=1
     )
@@ -188,18 +197,16 @@ def _limit(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
     return np.minimum(1.0, longest / np.maximum(length, 1e-30))
 
 
-def _choose(take_first: NDArray[np.bool_], first: RigidPose, second: RigidPose) -> RigidPose:
+def _where(take_first: NDArray[np.bool_], first: RigidPose, second: RigidPose) -> RigidPose:
     return RigidPose(
         np.where(take_first[:, None, None], first.rotation, second.rotation),
         np.where(take_first[:, None], first.translation_mm, second.translation_mm),
     )
 
 
-def _choose_equations(
-    take_first: NDArray[np.bool_], first: NormalEquations, second: NormalEquations
-) -> NormalEquations:
+def _where_equations(take_first: NDArray[np.bool_], first: NormalEquations, second: NormalEquations) -> NormalEquations:
     chosen = []
-    for name in ("hessian", "gradient", "loss", "moments"):
+    for name in NormalEquations.__dataclass_fields__:
         a, b = getattr(first, name), getattr(second, name)
         chosen.append(np.where(take_first.reshape(-1, *(1,) * (a.ndim - 1)), a, b))
     return NormalEquations(*chosen)

@@ -1,4 +1,4 @@
-"""Volume and slices in turns: every slice a rigid body of its own, coarse to fine."""
+"""Volume and slice poses in alternation: every slice its own rigid body, coarse to fine."""
 
 from __future__ import annotations
 
@@ -16,36 +16,20 @@ from g3r.acquisition.robust import robust_width, slice_weights
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
+from g3r.registration.settings import RegistrationSettings
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class SliceRounds:
-    """How long slices are registered.
-
-    Args:
-        n_rounds: alternations of volume and slices.
-        steps_per_round: Gauss-Newton steps of the slices in a round.
-        finest_voxel_mm: voxel of the last rounds.
-        max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
-    """
-
-    n_rounds: int
-    steps_per_round: int
-    finest_voxel_mm: float
-    max_pixels: int
-
-
 MIN_ROUNDS = 3
-"""One round for each voxel size, however little time there is."""
+"""One round for each voxel size, whatever the deadline."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FittedSlices:
-    """Slices at their last poses with gain, weight and correlation [K], and a line of figures a round."""
+    """Slices at their last poses with gain, weight and correlation [K], and figures of each round."""
 
     slices: Slices
     gain: NDArray[np.float64]
@@ -56,16 +40,16 @@ class FittedSlices:
 
 def refine_slices(
     slices: Slices,
-    rounds: SliceRounds,
+    settings: RegistrationSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
     deadline: Deadline | None = None,
 ) -> FittedSlices:
-    """Register every slice to the volume of all, which is made anew in each round.
+    """Register every slice to the volume of all, which each round makes anew.
 
     Args:
         slices: at poses right to a few millimetres.
-        rounds: how long.
-        progress: called with (rounds done, rounds in all).
+        settings: number of rounds and steps, finest voxel, number of pixels.
+        progress: called with the rounds done and their total.
         deadline: fewer rounds if they would end after it.
     """
     gain = np.ones(len(slices))
@@ -73,16 +57,16 @@ def refine_slices(
     volume: NDArray[np.float32] | None = None
     grid: VolumeGrid | None = None
     history: list[dict[str, float]] = []
-    for number, done in timed_steps(rounds.n_rounds, deadline, least=MIN_ROUNDS):
-        progress(number, rounds.n_rounds)
-        # the last round has 1; rounded, so that the steps below do not hang on the last digit
-        fraction = round(min(1.0, done * rounds.n_rounds / max(1, rounds.n_rounds - 1)), 9)
+    for number, done in timed_steps(settings.n_rounds, deadline, least=MIN_ROUNDS):
+        progress(number, settings.n_rounds)
+        # 1 in the last round; rounded, so that the steps below do not depend on the last digit
+        fraction = round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9)
         # coarse to fine: the capture range is about a voxel of the volume's blur
-        voxel = rounds.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
+        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
         smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
         if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
             grid, volume = grid_around(slices, voxel), None
-        n_wanted = rounds.max_pixels / (voxel / rounds.finest_voxel_mm)
+        n_wanted = settings.max_pixels / (voxel / settings.finest_voxel_mm)
         stride = max(1, round(len(slices.pixel_index) / n_wanted))
         volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
         model = SliceModel(slices, volume, grid, stride=stride)
@@ -91,7 +75,7 @@ def refine_slices(
         moved = 0
         if 0.1 < fraction < 0.8:
             slices, moved = try_neighbours(model, slices, gain, width=width)
-        slices, gain, fit = register_slices(model, slices, gain, n_steps=rounds.steps_per_round, width=width)
+        slices, gain, fit = register_slices(model, slices, gain, n_steps=settings.steps_per_round, width=width)
         weight = slice_weights(fit.loss)
         history.append(
             {
@@ -103,9 +87,9 @@ def refine_slices(
             }
         )
         logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
-    progress(rounds.n_rounds, rounds.n_rounds)
-    ncc = correlation_with_all(slices, gain, weight, rounds.finest_voxel_mm)
-    return FittedSlices(slices, gain, weight, ncc, history)
+    progress(settings.n_rounds, settings.n_rounds)
+    ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm)
+    return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
 
 
 def _volume_of(
@@ -133,7 +117,14 @@ def _volume_of(
 def correlation_with_all(
     slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
 ) -> NDArray[np.float64]:
-    """Correlation of each slice [K] with a volume made of all of them."""
+    """Correlation of each slice [K] with a volume made of all of them.
+
+    Args:
+        slices: at their present poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        voxel_mm: of the volume.
+    """
     grid = grid_around(slices, voxel_mm)
     volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
     return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc

@@ -1,4 +1,4 @@
-"""Exhaustive search over the whole sphere of orientations, for a head or for the runs of one stack."""
+"""Exhaustive search over SO(3): orientations of a head or of one stack, and motion segments around them."""
 
 from __future__ import annotations
 
@@ -8,37 +8,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.geometry import VolumeGrid
-from g3r.registration.normal_equations import correlation
-from g3r.registration.placement import Placement, StackSamples, slice_costs
-from g3r.registration.pose_samples import angle_deg, rotations_within, turns_about, uniform_rotations
-from g3r.registration.segments import best_segments
+from g3r.registration.motion_segments import best_segments
+from g3r.registration.placement import Placement
+from g3r.registration.pose_sampling import angle_deg, rotations_about, rotations_within, uniform_rotations
+from g3r.registration.similarity import StackSamples, correlation, slice_costs
 
 N_ORIENTATIONS = 4000
 """Orientations that are tried; the nearest to any is about 10 degrees off."""
 
-N_PEAKS = 4
-PEAK_DISTANCE_DEG = 60.0
-PEAK_MARGIN = 0.08
-N_STACK_PEAKS = 10
-STACK_PEAK_DISTANCE_DEG = 35.0
-"""Orientations that are followed further: at most so many, at least so far apart, and no worse than the best
-by more than this in correlation. One stack alone is more ambiguous than the whole head."""
+N_FOLLOWED, DISTANCE_DEG = 4, 60.0
+N_FOLLOWED_OF_STACK, STACK_DISTANCE_DEG = 10, 35.0
+CORRELATION_MARGIN = 0.08
+"""Orientations that are followed further: at most this many, at least this far apart, and no worse than the
+best by more than this. One stack alone is more ambiguous than the whole head."""
 
 SEGMENT_REACH_DEG = 70.0
 SEGMENT_TRANSLATION_MM = 7.0
-"""How far a run of slices may lie from its stack's orientation, and the lattice of shifts tried."""
+"""How far a motion segment may lie from its stack's orientation, and the lattice of translations tried."""
 
 
-def peaks(
+def best_orientations(
     rotation: NDArray[np.float64],
     agreement: NDArray[np.float64],
-    n_most: int = N_PEAKS,
-    distance_deg: float = PEAK_DISTANCE_DEG,
+    n_most: int = N_FOLLOWED,
+    distance_deg: float = DISTANCE_DEG,
 ) -> list[NDArray[np.float64]]:
-    """The best of rotations [J, 3, 3] by agreement [J] that are far apart from each other, best first."""
+    """The rotations with the highest correlation that are far apart from each other, best first.
+
+    Args:
+        rotation: [J, 3, 3].
+        agreement: [J] correlation of each.
+        n_most: how many at most.
+        distance_deg: angle between any two of them.
+    """
     chosen: list[NDArray[np.float64]] = []
     for n in np.argsort(-agreement):
-        if agreement[n] < agreement.max() - PEAK_MARGIN or len(chosen) == n_most:
+        if agreement[n] < agreement.max() - CORRELATION_MARGIN or len(chosen) == n_most:
             break
         if all(angle_deg(rotation[n], other) > distance_deg for other in chosen):
             chosen.append(rotation[n])
@@ -48,11 +53,18 @@ def peaks(
 def stack_orientations(
     sample: StackSamples, target_mm: NDArray[np.float64], volume: NDArray[np.float32], grid: VolumeGrid
 ) -> list[NDArray[np.float64]]:
-    """Orientations [3, 3] of a whole stack worth following, its centre taken to a target [3] (mm)."""
+    """Orientations [3, 3] of one stack worth following, best first.
+
+    Args:
+        sample: the stack.
+        target_mm: [3] where its centre is taken.
+        volume: [I, J, K].
+        grid: its grid.
+    """
     rotation = uniform_rotations(N_ORIENTATIONS)
-    motion = turns_about(rotation, sample.pixels.center_mm, target_mm)
+    motion = rotations_about(rotation, sample.pixels.center_mm, target_mm)
     agreement = correlation(sample.pixels.moments(volume, grid, motion).sum(1))
-    return peaks(rotation, agreement, N_STACK_PEAKS, STACK_PEAK_DISTANCE_DEG)
+    return best_orientations(rotation, agreement, N_FOLLOWED_OF_STACK, STACK_DISTANCE_DEG)
 
 
 def place_around(
@@ -62,18 +74,18 @@ def place_around(
     volume: NDArray[np.float32],
     grid: VolumeGrid,
 ) -> Placement:
-    """Runs of a stack on a lattice of motions around one orientation.
+    """Motion segments of a stack, chosen from a lattice of motions around one orientation.
 
     Args:
         sample: the stack.
-        base: [3, 3] orientation of the lattice's middle.
-        target_mm: [3] where the stack's centre is taken to, give or take a shift.
+        base: [3, 3] orientation in the middle of the lattice.
+        target_mm: [3] where the stack's centre is taken, up to a translation of the lattice.
         volume: [I, J, K].
         grid: its grid.
     """
     rotation = rotations_within(N_ORIENTATIONS, SEGMENT_REACH_DEG) @ base
     lattice = np.array(list(itertools.product((-SEGMENT_TRANSLATION_MM, 0.0, SEGMENT_TRANSLATION_MM), repeat=3)))
-    candidate = turns_about(
+    candidate = rotations_about(
         np.repeat(rotation, len(lattice), axis=0),
         sample.pixels.center_mm,
         target_mm + np.tile(lattice, (len(rotation), 1)),

@@ -1,9 +1,9 @@
 """Stack-to-stack registration: one stack after the other, from many starts.
 
-A volume is made of the stacks registered so far; the next stack is tried in many turns about the centre of
-the head, the best few are refined by Gauss-Newton with the whole stack as one rigid body, and the one that
-agrees best stays. One after the other, because the mean of unregistered stacks is a blur that draws all of
-them to its centre.
+A volume is made of the stacks registered so far; the next stack is tried in many rotations about the centre
+of the head, the best few are refined by Gauss-Newton with the whole stack as one rigid body, and the best one
+is taken. One after the other, because the mean of unregistered stacks is a blur that draws all of them to its
+centre.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix
-from g3r.registration.normal_equations import SliceModel, correlation
+from g3r.registration.normal_equations import SliceModel
+from g3r.registration.similarity import correlation
 
 logger = logging.getLogger(__name__)
 
@@ -37,11 +38,11 @@ def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
     """Bring all stacks into the frame of the most self-consistent one.
 
     Args:
-        slices: slices of all stacks in header poses, intensities of order one.
+        slices: slices of all stacks at their header poses, normalised.
 
     Returns:
-        The slices in new poses, and for each stack its correlation with the volume of the others that were
-        there when it was registered (1.0 for the first).
+        The slices in new poses, and for each stack its correlation with the volume of the stacks that were
+        registered before it (1.0 for the first).
     """
     stacks = np.unique(slices.stack_id)
     if len(stacks) == 1:
@@ -61,10 +62,9 @@ def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
 
 
 def self_consistency(stack: Slices) -> float:
-    """How well neighbouring slices of a stack continue each other: mean correlation, in [-1, 1].
+    """Mean correlation of neighbouring slices of a stack, in [-1, 1]; high where the fetus lay still.
 
-    Every slice is compared with its neighbour by the header through a nearest-pixel look-up; high where the
-    fetus lay still.
+    Every slice is compared with its neighbour by the header through a nearest-pixel look-up.
     """
     values = []
     planes = stack.planes
@@ -95,10 +95,10 @@ def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
     moving_center, fixed_center = _centroid(moving), _centroid(fixed)
     starts = []
     for angles in itertools.product(SEARCH_ANGLES_DEG, repeat=3):
-        turn = rotation_matrix(np.deg2rad(angles))
-        # about the centre of the head; shifted to the other head's centre, or left where the header says
+        rotation = rotation_matrix(np.deg2rad(angles))
+        # about the centre of the head; moved to the centre of the other stacks, or left where the header says
         for target in (fixed_center, moving_center):
-            motion = RigidPose(turn[None], (target - turn @ moving_center)[None])
+            motion = RigidPose(rotation[None], (target - rotation @ moving_center)[None])
             pose = motion @ moving.planes.pose
             starts.append((_agreement(coarse, moving, pose), pose))
     starts.sort(key=lambda item: -item[0])
@@ -126,7 +126,13 @@ def refine_stack(model: SliceModel, slices: Slices, pose: RigidPose, n_steps: in
     """Levenberg-Marquardt on one rigid motion of a whole stack.
 
     A world twist (W, V) about the centre c moves slice k in its own frame by w = R^T W and
-    v = R^T (W x (t - c) + V); its normal matrix is the sum of the slices' in these terms.
+    v = R^T (W x (t - c) + V); its normal matrix is the sum of those of the slices in these terms.
+
+    Args:
+        model: the pixels of the stack and the volume.
+        slices: K slices of the stack.
+        pose: [K] world from plane, to start from.
+        n_steps: number of evaluations.
     """
     gain = np.ones(len(slices))
     damping = 1e-2
@@ -144,8 +150,8 @@ def refine_stack(model: SliceModel, slices: Slices, pose: RigidPose, n_steps: in
         twist = np.linalg.solve(hessian + np.diag(damping * scale), gradient)
         twist[:3] = _shortened(twist[:3], MAX_ROTATION_RAD)
         twist[3:] = _shortened(twist[3:], MAX_TRANSLATION_MM)
-        turn = rotation_matrix(twist[:3])
-        trial_pose = RigidPose(turn[None], (center - turn @ center + twist[3:])[None]) @ pose
+        rotation = rotation_matrix(twist[:3])
+        trial_pose = RigidPose(rotation[None], (center - rotation @ center + twist[3:])[None]) @ pose
         trial = model.evaluate(slices.planes.with_pose(trial_pose), gain, width)
         if size @ trial.loss < size @ current.loss:
             pose, current, damping = trial_pose, trial, max(damping / 3, 1e-4)

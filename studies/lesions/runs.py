@@ -158,16 +158,16 @@ def true_motion(stacks: list[SimulatedStack]) -> Registration:
     pose = RigidPose(rotation[row], shift[row])
     n = len(stacks)
     return Registration(
-        slices.with_pose(pose @ slices.header_pose),
-        gain / np.exp(np.log(gain).mean()),
-        np.where(dropout, DROPOUT_WEIGHT, 1.0),
-        np.ones(len(slices)),
-        [1.0] * n if n > 1 else None,
-        "true poses",
-        {},
-        [None] * n,
-        [1] * n,
-        None,
+        slices=slices.with_motion(pose),
+        gain=gain / np.exp(np.log(gain).mean()),
+        weight=np.where(dropout, DROPOUT_WEIGHT, 1.0),
+        ncc=np.ones(len(slices)),
+        held_out=[1.0] * n if n > 1 else None,
+        initialisation="true poses",
+        initialisations={},
+        interleave=[None] * n,
+        n_segments=[1] * n,
+        orientation=None,
     )
 
 

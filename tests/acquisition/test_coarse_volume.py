@@ -34,7 +34,7 @@ def cube_stack(
     affine[:3, 3] = -affine[:3, :3] @ ((np.array(shape) - 1) / 2)
     image = np.full(shape, value or 1.0, np.float32)
     image[0, 0, 0] += 1e-3 * image[0, 0, 0]  # a stack that is constant throughout is refused
-    return Stack(image, np.ones(shape, bool), affine, thickness_mm)
+    return Stack(image=image, mask=np.ones(shape, bool), affine=affine, thickness_mm=thickness_mm)
 
 
 def density_inside(slices: Slices, voxel_mm: float = 1.0, **options) -> np.ndarray:
@@ -121,13 +121,13 @@ def test_gains_are_divided_out():
     slices = slices_from_stacks([cube_stack()])
     gain = np.random.default_rng(0).uniform(0.5, 2, len(slices))
     dark = Slices(
-        slices.planes,
-        (slices.value * np.repeat(gain, np.diff(slices.planes.offset))).astype(np.float32),
-        slices.mask,
-        slices.stack_id,
-        slices.slice_index,
-        slices.thickness_mm,
-        slices.header_pose,
+        planes=slices.planes,
+        value=(slices.value * np.repeat(gain, np.diff(slices.planes.offset))).astype(np.float32),
+        mask=slices.mask,
+        stack_id=slices.stack_id,
+        slice_index=slices.slice_index,
+        thickness_mm=slices.thickness_mm,
+        header_pose=slices.header_pose,
     )
     grid = VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0)
     np.testing.assert_allclose(coarse_and_density(dark, grid, gain)[0], 7, rtol=2e-3)

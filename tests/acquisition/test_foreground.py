@@ -47,7 +47,7 @@ def ellipsoid_stack(
     if hole:
         mask &= np.linalg.norm(world, axis=-1) > 5
     image = (100 + index.sum(-1)).astype(np.float32)
-    return Stack(image, mask, affine, thickness_mm)
+    return Stack(image=image, mask=mask, affine=affine, thickness_mm=thickness_mm)
 
 
 def volume_of(mask: np.ndarray) -> float:

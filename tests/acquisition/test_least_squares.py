@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 
 from data_synth.heads import PhantomSubject, load_volume_of
+from data_synth.phantom import fetal_brain_phantom
 from data_synth.simulator import orthogonal_settings, simulate_stacks
+from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density
-from g3r.acquisition.least_squares import SHARP_CONVENTION, sharpened_volume
+from g3r.acquisition.least_squares import SHARP_CONVENTION, sharpened_volume, solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
+from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
+from tests.registration.moving_heads import as_slices, simulated
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +41,7 @@ def test_v_sharp_is_nearer_to_the_head(head, slices) -> None:
     assert error["sharp"] < 0.9 * error["coarse"]
 
 
-def test_gain_and_trust_count(head, slices) -> None:
+def test_gain_and_weight_count(head, slices) -> None:
     grid = VolumeGrid(head.data.shape, head.affine)
     coarse, _ = coarse_and_density(slices, grid)
     plain = sharpened_volume(slices, grid, coarse)
@@ -54,3 +58,18 @@ def test_gain_and_trust_count(head, slices) -> None:
 
 def test_the_convention_names_what_it_depends_on() -> None:
     assert SHARP_CONVENTION == "cg6-smoothness0.1-v1"
+
+
+def test_a_volume_explains_its_slices_and_more_steps_explain_more():
+    slices, _ = as_slices(simulated(fetal_brain_phantom(24, 1.2)))
+    grid = grid_around(slices, 1.5)
+    operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
+    weight = np.ones(len(slices.pixel_index), np.float32)
+    errors = []
+    for n in (1, 4, 16):
+        volume = solve_volume(operator, slices.masked_value, weight, n_iterations=n)
+        errors.append(float(np.square(operator.forward(volume) - slices.masked_value).mean() ** 0.5))
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 0.05
+    again = solve_volume(operator, slices.masked_value, weight, start=volume, n_iterations=2)
+    assert np.abs(again - volume).max() < 0.2

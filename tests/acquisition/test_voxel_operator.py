@@ -21,11 +21,11 @@ def random_planes(seed: int, n: int = 6, spread_mm: float = 6.0, thickness_mm: f
     rng = np.random.default_rng(seed)
     spacing = rng.uniform(0.7, 1.6, (n, 2))
     return Planes(
-        Rotation.random(n, rng=rng).as_matrix(),
-        GRID.center_mm + rng.normal(0, spread_mm, (n, 3)),
-        spacing,
-        rng.integers(8, 20, (n, 2)),
-        psf_variance_mm2(spacing, np.full(n, thickness_mm)),
+        rotation=Rotation.random(n, rng=rng).as_matrix(),
+        center_mm=GRID.center_mm + rng.normal(0, spread_mm, (n, 3)),
+        spacing_mm=spacing,
+        shape=rng.integers(8, 20, (n, 2)),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(n, thickness_mm)),
     )
 
 
@@ -82,11 +82,11 @@ def test_a_gaussian_through_the_psf_has_its_closed_form():
     rng = np.random.default_rng(5)
     spacing = np.tile([0.9, 1.2], (4, 1))
     planes = Planes(
-        Rotation.random(4, rng=rng).as_matrix(),
-        rng.normal(0, 1.5, (4, 3)),
-        spacing,
-        np.full((4, 2), 9),
-        psf_variance_mm2(spacing, np.full(4, 3.0)),
+        rotation=Rotation.random(4, rng=rng).as_matrix(),
+        center_mm=rng.normal(0, 1.5, (4, 3)),
+        spacing_mm=spacing,
+        shape=np.full((4, 2), 9),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(4, 3.0)),
     )
     pixels = VoxelOperator(planes, grid, None, (5, 5, 9)).forward(volume)
     expected = []

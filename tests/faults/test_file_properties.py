@@ -49,7 +49,7 @@ def stacks(draw: st.DrawFn) -> Stack:
     data.flat[0] = scale  # something positive
     mask = rng.random(shape) < draw(st.floats(0.2, 1.0))
     mask.flat[:2] = True
-    return Stack(data, mask, affine, draw(st.floats(0.1, 20.0)), "any")
+    return Stack(image=data, mask=mask, affine=affine, thickness_mm=draw(st.floats(0.1, 20.0)), name="any")
 
 
 def written_and_read(stack: Stack, folder: Path, order: tuple[int, ...], ending: str) -> Stack:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.small_case import WHOLE, SmallCase, names
-from tests.faults.tally import Tally
+from tests.tally import Tally
 
 HIDE = {
     "macOS": """

@@ -50,13 +50,25 @@ def make_slices(gain: np.ndarray | None = None) -> Slices:
     rotation = np.repeat([turn.as_matrix() for turn in turns], 8, axis=0)
     center = rotation[:, :, 2] * np.tile((np.arange(8) - 3.5) * 2.4, 3)[:, None]
     spacing = np.full((24, 2), 1.0)
-    planes = Planes(rotation, center, spacing, np.full((24, 2), 20), psf_variance_mm2(spacing, np.full(24, 2.4)))
+    planes = Planes(
+        rotation=rotation,
+        center_mm=center,
+        spacing_mm=spacing,
+        shape=np.full((24, 2), 20),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(24, 2.4)),
+    )
     value = render(true_cloud(), planes, cutoff_sigma=6.0).numpy()
     if gain is not None:
         value = value * gain[planes.plane_id()].astype(np.float32)
     mask = np.linalg.norm(planes.pixel_world_mm(), axis=1) < 10
     return Slices(
-        planes, value, mask, np.repeat(np.arange(3), 8), np.tile(np.arange(8), 3), np.full(24, 2.4), planes.pose
+        planes=planes,
+        value=value,
+        mask=mask,
+        stack_id=np.repeat(np.arange(3), 8),
+        slice_index=np.tile(np.arange(8), 3),
+        thickness_mm=np.full(24, 2.4),
+        header_pose=planes.pose,
     )
 
 

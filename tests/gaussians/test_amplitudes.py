@@ -31,7 +31,13 @@ def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
     rotation = np.repeat(frames, 7, axis=0)
     center = cloud.origin_mm + rotation[:, :, 2] * np.tile(np.arange(7) * 2.2 - 6.6, 3)[:, None]
     spacing = np.full((21, 2), 1.0)
-    return cloud, Planes(rotation, center, spacing, np.full((21, 2), 18), psf_variance_mm2(spacing, np.full(21, 2.2)))
+    return cloud, Planes(
+        rotation=rotation,
+        center_mm=center,
+        spacing_mm=spacing,
+        shape=np.full((21, 2), 18),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(21, 2.2)),
+    )
 
 
 @pytest.mark.parametrize("attenuation", ["exact", "printed"])
@@ -118,7 +124,13 @@ def test_pixels_of_weight_zero_do_not_count():
 
 def test_what_no_pixel_sees_stays():
     cloud, planes = scene()
-    away = Planes(planes.rotation, planes.center_mm + 500, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
+    away = Planes(
+        rotation=planes.rotation,
+        center_mm=planes.center_mm + 500,
+        spacing_mm=planes.spacing_mm,
+        shape=planes.shape,
+        psf_var_mm2=planes.psf_var_mm2,
+    )
     ones = np.ones(planes.n_pixels, np.float32)
     assert torch.equal(solve_amplitudes(cloud, away, ones, ones).amplitude, cloud.amplitude)
     assert torch.equal(solve_amplitudes(cloud, planes, ones, 0 * ones).amplitude, cloud.amplitude)

@@ -23,11 +23,11 @@ def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0):
         torch.tensor(rng.normal(0, 0.2, n_planes)),
     ]
     planes = Planes(
-        Rotation.random(n_planes, rng=seed).as_matrix(),
-        rng.normal(0, 0.5, (n_planes, 3)) + 50,
-        np.array([[0.8, 0.9]] * n_planes),
-        np.array([[30, 27]] * n_planes),
-        np.array([[0.2, 0.25, 1.2]] * n_planes) * psf,
+        rotation=Rotation.random(n_planes, rng=seed).as_matrix(),
+        center_mm=rng.normal(0, 0.5, (n_planes, 3)) + 50,
+        spacing_mm=np.array([[0.8, 0.9]] * n_planes),
+        shape=np.array([[30, 27]] * n_planes),
+        psf_var_mm2=np.array([[0.2, 0.25, 1.2]] * n_planes) * psf,
     )
     pixel_weight = torch.tensor(rng.normal(size=planes.n_pixels))
     return leaves, planes, pixel_weight
@@ -64,7 +64,11 @@ def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
 def test_reference_gradcheck(attenuation):
     leaves, planes, _ = scene(3, n=2, n_planes=2)
     planes = Planes(
-        planes.rotation, planes.center_mm, planes.spacing_mm * 4, np.array([[5, 4]] * 2), planes.psf_var_mm2
+        rotation=planes.rotation,
+        center_mm=planes.center_mm,
+        spacing_mm=planes.spacing_mm * 4,
+        shape=np.array([[5, 4]] * 2),
+        psf_var_mm2=planes.psf_var_mm2,
     )
     leaves = [leaf.requires_grad_() for leaf in leaves]
     assert torch.autograd.gradcheck(

@@ -30,11 +30,11 @@ def make_planes(seed: int, n: int = 3, shape=(7, 6), psf: float = 1.0, origin=(4
     rng = np.random.default_rng(seed)
     spacing = rng.uniform(0.7, 1.1, (n, 2))
     return Planes(
-        Rotation.random(n, rng=rng).as_matrix(),
-        np.array(origin) + rng.normal(0, 1, (n, 3)),
-        spacing,
-        np.tile(shape, (n, 1)),
-        psf * psf_variance_mm2(spacing, rng.uniform(2, 4, n)),
+        rotation=Rotation.random(n, rng=rng).as_matrix(),
+        center_mm=np.array(origin) + rng.normal(0, 1, (n, 3)),
+        spacing_mm=spacing,
+        shape=np.tile(shape, (n, 1)),
+        psf_var_mm2=psf * psf_variance_mm2(spacing, rng.uniform(2, 4, n)),
     )
 
 
@@ -101,7 +101,11 @@ def test_the_printed_amplitude_is_off_by_the_factor_of_the_design(backend: str):
         torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1), np.zeros(3)
     )
     planes = Planes(
-        np.eye(3)[None], np.zeros((1, 3)), [[0.8, 0.8]], [[1, 1]], psf_variance_mm2([[0.8, 0.8]], np.array([3.0]))
+        rotation=np.eye(3)[None],
+        center_mm=np.zeros((1, 3)),
+        spacing_mm=[[0.8, 0.8]],
+        shape=[[1, 1]],
+        psf_var_mm2=psf_variance_mm2([[0.8, 0.8]], np.array([3.0])),
     )
     exact = render(one, planes, backend=backend).item()
     printed = render(one, planes, backend=backend, attenuation="printed").item()
@@ -186,7 +190,13 @@ def test_ten_metres_from_the_origin_no_digit_is_lost():
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
     away = GaussianCloud(*cloud.parameters, far)
-    moved = Planes(planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
+    moved = Planes(
+        rotation=planes.rotation,
+        center_mm=planes.center_mm + far,
+        spacing_mm=planes.spacing_mm,
+        shape=planes.shape,
+        psf_var_mm2=planes.psf_var_mm2,
+    )
     for (first, _), (second, _) in zip(images(cloud, planes), images(away, moved), strict=True):
         assert np.abs(first - second).max() < 1e-6 * np.abs(first).max()
 
@@ -248,7 +258,7 @@ def test_one_gaussian_and_one_pixel():
 def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed():
     cloud, planes = single(make_cloud(15, 10)), make_planes(15)
     away = planes.moved(RigidPose.from_rotvec([[0.0, 0, 0]], [[500.0, 0, 0]]))
-    both = Planes(*(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__))
+    both = Planes(**{f: np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__})
     pixels = render(cloud, both)
     assert (pixels[: away.n_pixels] == 0).all()
     torch.testing.assert_close(pixels[away.n_pixels :], render(cloud, planes), rtol=1e-6, atol=1e-7)

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry.grid import bounding_box, on_grid
 
 
 def affine_of(axes: np.ndarray, spacing: tuple[float, float, float], origin: tuple[float, ...]) -> np.ndarray:
@@ -80,3 +81,30 @@ def test_a_moved_grid_has_its_voxels_where_the_motion_puts_them():
     motion = RigidPose.from_rotvec([[0.3, -0.2, 0.1]], [[5.0, 6.0, -7.0]])
     index = np.array([[0.0, 0, 0], [2, 3, 4]])
     np.testing.assert_allclose(grid.moved(motion).world(index), motion.apply(grid.world(index)[None])[0], atol=1e-12)
+
+
+def test_a_bounding_box_holds_the_mask_and_its_grid_the_same_places():
+    mask = np.zeros((7, 9, 5), bool)
+    mask[2:5, 4, 1:3] = True
+    mask[3, 6, 1] = True
+    assert bounding_box(mask) == (slice(2, 5), slice(4, 7), slice(1, 3))
+    assert bounding_box(mask, 2) == (slice(0, 7), slice(2, 9), slice(0, 5))
+    assert bounding_box(mask, (1, 0, 0)) == (slice(1, 6), slice(4, 7), slice(1, 3))
+    assert bounding_box(mask[3]) == (slice(4, 7), slice(1, 3))
+    grid = VolumeGrid.isotropic((-3, -4, -2), (3, 4, 2), 1.0)
+    inner = grid.cropped(bounding_box(mask))
+    assert inner.shape == mask[bounding_box(mask)].shape
+    np.testing.assert_allclose(inner.world((1, 2, 0)), grid.world((3, 6, 1)))
+    with pytest.raises(ValueError, match="mask is empty"):
+        bounding_box(np.zeros((3, 3, 3), bool))
+
+
+def test_a_map_read_on_another_grid_is_trilinear_and_known_outside(rng: np.random.Generator):
+    source = VolumeGrid.isotropic((0, 0, 0), (9, 9, 9), 1.0)
+    data = np.add.outer(np.add.outer(np.arange(10.0), 2 * np.arange(10)), 3 * np.arange(10))
+    target = VolumeGrid.isotropic((2, 2, 2), (12, 5, 5), 0.5)
+    found = on_grid(data, source, target, outside=-1.0)
+    place = target.world((4, 3, 1))
+    assert found[4, 3, 1] == pytest.approx(place @ [1, 2, 3])
+    assert found[-1, 0, 0] == -1
+    np.testing.assert_array_equal(on_grid(data, source, source, outside=0.0), data.astype(np.float32))

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid, orthonormal, rotation_matrix
+from g3r.geometry.rigid import fit_rigid, fit_rigid_robust, orthonormal, rotation_matrix
 
 
 def poses(seed: int, n: int) -> RigidPose:
@@ -122,3 +122,28 @@ def test_fit_rigid_of_points_in_a_plane_is_no_mirror_image():
     source = np.concatenate([rng.normal(0, 30, (40, 2)), np.zeros((40, 1))], axis=1)
     found = fit_rigid(source, truth.apply(source[None])[0])
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
+
+
+def test_fit_rigid_robust_is_not_tilted_by_points_that_went_astray(rng: np.random.Generator):
+    truth = RigidPose.from_rotvec([[0.2, -0.4, 0.3]], [[5.0, -3, 9]])
+    source = rng.normal(0, 30, (200, 3))
+    target = truth.apply(source[None])[0]
+    target[::8] += [40.0, -25, 10]
+    found, distance_mm = fit_rigid_robust(source, target, scale_mm=2.0, n_rounds=15)
+    np.testing.assert_allclose(found.rotation, truth.rotation, atol=2e-3)
+    np.testing.assert_allclose(distance_mm, np.linalg.norm(found.apply(source[None])[0] - target, axis=1))
+    assert distance_mm[::8].min() > 45
+    ignored = np.ones(len(source))
+    ignored[::8] = 0
+    exact, _ = fit_rigid_robust(source, target, scale_mm=2.0, n_rounds=3, weight=ignored)
+    np.testing.assert_allclose(exact.translation_mm, truth.translation_mm, atol=1e-9)
+
+
+def test_rows_are_replaced_and_records_joined():
+    poses = RigidPose.from_rotvec(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
+    changed = poses.with_rows(np.array([0, 2]), RigidPose.identity(2))
+    np.testing.assert_array_equal(changed.translation_mm[[0, 2]], 0)
+    np.testing.assert_array_equal(changed.translation_mm[[1, 3]], poses.translation_mm[[1, 3]])
+    joined = RigidPose.concatenated([poses, changed])
+    assert len(joined) == 8
+    np.testing.assert_array_equal(joined.take(slice(4, None)).translation_mm, changed.translation_mm)

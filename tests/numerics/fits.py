@@ -67,7 +67,13 @@ def _stack(planes: Planes, pixels: NDArray[np.float32], inside: NDArray[np.bool_
     def volume(array: NDArray) -> NDArray:
         return array[begin:end].reshape(n, *shape).transpose(1, 2, 0)
 
-    return Stack(volume(pixels), volume(inside), affine, float(np.linalg.norm(step)), name=f"stack-{number}.nii.gz")
+    return Stack(
+        image=volume(pixels),
+        mask=volume(inside),
+        affine=affine,
+        thickness_mm=float(np.linalg.norm(step)),
+        name=f"stack-{number}.nii.gz",
+    )
 
 
 def reconstruction(factor: float = 1.0, motion: RigidPose | None = None) -> ReconstructionResult:
@@ -113,7 +119,13 @@ def _points(result: ReconstructionResult) -> Planes:
     world = result.grid.world(np.argwhere(result.mask))
     world = world[np.linalg.norm(world - ORIGIN_MM, axis=1) < HEAD_RADIUS_MM - 2][::7]
     n = len(world)
-    return Planes(np.tile(np.eye(3), (n, 1, 1)), world, np.ones((n, 2)), np.ones((n, 2), np.int64), np.zeros((n, 3)))
+    return Planes(
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        center_mm=world,
+        spacing_mm=np.ones((n, 2)),
+        shape=np.ones((n, 2), np.int64),
+        psf_var_mm2=np.zeros((n, 3)),
+    )
 
 
 def _values(result: ReconstructionResult, points: Planes, motion: RigidPose | None) -> NDArray[np.float64]:
@@ -136,13 +148,13 @@ def slices_of_small_head(noise: float = NOISE) -> tuple[Slices, VolumeGrid, NDAr
     value = value + rng.normal(0, noise, len(value)).astype(np.float32)
     n = len(planes) // 3
     slices = Slices(
-        planes,
-        value,
-        np.linalg.norm(planes.pixel_world_mm(), axis=1) < HEAD_RADIUS_MM,
-        np.repeat(np.arange(3), n),
-        np.tile(np.arange(n), 3),
-        np.full(3 * n, 2.2),
-        planes.pose,
+        planes=planes,
+        value=value,
+        mask=np.linalg.norm(planes.pixel_world_mm(), axis=1) < HEAD_RADIUS_MM,
+        stack_id=np.repeat(np.arange(3), n),
+        slice_index=np.tile(np.arange(n), 3),
+        thickness_mm=np.full(3 * n, 2.2),
+        header_pose=planes.pose,
     )
     grid = VolumeGrid.isotropic([-HEAD_RADIUS_MM] * 3, [HEAD_RADIUS_MM] * 3, 1.0)
     index = np.stack(np.meshgrid(*[np.arange(m) for m in grid.shape], indexing="ij"), -1)

@@ -70,11 +70,11 @@ def slender_scenes(ratio: float, widest_mm: float, psf: bool, n: int = 12, seed:
         spacing = np.maximum(spacing, 1e-3)
         variance = psf_variance_mm2([PIXEL_MM, PIXEL_MM], THICKNESS_MM) if psf else np.zeros(3)
         planes = Planes(
-            np.concatenate([tilted.as_matrix(), at_random.as_matrix()[None]]),
-            np.concatenate([middle + shift, middle[None] + rng.normal(0, 0.3 * sigma.min(), (1, 3))]),
-            spacing,
-            np.array([[40, 24]] * 3),
-            np.tile(variance, (3, 1)),
+            rotation=np.concatenate([tilted.as_matrix(), at_random.as_matrix()[None]]),
+            center_mm=np.concatenate([middle + shift, middle[None] + rng.normal(0, 0.3 * sigma.min(), (1, 3))]),
+            spacing_mm=spacing,
+            shape=np.array([[40, 24]] * 3),
+            psf_var_mm2=np.tile(variance, (3, 1)),
         )
         scenes.append(Scene(cloud, planes))
     return scenes
@@ -101,9 +101,9 @@ def stacks_of_planes(
     n = len(rotation)
     spacing = np.full((n, 2), PIXEL_MM)
     return Planes(
-        rotation,
-        origin_mm + rotation[:, :, 2] * offset[:, None],
-        spacing,
-        np.full((n, 2), n_pixels),
-        psf_variance_mm2(spacing, np.full(n, thickness_mm)),
+        rotation=rotation,
+        center_mm=origin_mm + rotation[:, :, 2] * offset[:, None],
+        spacing_mm=spacing,
+        shape=np.full((n, 2), n_pixels),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(n, thickness_mm)),
     )

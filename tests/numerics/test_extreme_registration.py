@@ -11,11 +11,12 @@ import pytest
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.geometry import RigidPose
-from g3r.registration.normal_equations import correlation
-from g3r.registration.slice_rounds import SliceRounds, refine_slices
+from g3r.registration import RegistrationSettings
+from g3r.registration.similarity import correlation
+from g3r.registration.slice_rounds import refine_slices
 from tests.numerics.fits import slices_of_small_head
 
-ROUNDS = SliceRounds(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6, max_pixels=400_000)
+ROUNDS = RegistrationSettings(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6)
 
 
 def plain() -> Slices:

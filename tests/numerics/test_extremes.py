@@ -67,11 +67,11 @@ def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) 
     spacing = np.full((n, 2), 4.0)
     aside = turns.apply(np.array([0, 0, aside_mm]) * rng.choice([-1, 1], (n, 1)))
     planes = Planes(
-        tilted.as_matrix(),
-        ORIGIN_MM + cloud.mean_mm.numpy() + aside,
-        spacing,
-        np.full((n, 2), 40),
-        psf_variance_mm2(spacing, np.full(n, 0.1)) * (1.0 if psf else 0.0),
+        rotation=tilted.as_matrix(),
+        center_mm=ORIGIN_MM + cloud.mean_mm.numpy() + aside,
+        spacing_mm=spacing,
+        shape=np.full((n, 2), 40),
+        psf_var_mm2=psf_variance_mm2(spacing, np.full(n, 0.1)) * (1.0 if psf else 0.0),
     )
     return Scene(cloud, planes)
 

@@ -48,13 +48,13 @@ class CompleteLoss:
         planes = replace(planes, shape=np.full((6, 2), 16), spacing_mm=np.full((6, 2), 1.4))
         mask = rng.uniform(size=planes.n_pixels) < 0.8
         slices = Slices(
-            planes,
-            np.zeros(planes.n_pixels, np.float32),
-            mask,
-            np.repeat(np.arange(3), 2),
-            np.tile([0, 1], 3),
-            np.full(6, 2.2),
-            planes.pose,
+            planes=planes,
+            value=np.zeros(planes.n_pixels, np.float32),
+            mask=mask,
+            stack_id=np.repeat(np.arange(3), 2),
+            slice_index=np.tile([0, 1], 3),
+            thickness_mm=np.full(6, 2.2),
+            header_pose=planes.pose,
         )
         self.gain, self.slice_weight = np.exp(rng.normal(0, 0.1, 6)), rng.uniform(0.2, 1, 6)
         self.bias_field = StackBiasField(slices)
@@ -91,11 +91,11 @@ class CompleteLoss:
         n = 6
         spacing = np.full((n, 2), 1.9)
         planes = Planes(
-            np.tile(np.eye(3), (n, 1, 1)),
-            np.array([[0, 0, z] for z in np.linspace(-6, 6, n)]),
-            spacing,
-            np.full((n, 2), 11),
-            np.zeros((n, 3)),
+            rotation=np.tile(np.eye(3), (n, 1, 1)),
+            center_mm=np.array([[0, 0, z] for z in np.linspace(-6, 6, n)]),
+            spacing_mm=spacing,
+            shape=np.full((n, 2), 11),
+            psf_var_mm2=np.zeros((n, 3)),
         )
         shown = render(self._cloud(self._values()), planes, backend="reference").numpy()
         away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.3, planes.n_pixels)

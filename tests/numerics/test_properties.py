@@ -41,11 +41,11 @@ def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
     thickness = np.exp(rng.uniform(np.log(0.1), np.log(20), n_planes))
     psf = psf_variance_mm2(spacing, thickness) * draw(st.sampled_from([0.0, 1.0]))
     planes = Planes(
-        Rotation.random(n_planes, rng=rng).as_matrix(),
-        origin + rng.normal(0, spread, (n_planes, 3)),
-        spacing,
-        rng.integers(1, 40, (n_planes, 2)),
-        psf,
+        rotation=Rotation.random(n_planes, rng=rng).as_matrix(),
+        center_mm=origin + rng.normal(0, spread, (n_planes, 3)),
+        spacing_mm=spacing,
+        shape=rng.integers(1, 40, (n_planes, 2)),
+        psf_var_mm2=psf,
     )
     ratio = float((sigma.max(1) / sigma.min(1)).max()) if n else 1.0
     return Scene(cloud, planes), ratio

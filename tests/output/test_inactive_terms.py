@@ -13,11 +13,23 @@ from g3r.planning.presets import PRESETS
 def slices_of(stacks: list[int]) -> Slices:
     n = len(stacks)
     planes = Planes(
-        np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.ones((n, 2)), np.full((n, 2), 4), np.ones((n, 3))
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        center_mm=np.zeros((n, 3)),
+        spacing_mm=np.ones((n, 2)),
+        shape=np.full((n, 2), 4),
+        psf_var_mm2=np.ones((n, 3)),
     )
     pixels = np.ones(planes.n_pixels, np.float32)
     pose = RigidPose(planes.rotation, planes.center_mm)
-    return Slices(planes, pixels, pixels > 0, np.array(stacks), np.arange(n), np.full(n, 2.0), pose)
+    return Slices(
+        planes=planes,
+        value=pixels,
+        mask=pixels > 0,
+        stack_id=np.array(stacks),
+        slice_index=np.arange(n),
+        thickness_mm=np.full(n, 2.0),
+        header_pose=pose,
+    )
 
 
 def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:

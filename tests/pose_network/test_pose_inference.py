@@ -49,7 +49,7 @@ def blob_stack(rotation, seed, shape=(50, 46, 12)):
     mask = ((world / [22, 26, 18]) ** 2).sum(-1) < 1
     spot = np.exp(-((world - [8, 10, 5]) ** 2).sum(-1) / 50)
     image = (1 + spot + 0.02 * rng.standard_normal(shape)).astype(np.float32)
-    return Stack(image, mask, affine, 4.0, f"stack-{seed}")
+    return Stack(image=image, mask=mask, affine=affine, thickness_mm=4.0, name=f"stack-{seed}")
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +61,13 @@ def slices() -> Slices:
 def moved_headers(slices: Slices, motion: RigidPose) -> Slices:
     header = motion @ slices.header_pose
     return Slices(
-        slices.planes.with_pose(header),
-        slices.value,
-        slices.mask,
-        slices.stack_id,
-        slices.slice_index,
-        slices.thickness_mm,
-        header,
+        planes=slices.planes.with_pose(header),
+        value=slices.value,
+        mask=slices.mask,
+        stack_id=slices.stack_id,
+        slice_index=slices.slice_index,
+        thickness_mm=slices.thickness_mm,
+        header_pose=header,
     )
 
 
@@ -97,13 +97,13 @@ def test_the_order_does_not_matter(model, slices):
 
 def test_numbers_of_stacks_do_not_matter(model, slices):
     renamed = Slices(
-        slices.planes,
-        slices.value,
-        slices.mask,
-        7 - 2 * slices.stack_id,
-        slices.slice_index,
-        slices.thickness_mm,
-        slices.header_pose,
+        planes=slices.planes,
+        value=slices.value,
+        mask=slices.mask,
+        stack_id=7 - 2 * slices.stack_id,
+        slice_index=slices.slice_index,
+        thickness_mm=slices.thickness_mm,
+        header_pose=slices.header_pose,
     )
     assert_same(model.predict(slices), model.predict(renamed), 1e-3)
 

@@ -11,6 +11,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
+from g3r.registration.similarity import StackSamples
 from tests.registration.moving_heads import Moving, as_slices, simulated
 
 
@@ -21,7 +22,7 @@ def head() -> Phantom:
 
 @pytest.fixture(scope="session")
 def still(head: Phantom) -> list[SimulatedStack]:
-    """Three stacks of a head that lies still, clean."""
+    """Three stacks of a head without motion, without noise."""
     return simulated(head)
 
 
@@ -32,8 +33,14 @@ def still_slices(still: list[SimulatedStack]) -> tuple[Slices, RigidPose]:
 
 
 @pytest.fixture(scope="session")
+def samples(still_slices: tuple[Slices, RigidPose]) -> list[StackSamples]:
+    """Their thinned pixels, stack by stack."""
+    return StackSamples.of_all(still_slices[0])
+
+
+@pytest.fixture(scope="session")
 def template() -> AtlasTemplate:
-    """Mean heads of other phantoms, about as old and older."""
+    """Atlas templates of other phantoms, about as old and older."""
     subjects = [PhantomSubject(f"week-{w}-{seed}", w, seed) for w in (24.0, 31.0) for seed in (1, 2, 3)]
     return atlas_templates(subjects, 3.0, weeks=(24, 31))
 

@@ -41,23 +41,23 @@ def fit_of(noise: float) -> SliceFit:
     z = np.arange(-9.0, 9.1, 2.0)
     n = len(z)
     planes = Planes(
-        np.tile(np.eye(3), (n, 1, 1)),
-        np.c_[np.zeros((n, 2)), z],
-        np.ones((n, 2)),
-        np.full((n, 2), 20),
-        np.tile([0.26, 0.26, 0.72], (n, 1)),
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        center_mm=np.c_[np.zeros((n, 2)), z],
+        spacing_mm=np.ones((n, 2)),
+        shape=np.full((n, 2), 20),
+        psf_var_mm2=np.tile([0.26, 0.26, 0.72], (n, 1)),
     )
     value = render(cloud, planes).numpy()
     upper = z[planes.plane_id()] > 0
     value = value + np.where(upper, noise * rng.standard_normal(len(value)), 0).astype(np.float32)
     slices = Slices(
-        planes,
-        value.astype(np.float32),
-        np.ones(len(value), bool),
-        np.zeros(n, np.int64),
-        np.arange(n),
-        np.full(n, 2.0),
-        planes.pose,
+        planes=planes,
+        value=value.astype(np.float32),
+        mask=np.ones(len(value), bool),
+        stack_id=np.zeros(n, np.int64),
+        slice_index=np.arange(n),
+        thickness_mm=np.full(n, 2.0),
+        header_pose=planes.pose,
     )
     return SliceFit(cloud, slices, np.ones(n), np.ones(n), [], [])
 

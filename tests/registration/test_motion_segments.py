@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
-from g3r.registration.segments import (
+from g3r.registration.motion_segments import (
     CHANGE_PENALTY,
     HEAD_RADIUS_MM,
     best_segments,

@@ -1,11 +1,10 @@
-"""Runs of slices between jerks: the most likely sequence of motions in time, among candidates.
+"""Motion segments between jerks: the most likely sequence of motions in time, among candidates.
 
 A fetus lies still, jerks, and lies still again. So the motions of a stack's slices, in the order of their
-acquisition, are a few constant runs with small changes inside. Given what each slice costs under each
-candidate motion, dynamic programming finds the sequence with the least sum of these costs and of a price for
-every change, which grows with how far the head would have moved (Viterbi 1967). It needs no threshold for
-what a jerk is, and says at the same time how the stack was interleaved: the order in which the motions
-change least.
+acquisition, are a few constant segments with small changes inside. Given the cost of each slice under each
+candidate motion, dynamic programming finds the sequence with the least sum of these costs and of a transition
+penalty for every change, which grows with the distance (Viterbi 1967). It needs no threshold for what a jerk
+is, and finds at the same time how the stack was interleaved: the order in which the motions change least.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 
 INTERLEAVES = (1, 2, 3)
-"""Acquisition orders that are tried; the first of equals is taken."""
+"""Acquisition orders to try; the first of equals is taken."""
 
 HEAD_RADIUS_MM = 30.0
-"""Half of a typical head's diameter, by which turns are compared with shifts."""
+"""Half the diameter of a typical head, by which rotations are compared with translations."""
 
 CHANGE_PENALTY = 6.0
-"""Cost (a logarithm of odds) of any change of motion from one slice in time to the next."""
+"""Cost (log odds) of any change of motion from one slice in time to the next."""
 DISTANCE_PENALTY = 8.0
 """Further cost of a change by d mm: this times log(1 + (d / STEADY_MM)^2); heavy-tailed, as jerks are."""
 STEADY_MM = 4.0
@@ -35,7 +34,7 @@ SAME_PLACE_MM = 1e-3
 """Motions nearer to each other than this are one."""
 
 WINDOW = 5
-"""Slices in time that are looked at together when candidates are chosen."""
+"""Consecutive slices in time that candidates are preselected for."""
 BEST_PER_WINDOW = 6
 
 
@@ -45,9 +44,9 @@ class Segments:
 
     Args:
         choice: [K] candidate of each slice, in the order of the slices given.
-        interleave: the acquisition order under which that was cheapest.
+        interleave: the acquisition order with the least cost.
         cost: of the whole sequence.
-        n_segments: constant pieces of it.
+        n_segments: constant segments in it.
     """
 
     choice: NDArray[np.int64]
@@ -57,10 +56,10 @@ class Segments:
 
 
 def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
-    """For each interleave the slices of one stack [K] in the order of their acquisition.
+    """For each interleave the slices [K] of one stack in the order of their acquisition.
 
     Args:
-        slice_index: [K] numbers of the slices in their stack, of which some may be missing.
+        slice_index: [K] numbers of the slices in their stack; some may be missing.
     """
     place = {int(number): k for k, number in enumerate(slice_index)}
     n = int(slice_index.max()) + 1
@@ -74,12 +73,17 @@ def head_distance_mm(a: RigidPose, b: RigidPose, center_mm: NDArray[np.float64])
     """Root mean square distance [A, B] between where motions a and b take a ball of `HEAD_RADIUS_MM`.
 
     For a ball of radius r about the center, mean |(R_a - R_b) x|^2 = 2 (3 - trace(R_a^T R_b)) r^2 / 5.
+
+    Args:
+        a: A motions.
+        b: B motions.
+        center_mm: [3] centre of the ball before the motions.
     """
     place_a = a.rotation @ center_mm + a.translation_mm
     place_b = b.rotation @ center_mm + b.translation_mm
-    shift = ((place_a[:, None] - place_b[None]) ** 2).sum(-1)
+    translation = ((place_a[:, None] - place_b[None]) ** 2).sum(-1)
     trace = np.einsum("aij,bij->ab", a.rotation, b.rotation, optimize=True)
-    return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+    return np.sqrt(translation + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
 def best_segments(
@@ -96,7 +100,7 @@ def best_segments(
         motion: J candidate motions of the world.
         slice_index: [K] numbers of the slices in their stack.
         center_mm: [3] centre of the head before the motions.
-        keep: candidates that must be considered besides those that `promising` picks.
+        keep: candidates to consider in addition to those that `promising` picks.
     """
     orders = time_orders(slice_index)
     chosen = promising(cost, orders)
@@ -123,21 +127,33 @@ def _penalty(distance_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def changes_in_time(
     motion: RigidPose, slice_index: NDArray[np.int64], center_mm: NDArray[np.float64], interleave: int
 ) -> NDArray[np.float64]:
-    """How far the head moved [K - 1] (mm) between slices of a stack that were taken one after the other."""
+    """How far the head moved [K - 1] (mm) between consecutive slices of a stack in time.
+
+    Args:
+        motion: [K] world from header.
+        slice_index: [K] numbers of the slices in their stack.
+        center_mm: [3] centre of the head before the motions.
+        interleave: acquisition order.
+    """
     ordered = motion.take(time_orders(slice_index)[interleave])
     place = ordered.rotation @ center_mm + ordered.translation_mm
-    shift = (np.diff(place, axis=0) ** 2).sum(1)
+    translation = (np.diff(place, axis=0) ** 2).sum(1)
     trace = np.einsum("tij,tij->t", ordered.rotation[:-1], ordered.rotation[1:])
-    return np.sqrt(shift + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
+    return np.sqrt(translation + 2 * np.maximum(3 - trace, 0) * HEAD_RADIUS_MM**2 / 5)
 
 
 def transition_penalty(distance_mm: NDArray[np.float64]) -> float:
-    """Price of all movements [K - 1] (mm) of a stack; none costs nothing."""
+    """Penalty of all movements [K - 1] (mm) of a stack; no movement costs nothing."""
     return float(_penalty(distance_mm[distance_mm > SAME_PLACE_MM]).sum())
 
 
 def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Candidates that are among the best of some window of slices in time, or of some slice alone."""
+    """Candidates among the best of some window of slices in time, or of some single slice.
+
+    Args:
+        cost: [K, J] of slice k under candidate j.
+        orders: slices in the order of their acquisition, by interleave.
+    """
     n = len(cost)
     width = min(WINDOW, n)
     count = min(BEST_PER_WINDOW, cost.shape[1])
@@ -151,7 +167,7 @@ def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -
 
 
 def cheapest_path(cost: NDArray[np.float64], penalty: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """The path [T] with the least sum of costs [T, J] and prices [J, J] of changes, and that sum."""
+    """The path [T] with the least sum of costs [T, J] and penalties [J, J] of changes, and that sum."""
     n, n_states = cost.shape
     total = cost[0].astype(np.float64)
     came_from = np.zeros((n, n_states), np.int64)

@@ -1,25 +1,16 @@
-"""Rival ideas of how slices lie, judged by slices held out; runs settled, still stacks left in one piece."""
-
-from dataclasses import replace
+"""Motion segments of all stacks: jerks are undone, rigid stacks stay in one piece."""
 
 import numpy as np
-import pytest
 
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.candidates import (
-    aligned_to,
-    best_initialisation,
-    collapse_to_rigid,
-    estimate_interleave,
-    held_out_score,
-    moved,
-    refine_segments,
-)
-from g3r.registration.placement import StackSamples, refine_placement, volume_without
-from g3r.registration.segments import head_distance_mm
+from g3r.registration.held_out import held_out_score, volume_without
+from g3r.registration.motion_segments import head_distance_mm
+from g3r.registration.placement import refine_placement
+from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments
+from g3r.registration.similarity import StackSamples
 from tests.registration.moving_heads import (
     STILL,
     Moving,
@@ -30,11 +21,6 @@ from tests.registration.moving_heads import (
     stack_moved,
     turned_about,
 )
-
-
-@pytest.fixture(scope="module")
-def samples(still_slices: tuple[Slices, RigidPose]) -> list[StackSamples]:
-    return StackSamples.of_all(still_slices[0])
 
 
 def upside_down(slices: Slices, stack: int) -> RigidPose:
@@ -55,85 +41,10 @@ def jerked(slices: Slices, stack: int, by: RigidPose) -> tuple[RigidPose, np.nda
     ), late
 
 
-# -- judging ---------------------------------------------------------------------------------------
-
-
-def test_true_poses_predict_better_than_wrong_ones(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
-    """The further off, the dearer; the wrong stack shows most."""
-    slices, truth = still_slices
-    right = held_out_score(slices, samples, truth)
-    assert min(p.correlation for p in right.prediction) > 0.75
-    previous = right.cost
-    for degrees, mm in ((3.0, 1.5), (8.0, 5.0), (25.0, 10.0)):
-        by = turned_about(np.zeros(3), np.deg2rad([degrees, 0, 0]), np.array([0, mm, 0]))
-        wrong = held_out_score(slices, samples, stack_moved(truth, slices, 1, by))
-        assert wrong.cost > previous + 20
-        assert np.argmin([p.correlation for p in wrong.prediction]) == 1
-        previous = wrong.cost
-
-
-def test_a_judgement_has_a_line_for_every_stack_and_slice(
-    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
-):
-    slices, truth = still_slices
-    judged = held_out_score(slices, samples, truth)
-    assert len(judged.prediction) == 3
-    for stack, one in enumerate(judged.prediction):
-        assert one.slice_correlation.shape == ((slices.stack_id == stack).sum(),)
-    assert judged.cost == pytest.approx(sum(p.cost for p in judged.prediction))
-
-
-def test_restless_poses_pay_for_their_movements(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
-    slices, truth = still_slices
-    restless = slices_disturbed(slices, 0.1, 0.05).world_from_header()
-    assert held_out_score(slices, samples, restless).cost > held_out_score(slices, samples, truth).cost + 5 * len(
-        slices
-    )
-
-
-def test_the_true_hypothesis_is_chosen_by_its_name(moving: Moving):
-    slices, truth = moving.slices, moving.truth
-    initialisations = {
-        "headers": RigidPose.identity(len(slices)),
-        "truth": truth,
-        "nearly": slices_disturbed(moved(slices, truth), 4.0, 3.0).world_from_header(),
-    }
-    name, judged = best_initialisation(slices, StackSamples.of_all(slices), initialisations)
-    assert name == "truth"
-    assert set(judged) == set(initialisations)
-    assert judged["truth"].cost < judged["nearly"].cost
-    assert judged["truth"].cost < judged["headers"].cost
-
-
-def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]):
-    """The volume without a stack knows nothing of it."""
-    slices, _ = still_slices
-    volume, grid = volume_without(slices, 1, 3.2)
-    brighter = slices.value.copy()
-    own = (slices.stack_id == 1)[slices.planes.plane_id()]
-    brighter[own] *= 3
-    again, again_grid = volume_without(replace(slices, value=brighter), 1, 3.2)
-    np.testing.assert_array_equal(volume, again)
-    np.testing.assert_array_equal(grid.affine, again_grid.affine)
-    everything, _ = volume_without(replace(slices, value=brighter), None, 3.2)
-    assert everything.max() > 1.3 * volume.max()
-
-
-def test_the_calmest_interleave_is_the_true_one(head: Phantom):
-    for interleave in (1, 2, 3):
-        level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
-        slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
-        (sample,) = StackSamples.of_all(slices)
-        assert estimate_interleave(sample, truth) == interleave
-
-
-# -- frames ----------------------------------------------------------------------------------------
-
-
 def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
     slices, truth = moving.slices, moving.truth
     elsewhere = turned_about(np.zeros(3), np.array([2.0, 0.5, -1.0]), np.array([60.0, 20, -50])) @ truth
-    stray = slices_disturbed(moved(slices, elsewhere), 30.0, 25.0).world_from_header()
+    stray = slices_disturbed(slices.with_motion(elsewhere), 30.0, 25.0).world_from_header()
     few = np.arange(len(slices)) % 6 == 0
     other = RigidPose(
         np.where(few[:, None, None], stray.rotation, elsewhere.rotation),
@@ -152,15 +63,12 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
     )
 
 
-# -- runs ------------------------------------------------------------------------------------------
-
-
-def test_half_a_stack_after_a_jerk_finds_back(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
-    """Wrong motions of a run are taken back, with nothing known about which run lies wrongly."""
+def test_half_a_stack_is_placed_again_after_a_jerk(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+    """A wrongly placed segment is corrected, with nothing known about which segment is wrong."""
     slices, _ = still_slices
     by = turned_about(np.zeros(3), np.deg2rad([0, 12, 8]), np.array([4.0, 3, -5]))
     motion, late = jerked(slices, 1, by)
-    volume, grid = volume_without(moved(slices, motion), 1, 2.4)
+    volume, grid = volume_without(slices.with_motion(motion), 1, 2.4)
     own = motion.take(samples[1].rows)
     placed = refine_placement(
         samples[1], own, volume, grid, rotation_deg=2.0, translation_mm=1.0, rng=np.random.default_rng(0)
@@ -183,7 +91,7 @@ def test_half_a_stack_after_a_jerk_finds_back(still_slices: tuple[Slices, RigidP
     assert (proposed.motion.translation_mm == 0).all(1).mean() > 0.8
 
 
-def test_a_still_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phantom):
+def test_a_rigid_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phantom):
     jerk = MotionLevel(n_jerks=1, jerk_deg=10.0, jerk_mm=6.0)
     slices, truth = as_slices(simulated(head, [STILL, jerk, STILL], seed=2))
     _, sizes = np.unique(truth.take(slices.stack_id == 1).translation_mm.round(6), axis=0, return_counts=True)
@@ -197,17 +105,17 @@ def test_a_still_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phant
         own = found.take(samples[stack].rows)
         np.testing.assert_allclose(own.rotation, own.rotation[:1].repeat(len(own), 0), atol=1e-9)
         np.testing.assert_allclose(own.translation_mm, own.translation_mm[:1].repeat(len(own), 0), atol=1e-6)
-    assert np.median(pixel_errors_mm(moved(slices, found), truth)) < 0.5
+    assert np.median(pixel_errors_mm(slices.with_motion(found), truth)) < 0.5
 
 
-def test_runs_that_fit_noise_are_put_together_again(
+def test_segments_that_fit_noise_collapse_to_one_motion(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ):
     slices, truth = still_slices
     motion = slices_disturbed(slices, 0.7, 0.4).world_from_header()
     found, shared = collapse_to_rigid(slices, samples, motion, [1, 1, 1])
     assert shared == [True, True, True]
-    before, after = (pixel_errors_mm(moved(slices, m), truth) for m in (motion, found))
+    before, after = (pixel_errors_mm(slices.with_motion(m), truth) for m in (motion, found))
     assert after.mean() < 0.7 * before.mean()
 
 
@@ -216,9 +124,9 @@ def test_a_stack_that_starts_upside_down_comes_back(
 ):
     slices, truth = still_slices
     start = upside_down(slices, 1)
-    assert np.median(pixel_errors_mm(moved(slices, start), truth)[(slices.stack_id == 1)[slices.pixel_plane]]) > 20
+    assert np.median(pixel_errors_mm(slices.with_motion(start), truth)[(slices.stack_id == 1)[slices.pixel_plane]]) > 20
     found, placements = refine_segments(slices, samples, start, [], np.random.default_rng(0))
-    error = pixel_errors_mm(moved(slices, found), truth)
+    error = pixel_errors_mm(slices.with_motion(found), truth)
     assert np.median(error) < 1.5
     assert np.quantile(error, 0.9) < 4
     assert len(placements) == 3

@@ -1,4 +1,4 @@
-"""Where an unknown head lies, whichever way it was scanned; and its standard orientation."""
+"""Where an unknown head lies, whichever way it was scanned."""
 
 from dataclasses import replace
 
@@ -14,17 +14,16 @@ from g3r.acquisition.slicing import head_volume_mm3
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import standard_orientation
-from g3r.registration.candidates import moved
-from g3r.registration.placement import StackSamples
-from g3r.registration.pose_samples import angle_deg, turns_about, uniform_rotations
-from g3r.registration.so3_search import PEAK_MARGIN, peaks, place_around, stack_orientations
-from g3r.registration.template_search import (
+from g3r.registration.atlas_search import (
     fitted_template,
     nearest_templates,
-    place_in_template,
+    place_in_atlas,
     template_fits,
     template_orientations,
 )
+from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
+from g3r.registration.similarity import StackSamples
+from g3r.registration.so3_search import CORRELATION_MARGIN, best_orientations, place_around, stack_orientations
 from tests.registration.moving_heads import (
     Moving,
     as_slices,
@@ -35,6 +34,8 @@ from tests.registration.moving_heads import (
 )
 
 TURNS = {"180 x": [np.pi, 0, 0], "180 z": [0, 0, np.pi], "oblique": [2.0, -1.2, 1.5]}
+
+
 PLACE_MM = np.array([20.0, -30.0, 40.0])
 
 
@@ -61,15 +62,15 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     slices, truth = as_slices([stacks[k] for k in order])
     samples = StackSamples.of_all(slices)
     rng = np.random.default_rng(0)
-    placed = place_in_template(slices, samples, template, rng)
+    placed = place_in_atlas(slices, samples, template, rng)
     motion = placed.motion(len(slices), samples)
-    error = pixel_errors_mm(moved(slices, motion), truth)
+    error = pixel_errors_mm(slices.with_motion(motion), truth)
     assert np.median(error) < 2
     assert error.max() < 5
     assert placed.correlation > 0.7
     assert max(angle_deg(m @ rotation, np.eye(3)) for m in motion.rotation) < 15
     # the atlas frame is that of the phantom, but for the turn
-    upright = standard_orientation(slices, placed.heads, motion, rng)
+    upright = standard_orientation(slices, placed.templates, motion, rng)
     assert upright is not None
     back = upright.pose @ slices.planes.pose.inverse()
     np.testing.assert_allclose(back.rotation, back.rotation[:1].repeat(len(back), 0), atol=1e-9)
@@ -134,22 +135,6 @@ def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
     assert standard_orientation(slices, heads, still, rng) is not None
 
 
-# -- size ------------------------------------------------------------------------------------------
-
-
-def test_the_masked_volume_is_the_heads(head: Phantom, still_slices: tuple[Slices, RigidPose]):
-    slices, _ = still_slices
-    true_mm3 = head.mask.sum() * abs(np.linalg.det(head.affine))
-    assert head_volume_mm3(slices) == pytest.approx(true_mm3, rel=0.05)
-    # by the distance of slices, whichever of them are there
-    assert head_volume_mm3(slices.take(slices.stack_id == 1)) == pytest.approx(true_mm3, rel=0.07)
-    other = slices.take(slices.slice_index % 2 == 0)
-    assert head_volume_mm3(other) == pytest.approx(true_mm3 / 2, rel=0.1)
-    one = slices.take([20])
-    area = one.mask.sum() * one.planes.spacing_mm[0].prod()
-    assert head_volume_mm3(one) == pytest.approx(area * one.thickness_mm[0])
-
-
 def test_masks_of_another_size_than_any_head_are_refused(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
 ):
@@ -211,9 +196,6 @@ def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose
         assert found.weeks == 24
 
 
-# -- the whole sphere ------------------------------------------------------------------------------
-
-
 def test_the_whole_head_turned_is_among_the_orientations_to_follow(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
 ):
@@ -238,7 +220,7 @@ def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices:
     assert min(away) < 20
     placed = place_around(sample, bases[int(np.argmin(away))], target, volume, grid)
     error = np.linalg.norm(
-        moved(stack, placed.motion).planes.center_mm - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
+        stack.with_motion(placed.motion).planes.center_mm - slices.take(slices.stack_id == 1).planes.center_mm, axis=1
     )
     assert np.median(error) < 6  # a lattice of 7 mm and 10 degrees
     assert placed.segments.n_segments <= 3
@@ -246,13 +228,13 @@ def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices:
 
 def test_orientations_to_follow_are_few_apart_and_best_first():
     rotation = uniform_rotations(3000)
-    centers = turns_about(rotation[[100, 900, 2500]], np.zeros(3), np.zeros(3)).rotation
+    centers = rotations_about(rotation[[100, 900, 2500]], np.zeros(3), np.zeros(3)).rotation
     agreement = np.zeros(len(rotation))
     for height, center in zip((0.70, 0.75, 0.60), centers, strict=True):
         agreement = np.maximum(agreement, height - angle_deg(rotation, center) / 200)
-    found = peaks(rotation, agreement, 4, 40.0)
+    found = best_orientations(rotation, agreement, 4, 40.0)
     assert len(found) == 2  # the third is lower by more than the margin
     assert angle_deg(found[0], centers[1]) < 1e-4
     assert angle_deg(found[1], centers[0]) < 1e-4
-    assert PEAK_MARGIN < 0.15
-    assert len(peaks(rotation, agreement, 1, 40.0)) == 1
+    assert CORRELATION_MARGIN < 0.15
+    assert len(best_orientations(rotation, agreement, 1, 40.0)) == 1

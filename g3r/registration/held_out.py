@@ -1,0 +1,148 @@
+"""Held-out scores: how well a volume made of the other stacks predicts each stack in given poses."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.least_squares import solve_volume
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.motion_segments import changes_in_time, time_orders, transition_penalty
+from g3r.registration.similarity import (
+    CORRELATION_AREA_MM2,
+    StackSamples,
+    correlation,
+    mean_square_residual,
+    own_moments,
+)
+
+logger = logging.getLogger(__name__)
+
+HELD_OUT_VOXEL_MM = 3.2
+
+PIXELS_OF_VOLUME = 100_000
+"""At most about this many pixels make a volume of the search."""
+
+
+def volume_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
+    """A volume from all slices except those of one stack, zero outside the masks; and its grid.
+
+    A slice would register to its own blur if it had helped to make the volume.
+
+    Args:
+        slices: all slices at their present poses.
+        stack: the one to hold out.
+        spacing_mm: voxel size.
+    """
+    others = slices.take(slices.stack_id != stack)
+    grid = grid_around(others, spacing_mm, margin_mm=20.0)
+    index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // PIXELS_OF_VOLUME))
+    operator = VoxelOperator(others.planes, grid, index, (1, 1, 3))
+    value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)
+    weight = np.ones(len(index), np.float32)
+    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
+    return gaussian_filter(volume, 0.5), grid
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How well a volume predicts the slices of a stack that it was made without.
+
+    Args:
+        cost: of the slices (n log residual, the noise being unknown) plus the transition penalty of their
+            motions; comparable between placements of the same stack.
+        correlation: over all pixels, outline included.
+        slice_correlation: [K].
+    """
+
+    cost: float
+    correlation: float
+    slice_correlation: NDArray[np.float64]
+
+
+def predict(
+    sample: StackSamples, motion: RigidPose, volume: NDArray[np.float32], grid: VolumeGrid, interleave: int
+) -> Prediction:
+    """Compare a stack with a volume that was made without it.
+
+    Args:
+        sample: the stack.
+        motion: [K] world from header.
+        volume: [I, J, K].
+        grid: its grid.
+        interleave: acquisition order of the stack.
+    """
+    moments = own_moments(sample.pixels, volume, grid, motion)
+    energy = moments[:, 3] / moments[:, 0]
+    relative = mean_square_residual(moments) / np.maximum(energy, 1e-30)
+    fit = (sample.pixels.area_mm2 / CORRELATION_AREA_MM2) @ np.log(relative + 1e-4)
+    moves = changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, interleave)
+    return Prediction(float(fit) + transition_penalty(moves), float(correlation(moments.sum(0))), correlation(moments))
+
+
+@dataclass(frozen=True)
+class HeldOutScore:
+    """How well each stack is predicted by the others: one `Prediction` for each."""
+
+    prediction: list[Prediction]
+
+    @property
+    def cost(self) -> float:
+        """Sum over the stacks."""
+        return sum(p.cost for p in self.prediction)
+
+    @property
+    def correlations(self) -> list[float]:
+        """Correlation of each stack with the volume of the others."""
+        return [p.correlation for p in self.prediction]
+
+
+def held_out_score(slices: Slices, samples: list[StackSamples], motion: RigidPose) -> HeldOutScore:
+    """Hold out each stack in turn and compare it with the volume of the others.
+
+    Args:
+        slices: of two or more stacks.
+        samples: the thinned pixels of each stack.
+        motion: [K] world from header of all slices.
+    """
+    posed = slices.with_motion(motion)
+    predictions = []
+    for sample in samples:
+        volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM)
+        own = motion.take(sample.rows)
+        predictions.append(predict(sample, own, volume, grid, estimate_interleave(sample, own)))
+    return HeldOutScore(predictions)
+
+
+def estimate_interleave(sample: StackSamples, motion: RigidPose) -> int:
+    """The interleave under which a stack's motions [K] change least."""
+    penalties = {
+        n: transition_penalty(changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, n))
+        for n in time_orders(sample.slice_index)
+    }
+    return min(penalties, key=lambda n: penalties[n])
+
+
+def best_initialisation(
+    slices: Slices, samples: list[StackSamples], initialisations: Mapping[str, RigidPose]
+) -> tuple[str, dict[str, HeldOutScore]]:
+    """The name of the initialisation with the lowest held-out cost, and the scores of all.
+
+    Args:
+        slices: of two or more stacks.
+        samples: the thinned pixels of each stack.
+        initialisations: motions [K] (world from header) by name.
+    """
+    scores = {name: held_out_score(slices, samples, motion) for name, motion in initialisations.items()}
+    for name, score in scores.items():
+        correlations = " ".join(f"{one:.2f}" for one in score.correlations)
+        logger.info("%s: held-out cost %.0f, correlation %s", name, score.cost, correlations)
+    return min(scores, key=lambda name: scores[name].cost), scores

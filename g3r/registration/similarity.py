@@ -1,0 +1,212 @@
+"""How well slices fit a volume under many candidate motions at once, outline of the head included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose, VolumeGrid
+
+PIXELS_PER_SLICE = 100
+"""Pixels of a slice that take part in a search; at its resolution neighbours are nearly alike."""
+
+GAIN_RANGE = (0.6, 1.6)
+"""Intensity factors of a slice that a candidate may be fitted with."""
+
+CORRELATION_AREA_MM2 = 80.0
+"""Area over which residuals are correlated at a search's resolution: one independent sample for each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchPixels:
+    """Thinned pixels of some slices as points of the world.
+
+    Pixels of a slice's bounding box outside its mask count with value 0: the outline of the head says at
+    least as much about its orientation as the anatomy inside.
+
+    Args:
+        point_mm: [P, 3].
+        value: [P].
+        start: [K + 1] first pixel of each slice.
+        area_mm2: [K] area of the bounding box of each slice.
+        center_mm: [3] mean of the masked pixels.
+    """
+
+    point_mm: NDArray[np.float64]
+    value: NDArray[np.float32]
+    start: NDArray[np.int64]
+    area_mm2: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, slices: Slices, pixels_per_slice: int = PIXELS_PER_SLICE) -> SearchPixels:
+        """A square lattice of about `pixels_per_slice` pixels from each slice, at the slices' poses."""
+        planes = slices.planes
+        chosen = []
+        for k in range(len(slices)):
+            number = np.arange(planes.offset[k], planes.offset[k + 1]).reshape(planes.shape[k])
+            step = max(1, round(float(np.sqrt(number.size / pixels_per_slice))))
+            first = np.minimum(step // 2, (np.array(number.shape) - 1) // 2)
+            chosen.append(number[first[0] :: step, first[1] :: step].ravel())
+        index = np.concatenate(chosen)
+        mask = slices.mask[index]
+        point = planes.pixel_world_mm(index)
+        return cls(
+            point_mm=point,
+            value=np.where(mask, slices.value[index], 0).astype(np.float32),
+            start=np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64),
+            area_mm2=planes.shape.prod(1) * planes.spacing_mm.prod(1),
+            center_mm=point[mask].mean(0) if mask.any() else point.mean(0),
+        )
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def moments(self, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose) -> NDArray[np.float64]:
+        """Sums n, y, m, yy, mm, ym [J, K, 6] of slices k in a volume under world motions j.
+
+        y is a pixel of the slice, m the volume there (trilinear, 0 outside). The volume should be as blurred
+        as the slices are thick; there is no PSF here.
+
+        Args:
+            volume: [I, J, K].
+            grid: its grid.
+            motion: J motions of the world.
+        """
+        index_from_world = np.linalg.inv(grid.affine)
+        linear = index_from_world[:3, :3] @ motion.rotation
+        translation = motion.translation_mm @ index_from_world[:3, :3].T + index_from_world[:3, 3]
+        out = np.zeros((len(motion), len(self), 6))
+        volume = np.ascontiguousarray(volume, np.float32)
+        _moments(volume, self.point_mm, self.value, self.start, linear, translation, out)
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackSamples:
+    """The thinned pixels of one stack, by the header, for the global search.
+
+    Args:
+        stack: number of the stack.
+        rows: [K] which of all slices these are.
+        pixels: at the header poses.
+        slice_index: [K] number of each slice in its stack.
+        n_candidates: random motions that are tried at once.
+    """
+
+    stack: int
+    rows: NDArray[np.int64]
+    pixels: SearchPixels
+    slice_index: NDArray[np.int64]
+    n_candidates: int
+
+    @classmethod
+    def of_all(cls, slices: Slices, n_candidates: int = 4000) -> list[StackSamples]:
+        """One entry for each stack."""
+        by_header = slices.with_pose(slices.header_pose)
+        samples = []
+        for stack in np.unique(slices.stack_id):
+            rows = np.flatnonzero(slices.stack_id == stack)
+            samples.append(
+                cls(
+                    stack=int(stack),
+                    rows=rows,
+                    pixels=SearchPixels.of(by_header.take(rows)),
+                    slice_index=slices.slice_index[rows],
+                    n_candidates=n_candidates,
+                )
+            )
+        return samples
+
+
+def slice_costs(
+    pixels: SearchPixels, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose
+) -> NDArray[np.float64]:
+    """Negative log likelihood [K, J] of slices k in a volume under motions j.
+
+    Student's form with the noise level of a slice that fits, so that a slice with signal loss counts less.
+
+    Args:
+        pixels: of K slices.
+        volume: [I, J, K].
+        grid: its grid.
+        motion: J motions of the world.
+    """
+    residual = mean_square_residual(pixels.moments(volume, grid, motion)).T
+    noise = float(np.median(residual.min(1))) + 1e-12
+    n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
+    return n_samples[:, None] * np.log1p(residual / (2 * noise))
+
+
+def own_moments(
+    pixels: SearchPixels, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose
+) -> NDArray[np.float64]:
+    """Sums n, y, m, yy, mm, ym [K, 6] of each slice in a volume under its own motion.
+
+    Args:
+        pixels: of K slices.
+        volume: [I, J, K].
+        grid: its grid.
+        motion: [K].
+    """
+    point = np.empty_like(pixels.point_mm)
+    for k in range(len(pixels)):
+        of_slice = slice(pixels.start[k], pixels.start[k + 1])
+        point[of_slice] = pixels.point_mm[of_slice] @ motion.rotation[k].T + motion.translation_mm[k]
+    return replace(pixels, point_mm=point).moments(volume, grid, RigidPose.identity(1))[0]
+
+
+def correlation(moments: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlation coefficients from sums n, y, m, yy, mm, ym [..., 6]; 0 where a variance vanishes."""
+    n, y, m, yy, mm, ym = np.moveaxis(moments, -1, 0)
+    n = np.maximum(n, 1.0)
+    var_y, var_m = yy - y * y / n, mm - m * m / n
+    product = var_y * var_m
+    defined = (var_y > 1e-12 * yy) & (var_m > 1e-12 * mm) & (product > 0)
+    return np.where(defined, (ym - y * m / n) / np.sqrt(np.where(defined, product, 1.0)), 0.0)
+
+
+def mean_square_residual(moments: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of (y - g m)^2 [...] at the best gain g in `GAIN_RANGE`, from moments [..., 6]."""
+    n, _, _, yy, mm, ym = np.moveaxis(moments, -1, 0)
+    gain = np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE)
+    return np.maximum(yy - 2 * gain * ym + gain**2 * mm, 0.0) / np.maximum(n, 1.0)
+
+
+@numba.njit(parallel=True, cache=True, fastmath=True)
+def _moments(volume, point, value, start, linear, translation, out):
+    n_i, n_j, n_k = volume.shape
+    for j in numba.prange(len(linear)):
+        a, b = linear[j], translation[j]
+        for k in range(len(start) - 1):
+            s_y = s_m = s_yy = s_mm = s_ym = 0.0
+            for p in range(start[k], start[k + 1]):
+                u, v, w = point[p, 0], point[p, 1], point[p, 2]
+                x = a[0, 0] * u + a[0, 1] * v + a[0, 2] * w + b[0]
+                y = a[1, 0] * u + a[1, 1] * v + a[1, 2] * w + b[1]
+                z = a[2, 0] * u + a[2, 1] * v + a[2, 2] * w + b[2]
+                m = 0.0
+                if 0 <= x < n_i - 1 and 0 <= y < n_j - 1 and 0 <= z < n_k - 1:
+                    i, h, q = int(x), int(y), int(z)
+                    fx, fy, fz = x - i, y - h, z - q
+                    v00 = volume[i, h, q] + fz * (volume[i, h, q + 1] - volume[i, h, q])
+                    v01 = volume[i, h + 1, q] + fz * (volume[i, h + 1, q + 1] - volume[i, h + 1, q])
+                    v10 = volume[i + 1, h, q] + fz * (volume[i + 1, h, q + 1] - volume[i + 1, h, q])
+                    v11 = volume[i + 1, h + 1, q] + fz * (volume[i + 1, h + 1, q + 1] - volume[i + 1, h + 1, q])
+                    v0, v1 = v00 + fy * (v01 - v00), v10 + fy * (v11 - v10)
+                    m = v0 + fx * (v1 - v0)
+                s_y += value[p]
+                s_m += m
+                s_yy += value[p] * value[p]
+                s_mm += m * m
+                s_ym += value[p] * m
+            out[j, k, 0] = start[k + 1] - start[k]
+            out[j, k, 1] = s_y
+            out[j, k, 2] = s_m
+            out[j, k, 3] = s_yy
+            out[j, k, 4] = s_mm
+            out[j, k, 5] = s_ym

@@ -1,0 +1,49 @@
+"""Decisions of registration that rest on a tuned number, with what was seen on the data it was tuned on.
+
+The data are simulated development subjects of 24 to 34 weeks at all levels of motion (`--development` of
+`studies.motion.sweep`; docs/motion.md measures on others), unless a line says otherwise. Correlations of
+stacks with volumes include the outline of the head.
+"""
+
+IN_PLACE_CORRELATION = 0.75
+"""Held-out correlation of a stack above which other orientations are not searched: stacks that lie the wrong
+way reach 0.65, stacks in place 0.7 to 0.9."""
+
+RETRY_BELOW_CORRELATION = 0.68
+"""Where a stack stays below this held-out correlation, the search starts again with other random numbers.
+Stacks in place reach 0.66 to 0.9, so a few searches are repeated without need."""
+
+MIN_COST_GAIN = 100.0
+"""A stack gets several motion segments, or leaves its initialisation, only for a cost (log odds) lower by at
+least this: segments that fit noise gain 10 to 30, a single true jerk several hundred."""
+
+MIN_COST_GAIN_SINGLE = 450.0
+"""The same for a single stack, which only the atlas template holds together: gains reach 277 with mild motion,
+where one motion for all slices is nearer to the truth (0.7-0.9 mm instead of 0.8-2.6), and 691 to 1950 with
+jerks (15 stacks of development and validation subjects)."""
+
+MAX_HELD_OUT_LOSS = 0.02
+"""A rigid stack whose held-out correlation falls by more than this as its slices move becomes rigid again."""
+
+MIN_NCC_GAIN = 0.015
+"""So does one whose slices gain less than this (median correlation with the volume of all): 0.004 to 0.010
+where nothing moved, which is noise, 0.02 to 0.05 with mild motion."""
+
+MIN_ATLAS_CORRELATION = 0.6
+"""Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for
+simulated heads of 24 to 34 weeks, 0.4 for heads that lie the wrong way."""
+
+MIN_PRIOR_LOSS_REMOVED = 0.22
+"""Share of the robust loss that registering a single stack to the prior must remove to be accepted: 0.10 to
+0.18 for stacks without motion (gains and noise), 0.26 to 0.32 for mild motion."""
+
+MIN_HELD_OUT = 0.65
+"""A stack with a lower held-out correlation is reported as not registered."""
+
+MIN_NCC = 0.75
+"""So is one whose slices have a lower median correlation with the volume: at least 0.93 for stacks in place,
+0.8 with a bias field of 0.15, 0.4 to 0.73 for the worst stack of failures."""
+
+DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHARE = 0.5, 0.6
+"""So is one of whose slices a larger share has a weight below the first number; up to 0.4 in good
+reconstructions of real stacks."""

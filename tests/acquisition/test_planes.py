@@ -1,0 +1,86 @@
+"""Planes and slices: taken, moved, refused; a volume as planes."""
+
+import numpy as np
+import pytest
+
+from g3r.acquisition.planes import Planes, volume_from_pixels, volume_planes
+from g3r.acquisition.slicing import slices_from_stacks
+from g3r.geometry import RigidPose, VolumeGrid
+from tests.acquisition.nifti_files import AXES, affine_of, stacks_of_two
+
+
+@pytest.mark.parametrize("index", [[3, 0, 7], slice(2, 6), "mask", []])
+def test_take_keeps_pixels_values_and_slices_together(index):
+    slices = slices_from_stacks(stacks_of_two())
+    if index == "mask":
+        index = np.arange(len(slices)) % 3 == 1
+    chosen = np.arange(len(slices))[index]
+    part = slices.take(index)
+    assert len(part) == len(chosen)
+    np.testing.assert_array_equal(part.stack_id, slices.stack_id[chosen])
+    np.testing.assert_array_equal(part.slice_index, slices.slice_index[chosen])
+    np.testing.assert_array_equal(part.thickness_mm, slices.thickness_mm[chosen])
+    world, offset = slices.planes.pixel_world_mm(), slices.planes.offset
+    part_world = part.planes.pixel_world_mm()
+    for new, old in enumerate(chosen):
+        old_pixels, new_pixels = (slice(offset[old], offset[old + 1]), slice(*part.planes.offset[new : new + 2]))
+        np.testing.assert_array_equal(part.value[new_pixels], slices.value[old_pixels])
+        np.testing.assert_array_equal(part.mask[new_pixels], slices.mask[old_pixels])
+        np.testing.assert_array_equal(part_world[new_pixels], world[old_pixels])
+        np.testing.assert_array_equal(part.header_pose.rotation[new], slices.header_pose.rotation[old])
+
+
+def test_moving_the_world_moves_the_pixels_and_is_reported():
+    slices = slices_from_stacks(stacks_of_two())
+    motion = RigidPose.from_rotvec([[0.2, -0.1, 0.4]], [[5.0, -3, 2]])
+    moved = slices.with_pose(motion @ slices.planes.pose)
+    expected = motion.apply(slices.planes.pixel_world_mm()[None])[0]
+    np.testing.assert_allclose(moved.planes.pixel_world_mm(), expected, atol=1e-10)
+    np.testing.assert_allclose(slices.planes.moved(motion).pixel_world_mm(), expected, atol=1e-10)
+    reported = moved.world_from_header()
+    np.testing.assert_allclose(reported.rotation, np.tile(motion.rotation, (len(slices), 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(reported.translation_mm - motion.translation_mm, 0, atol=1e-10)
+
+
+def test_volume_planes_are_the_volume_in_order():
+    data = np.random.default_rng(3).normal(size=(5, 4, 3)).astype(np.float32)
+    for axes in AXES.values():
+        grid = VolumeGrid(data.shape, affine_of(axes))
+        planes = volume_planes(grid)
+        pixels = data.transpose(2, 0, 1).ravel()
+        np.testing.assert_array_equal(volume_from_pixels(pixels, grid), data)
+        index = np.stack(np.meshgrid(*[np.arange(n) for n in data.shape], indexing="ij"), -1)
+        expected = grid.world(index).transpose(2, 0, 1, 3).reshape(-1, 3)
+        np.testing.assert_allclose(planes.pixel_world_mm(), expected, atol=1e-9)
+        assert (planes.psf_var_mm2 == 0).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"spacing_mm": [[0.0, 1]]},
+        {"shape": [[0, 3]]},
+        {"psf_var_mm2": [[-1.0, 0, 0]]},
+        {"center_mm": [[np.nan, 0, 0]]},
+        {"center_mm": [[0.0, 0]]},
+    ],
+)
+def test_planes_without_meaning_are_refused(change):
+    good = {
+        "rotation": np.eye(3)[None],
+        "center_mm": [[0.0, 0, 0]],
+        "spacing_mm": [[1.0, 1]],
+        "shape": [[4, 3]],
+        "psf_var_mm2": [[0.1, 0.1, 1.0]],
+    }
+    Planes(**good)
+    with pytest.raises(ValueError, match=r"planes need|expected|finite"):
+        Planes(**(good | change))
+
+
+def test_records_print_their_sizes_in_one_line():
+    stack = stacks_of_two()[1]
+    slices = slices_from_stacks(stacks_of_two())
+    assert repr(stack) == "Stack(second: 9 x 16 x 5 voxels of 0.8 x 0.9 x 3 mm, 2 mm thick)"
+    assert repr(slices).startswith(f"Slices({len(slices)} slices of 2 stacks, {len(slices.pixel_index)} ")
+    assert repr(slices.planes) == f"Planes({len(slices)} planes, {slices.planes.n_pixels} pixels)"

@@ -1,0 +1,106 @@
+"""The whole of registration on a small synthetic head."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.atlas_template import AtlasTemplate
+from g3r.geometry import RigidPose
+from g3r.registration import RegistrationSettings, register
+from g3r.registration.atlas_frame import centred_on_headers
+from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm
+
+OFF = RegistrationSettings(template=False, network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=1.8)
+
+
+def test_the_whole_estimate_on_a_moving_head(moving: Moving):
+    """Walks, jerks and stack offsets: the poses come back to a fraction of the header's error."""
+    slices, estimate = moving.slices, moving.estimate
+    before, after = pixel_errors_mm(slices, moving.truth), pixel_errors_mm(estimate.slices, moving.truth)
+    assert before.mean() > 4
+    assert np.median(after) < 1.2
+    assert after.mean() < 0.4 * before.mean()
+    assert moving.progress == [*((n, 4) for n in range(4)), (4, 4)]
+    assert len(estimate.history) == 4
+    for array in (estimate.gain, estimate.weight, estimate.ncc):
+        assert array.shape == (len(slices),)
+        assert np.isfinite(array).all()
+    assert np.median(estimate.ncc) > 0.9
+    # at the poles the volume's blur looks like a gain
+    assert np.quantile(np.abs(np.log(estimate.gain)), 0.8) < 0.1
+    np.testing.assert_array_equal(estimate.slices.value, slices.value)  # bias_corrected for registration alone
+
+
+def test_the_whole_estimate_says_how_it_was_found(moving: Moving):
+    estimate = moving.estimate
+    assert set(estimate.initialisations) == {"headers", "template", "stacks"}
+    sums = {name: sum(values) for name, values in estimate.initialisations.items()}
+    assert sums[estimate.initialisation] > sums["headers"]
+    assert len(estimate.held_out) == len(estimate.interleave) == len(estimate.n_segments) == 3
+    assert min(estimate.held_out) > max(estimate.initialisations["headers"])
+    assert estimate.interleave == [2, 2, 2]
+    assert all(1 <= n <= 6 for n in estimate.n_segments)
+    assert estimate.orientation is not None
+    assert estimate.orientation.weeks in (24, 31)
+
+
+def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedStack]):
+    slices, _ = as_slices(still)
+    estimate = register(slices, OFF)
+    np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
+    assert (estimate.gain == 1).all()
+    assert np.median(estimate.ncc) > 0.9
+    assert estimate.initialisation == "headers"
+    assert set(estimate.initialisations) == {"headers"}
+    assert estimate.orientation is None
+    assert estimate.n_segments == [1, 1, 1]
+
+
+def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]):
+    slices, _ = as_slices(still[:1])
+    estimate = register(slices, RegistrationSettings())
+    np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
+    assert estimate.held_out is None
+    assert estimate.initialisations == {}
+    assert estimate.history == []
+
+
+@pytest.mark.parametrize(("n_slices", "layer"), [(1, "template"), (2, "segments")])
+def test_stacks_of_one_or_two_slices(still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str):
+    """Too few to register well, but no reason to break down."""
+    slices, _ = as_slices(still)
+    rows = np.concatenate([np.flatnonzero(slices.stack_id == s)[6 : 6 + n_slices] for s in (1, 2)])
+    mixed = slices.take(np.concatenate([np.flatnonzero(slices.stack_id == 0), rows]))
+    for subject in (mixed, slices.take(rows), slices.take(rows[:n_slices])):
+        settings = replace(OFF, n_rounds=1, **{layer: True})
+        estimate = register(subject, settings, template=template)
+        assert np.isfinite(estimate.slices.planes.center_mm).all()
+        assert np.isfinite(estimate.ncc).all()
+        assert len(estimate.n_segments) == subject.n_stacks
+
+
+def test_proposals_are_initialisations_like_the_others(moving: Moving):
+    """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
+    proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
+    settings = replace(OFF, network=True)
+    estimate = register(moving.slices, settings, proposals=proposals)
+    assert estimate.initialisation == "oracle"
+    assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 1e-6
+    deaf = register(moving.slices, replace(settings, network=False), proposals=proposals)
+    assert set(deaf.initialisations) == {"headers"}
+
+
+def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack]):
+    """Poses are only determined up to it; a few slices that went astray do not tilt it."""
+    slices, _ = as_slices(still)
+    motion = RigidPose.from_rotvec([[0.2, -0.3, 0.1]], [[8.0, -5, 12]])
+    moved = slices.planes.moved(motion)
+    center = moved.center_mm.copy()
+    center[::10] += [0.0, 25, -15]
+    found = centred_on_headers(slices.with_pose(RigidPose(moved.rotation, center)))
+    usual = np.arange(len(slices)) % 10 != 0
+    distance = np.linalg.norm(found.planes.center_mm - slices.planes.center_mm, axis=1)
+    assert distance[usual].max() < 0.2
+    assert distance[~usual].min() > 20

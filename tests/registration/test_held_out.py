@@ -1,0 +1,83 @@
+"""Held-out scores: true poses predict the other stacks best."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.motion import MotionLevel
+from data_synth.phantom import Phantom
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose
+from g3r.registration.held_out import best_initialisation, estimate_interleave, held_out_score, volume_without
+from g3r.registration.similarity import StackSamples
+from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed, stack_moved, turned_about
+
+
+def test_true_poses_predict_better_than_wrong_ones(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+    """The further off, the higher the cost; the wrong stack correlates least."""
+    slices, truth = still_slices
+    right = held_out_score(slices, samples, truth)
+    assert min(p.correlation for p in right.prediction) > 0.75
+    previous = right.cost
+    for degrees, mm in ((3.0, 1.5), (8.0, 5.0), (25.0, 10.0)):
+        by = turned_about(np.zeros(3), np.deg2rad([degrees, 0, 0]), np.array([0, mm, 0]))
+        wrong = held_out_score(slices, samples, stack_moved(truth, slices, 1, by))
+        assert wrong.cost > previous + 20
+        assert np.argmin([p.correlation for p in wrong.prediction]) == 1
+        previous = wrong.cost
+
+
+def test_a_score_has_a_prediction_for_every_stack_and_slice(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+):
+    slices, truth = still_slices
+    scores = held_out_score(slices, samples, truth)
+    assert len(scores.prediction) == 3
+    for stack, one in enumerate(scores.prediction):
+        assert one.slice_correlation.shape == ((slices.stack_id == stack).sum(),)
+    assert scores.cost == pytest.approx(sum(p.cost for p in scores.prediction))
+
+
+def test_poses_pay_a_penalty_for_their_movements(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+    slices, truth = still_slices
+    moving_poses = slices_disturbed(slices, 0.1, 0.05).world_from_header()
+    assert held_out_score(slices, samples, moving_poses).cost > held_out_score(slices, samples, truth).cost + 5 * len(
+        slices
+    )
+
+
+def test_the_true_initialisation_is_chosen(moving: Moving):
+    slices, truth = moving.slices, moving.truth
+    initialisations = {
+        "headers": RigidPose.identity(len(slices)),
+        "truth": truth,
+        "nearly": slices_disturbed(slices.with_motion(truth), 4.0, 3.0).world_from_header(),
+    }
+    name, scores = best_initialisation(slices, StackSamples.of_all(slices), initialisations)
+    assert name == "truth"
+    assert set(scores) == set(initialisations)
+    assert scores["truth"].cost < scores["nearly"].cost
+    assert scores["truth"].cost < scores["headers"].cost
+
+
+def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]):
+    """A volume made without a stack does not depend on it."""
+    slices, _ = still_slices
+    volume, grid = volume_without(slices, 1, 3.2)
+    brighter = slices.value.copy()
+    own = (slices.stack_id == 1)[slices.planes.plane_id()]
+    brighter[own] *= 3
+    again, again_grid = volume_without(replace(slices, value=brighter), 1, 3.2)
+    np.testing.assert_array_equal(volume, again)
+    np.testing.assert_array_equal(grid.affine, again_grid.affine)
+    everything, _ = volume_without(replace(slices, value=brighter), -1, 3.2)
+    assert everything.max() > 1.3 * volume.max()
+
+
+def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom):
+    for interleave in (1, 2, 3):
+        level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
+        slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
+        (sample,) = StackSamples.of_all(slices)
+        assert estimate_interleave(sample, truth) == interleave
