@@ -124,24 +124,27 @@ def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[
     adaptive = replace(ADAPTIVE, start=4.0) if name == "ball" else ADAPTIVE
     adaptive = replace(adaptive, last_steps=adaptive.round_steps)
     rows: dict[str, Any] = {"adaptive": [], "uniform": []}
+
+    def keep(kind: str, cloud: GaussianCloud, start: float, more: Row) -> None:
+        seconds = round(time.process_time() - start, 2)
+        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **more}
+        rows[kind].append(row)
+        print(
+            f"{name}: {kind}, {len(cloud)} Gaussians, {row['psnr_db']:.2f} dB, {seconds} s", file=sys.stderr, flush=True
+        )
+
     max_steps = 0
     for bound in BOUNDS.get(name, USUAL_BOUNDS):
         start = time.process_time()
         settings = replace(adaptive, bound=bound)
         cloud, done = fit_adaptive(volume, mask, grid, finest, settings, STAGE, np.random.default_rng(seed))
-        seconds = round(time.process_time() - start, 2)
-        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **done.record()}
-        rows["adaptive"].append(row)
+        keep("adaptive", cloud, start, done.record())
         max_steps = max(max_steps, done.steps)
-        _say(name, "adaptive", row)
     iterations = ADAPTIVE.amplitude_iterations * (max_steps // adaptive.round_steps)
     for spacing_mm in LATTICE_MM.get(name, USUAL_LATTICE):
         start = time.process_time()
         cloud = lattice_cloud(subject, spacing_mm, max_steps, iterations, seed)
-        seconds = round(time.process_time() - start, 2)
-        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds}
-        rows["uniform"].append(row | {"spacing_mm": spacing_mm})
-        _say(name, "uniform", row)
+        keep("uniform", cloud, start, {"spacing_mm": spacing_mm})
     return rows | {"steps": max_steps, "n_voxels": int(mask.sum())}
 
 
@@ -192,14 +195,6 @@ def draw(record: Record, options: argparse.Namespace) -> None:
     axes[0].set_ylabel("PSNR, dB")
     axes[0].legend(frameon=False)
     save_figure(figure, options.figure)
-
-
-def _say(name: str, kind: str, row: dict[str, Any]) -> None:
-    print(
-        f"{name}: {kind}, {row['n']} Gaussians, {row['psnr_db']:.2f} dB, {row['cpu_seconds']} s",
-        file=sys.stderr,
-        flush=True,
-    )
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
