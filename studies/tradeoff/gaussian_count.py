@@ -109,15 +109,8 @@ STAGE = PriorStageSettings(scale_weight=0.0)
 ADAPTIVE = AdaptiveSettings()
 
 
-def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
-    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds.
-
-    Args:
-        subject: volume [I, J, K], mask and grid.
-        name: of the subject, which decides bounds and spacings.
-        voxel_mm: of its grid.
-        seed: of the fits.
-    """
+def _curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
+    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds."""
     volume, mask, grid = subject
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     finest = FINEST_MM.get(name, 2.5 * voxel_mm)
@@ -211,7 +204,7 @@ def measure(name: str, voxel_mm: float) -> Row:
         if not name.startswith("atlas"):
             raise
         return {"skipped": "no test data (set G3R_TEST_DATA to the folder with atlas/)"}
-    return curves(subject, name, voxel_mm)
+    return _curves(subject, name, voxel_mm)
 
 
 STUDY = Study(

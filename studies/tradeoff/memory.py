@@ -62,14 +62,8 @@ SHARES = (1.0, 0.9, 0.8, 0.7)
 GB = 1e9
 
 
-def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
-    """A simulated subject, made if it is not there.
-
-    Args:
-        weeks: of gestation.
-        n_stacks: that it is scanned with.
-        folder: of all phantoms.
-    """
+def _phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
+    """A simulated subject, made if it is not there."""
     from data_synth import cli as simulate
 
     where = folder / f"phantom-{weeks}-{n_stacks}"
@@ -79,14 +73,8 @@ def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
     return load_case(where)
 
 
-def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
-    """Of g3r-infer.
-
-    Args:
-        one: what is asked for.
-        case: the phantom.
-        output: folder to write.
-    """
+def _arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
+    """Of g3r-infer."""
     return [
         *infer_arguments(case, one.preset, output),
         "--threads",
@@ -99,8 +87,8 @@ def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list
 
 def stated(one: Configuration, folder: Path) -> Row:
     """Stated and measured bytes of one run of the command."""
-    case = phantom(one.weeks, one.n_stacks, folder)
-    run = run_infer(arguments_for(one, case, folder / "out"), folder / "out")
+    case = _phantom(one.weeks, one.n_stacks, folder)
+    run = run_infer(_arguments_for(one, case, folder / "out"), folder / "out")
     said = run.record["memory"]
     return {
         "weeks": one.weeks,
@@ -117,23 +105,15 @@ def stated(one: Configuration, folder: Path) -> Row:
 
 def limited(one: Configuration, folder: Path) -> Row:
     """The command without a limit and below several."""
-    case, output = phantom(one.weeks, one.n_stacks, folder), folder / "out"
+    case, output = _phantom(one.weeks, one.n_stacks, folder), folder / "out"
     name = f"{one.weeks} weeks, {one.n_stacks} stacks, {one.preset}, {one.voxel_mm:g} mm"
-    return {"limited": limited_rows(case, name, arguments_for(one, case, output), output)}
+    return {"limited": _limited_rows(case, name, _arguments_for(one, case, output), output)}
 
 
-def limited_rows(
+def _limited_rows(
     case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, shares: Sequence[float] = SHARES
 ) -> list[Row]:
-    """A row without a limit, and one for each limit.
-
-    Args:
-        case: to be scored against.
-        name: of the rows.
-        arguments: of g3r-infer.
-        output: its folder.
-        shares: see `SHARES`.
-    """
+    """A row without a limit, and one for each limit."""
     first = _row(case, name, arguments, output, None)
     limits = [round(share * first["stated_bytes"]) for share in shares]
     return [first, *[_row(case, name, arguments, output, limit) for limit in limits]]

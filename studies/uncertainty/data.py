@@ -124,7 +124,7 @@ def judged(
         registered: False reconstructs from the headers.
     """
     case = simulated_case(spec, cache)
-    motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
+    motion = _cached_registration(case, n_stacks, reconstructor, cache) if registered else None
     start = time.perf_counter()
     result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
     pose_error = case.pose_error(result.slices)
@@ -185,17 +185,10 @@ def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]
     )
 
 
-def cached_registration(
+def _cached_registration(
     case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
-    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept.
-
-    Args:
-        case: the subject.
-        n_stacks: of its stacks.
-        reconstructor: that registers them.
-        cache: folder to keep it in.
-    """
+    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
     path = cache / f"{case.name}-{n_stacks}.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:
