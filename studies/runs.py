@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,102 +19,69 @@ from g3r.evaluation.compare import Comparison, compare
 from g3r.evaluation.metrics import Scores
 from g3r.evaluation.pose_error import PoseError
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from g3r.registration.quality import pose_warnings, stack_qualities
+from studies.harness import Row
 from studies.subjects import read_case
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """What one subject gave.
-
-    Attributes:
-        error: of the poses at the end.
-        seconds: wall time of what was run.
-        cpu_seconds: time of all threads.
-        warnings: what g3r said against trusting the result.
-        scores: of the volume; None where registration alone was run.
-        stage_seconds: wall time of each stage of the reconstruction; empty where registration alone was run.
-        orientation_deg: angle between the frame of the poses and that of the atlas, which the truth's voxel
-            axes show.
-    """
-
-    error: PoseError
-    seconds: float
-    cpu_seconds: float
-    warnings: tuple[str, ...]
-    scores: Scores | None = None
-    stage_seconds: Mapping[str, float] | None = None
-    orientation_deg: float | None = None
-
-    @property
-    def is_bad(self) -> bool:
-        """Whether the poses should not have been trusted."""
-        return not self.error.median_mm < BAD_MEDIAN_MM
-
-    def record(self) -> dict[str, Any]:
-        """The figures as plain numbers, without the slices."""
-        result: dict[str, Any] = {
-            **self.error.figures(),
-            "worst_mm": max(self.error.per_slice_mm.values()),
-            "orientation_deg": self.orientation_deg,
-            "seconds": round(self.seconds, 2),
-            "cpu_seconds": round(self.cpu_seconds, 2),
-            "warned": bool(self.warnings),
-            "bad": self.is_bad,
-            "warnings": list(self.warnings),
-        }
-        if self.scores:
-            result |= {"psnr_db": self.scores.psnr_db, "ssim": self.scores.ssim}
-            result |= {"stage_seconds": dict(self.stage_seconds or {})}
-        return result
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-def registered(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
-    """Registration alone, as the reconstruction begins with it.
+def run(
+    case: SimulatedCase, options: argparse.Namespace, changes: Mapping[str, Any] = NOTHING, *, full: bool
+) -> tuple[PoseError, Row]:
+    """Registration alone, as the reconstruction begins with it, or all of it with its volume scored.
 
     Args:
         case: the subject.
-        settings: of the reconstruction.
-        checkpoint: of the prior; None takes the one shipped.
+        options: of the command; its preset and prior count.
+        changes: of the settings (see `g3r.planning.presets.changed`).
+        full: whether the whole reconstruction is run.
+
+    Returns:
+        Errors of the poses, and all figures as `pose_row` has them; `orientation_deg` is the angle between the
+        frame of the poses and that of the atlas, `stage_seconds` wall time of each stage of a reconstruction.
     """
-    reconstructor = GaussianReconstructor(checkpoint, settings)
-    wall, cpu = time.perf_counter(), time.process_time()
-    motion = reconstructor.register_stacks(case.stacks)
-    seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-    confidences = stack_qualities(motion, len(case.stacks))
-    warnings = tuple(pose_warnings(motion, confidences, case.stacks))
-    error = case.pose_error(motion.slices)
-    return Run(
-        error=error,
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
-        warnings=warnings,
-        orientation_deg=orientation_deg(case, error.common),
-    )
+    reconstructor = GaussianReconstructor(options.ckpt, changed(PRESETS[options.preset], changes))
+    start = time.perf_counter(), time.process_time()
+    result = reconstructor.reconstruct(case.stacks) if full else None
+    motion = None if full else reconstructor.register_stacks(case.stacks)
+    seconds = time.perf_counter() - start[0], time.process_time() - start[1]
+    if result is not None:
+        error, warnings = case.pose_error(result.slices), result.record.warnings
+        scores = aligned(case, result.volume, result.grid, error.common).scores
+        more = {"psnr_db": scores.psnr_db, "ssim": scores.ssim, "stage_seconds": result.record.seconds}
+    else:
+        assert motion is not None
+        warnings = pose_warnings(motion, stack_qualities(motion, len(case.stacks)), case.stacks)
+        error, more = case.pose_error(motion.slices), {}
+    return error, pose_row(error, warnings, *seconds) | {"orientation_deg": orientation_deg(case, error.common)} | more
 
 
-def reconstructed(case: SimulatedCase, settings: ReconstructionSettings, checkpoint: str | None = None) -> Run:
-    """The whole reconstruction, its volume scored after rigid alignment; arguments as of `registered`."""
-    reconstructor = GaussianReconstructor(checkpoint, settings)
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = reconstructor.reconstruct(case.stacks)
-    seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-    error = case.pose_error(result.slices)
-    return Run(
-        error=error,
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
-        warnings=tuple(result.record.warnings),
-        scores=aligned(case, result.volume, result.grid, error.common).scores,
-        stage_seconds=result.record.seconds,
-        orientation_deg=orientation_deg(case, error.common),
-    )
+def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seconds: float) -> Row:
+    """Figures of poses, without the slices.
+
+    Args:
+        error: of the poses.
+        warnings: what g3r said against trusting them.
+        seconds: wall time of what was run.
+        cpu_seconds: of all threads.
+    """
+    return {
+        **error.figures(),
+        "worst_mm": max(error.per_slice_mm.values()),
+        "orientation_deg": None,
+        "seconds": round(seconds, 2),
+        "cpu_seconds": round(cpu_seconds, 2),
+        "warned": bool(warnings),
+        "bad": not error.median_mm < BAD_MEDIAN_MM,
+        "warnings": list(warnings),
+    }
 
 
 def aligned(

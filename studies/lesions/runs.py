@@ -53,7 +53,6 @@ class LesionRun:
         subject: the head.
         n_stacks: how many of its stacks were used.
         volumes: variant -> reconstruction with lesions [I, J, K], on the truth's grid and in its intensities.
-        changes: variant -> the same minus the reconstruction without lesions.
         kept: variant -> share of the contrast of each lesion that is kept.
         seconds: of all reconstructions.
     """
@@ -61,7 +60,6 @@ class LesionRun:
     subject: LesionSubject
     n_stacks: int
     volumes: dict[str, NDArray[np.float32]]
-    changes: dict[str, NDArray[np.float32]]
     kept: dict[str, list[float]]
     seconds: float
 
@@ -135,15 +133,15 @@ def lesion_run(
     pairs = {v: {w: _on_truth(r.volume, r.grid, subject) for w, r in of.items()} for v, of in found.items()}
     last = found[list(reconstructors)[-1]]
     pairs[prior_alone] = {w: _on_truth(r.prior, r.prior_grid, subject) for w, r in last.items()}
-    volumes, changes, shares = {}, {}, {}
+    volumes, shares = {}, {}
     for variant, pair in pairs.items():
         inside = subject.healthy.mask & (pair["healthy"] != 0)
         # slices carry gains of their own: one factor brings the pair into the truth's intensities
         scale = np.float32(subject.healthy.data[inside].mean() / pair["healthy"][inside].mean())
         volumes[variant] = pair["lesions"] * scale
-        changes[variant] = (pair["lesions"] - pair["healthy"]) * scale
-        shares[variant] = [kept(changes[variant], lesion) for lesion in subject.lesions]
-    return LesionRun(subject, n_stacks, volumes, changes, shares, seconds)
+        change = (pair["lesions"] - pair["healthy"]) * scale
+        shares[variant] = [kept(change, lesion) for lesion in subject.lesions]
+    return LesionRun(subject, n_stacks, volumes, shares, seconds)
 
 
 def true_motion(stacks: list[SimulatedStack]) -> Registration:

@@ -7,9 +7,9 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from g3r.planning.presets import PRESETS, ReconstructionSettings, changed
+from g3r.planning.presets import PRESETS, changed
 from studies.harness import FITS, Record, Row, Study, Task, positive
-from studies.runs import reconstructed, registered
+from studies.runs import run
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, table
 
@@ -52,15 +52,13 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
                 continue  # registration would do the same again
             # without the fit, settings left as they are say nothing about the shading
             label = "-" if options.motion_only and not changes else variant
-            yield Task(f"{spec.name}, {label}", measure, (spec, label, chosen, options))
+            yield Task(f"{spec.name}, {label}", measure, (spec, label, changes, options))
 
 
-def measure(spec: SubjectSpec, label: str, settings: ReconstructionSettings, options: argparse.Namespace) -> Row:
+def measure(spec: SubjectSpec, label: str, changes: Mapping[str, Any], options: argparse.Namespace) -> Row:
     """One variant of one subject."""
-    run = (registered if options.motion_only else reconstructed)(
-        simulated_case(spec, options.cache), settings, options.ckpt
-    )
-    return {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "shading": label, **run.record()}
+    _, row = run(simulated_case(spec, options.cache), options, changes, full=not options.motion_only)
+    return {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "shading": label, **row}
 
 
 def tables(record: Record) -> dict[str, str]:

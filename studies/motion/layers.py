@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g3r.planning.presets import PRESETS, changed
 from studies.harness import FITS, Record, Row, Study, Task
 from studies.motion.figure import draw_slice_errors, jerk_slices
-from studies.runs import Run, reconstructed, registered
+from studies.runs import run
 from studies.subjects import case_folders, read_case
 from studies.tables import table
 
@@ -74,20 +73,21 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
     """Errors after each layer, and scores with everything and with a layer left out."""
-    case, settings = read_case(folder), PRESETS[options.preset]
+    case = read_case(folder)
     header = case.header_error()
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
+    row: Row = {}
     for layer in LAYERS:
-        run = (reconstructed if layer.full else registered)(case, changed(settings, layer.options), options.ckpt)
-        layers[layer.name] = {**run.record(), "per_slice_mm": _listed(run.error.per_slice_mm)}
-        print(_line(case.name, f"after {layer.name}", run), flush=True)
-    runs = {"everything": run}  # the last layer is the product
-    for name, without in ({} if options.no_without else WITHOUT).items():
-        runs[name] = reconstructed(case, changed(settings, without), options.ckpt)
-        print(_line(case.name, f"without {name}", runs[name]), flush=True)
+        error, row = run(case, options, layer.options, full=layer.full)
+        layers[layer.name] = {**row, "per_slice_mm": _listed(error.per_slice_mm)}
+        _say(case.name, f"after {layer.name}", row)
+    without = {"everything": row}  # the last layer is the product
+    for name, changes in ({} if options.no_without else WITHOUT).items():
+        _, without[name] = run(case, options, changes, full=True)
+        _say(case.name, f"without {name}", without[name])
     return {
         "layers": layers,
-        "without": {name: run.record() for name, run in runs.items()},
+        "without": without,
         "n_slices": [stack.image.shape[2] for stack in case.stacks],
         "jerks": jerk_slices(case.true, case.points_mm),
     }
@@ -97,10 +97,10 @@ def _listed(per_slice_mm: Mapping[tuple[int, int], float]) -> list[list[float]]:
     return [[stack, k, round(error, 4)] for (stack, k), error in per_slice_mm.items()]
 
 
-def _line(case: str, what: str, run: Run) -> str:
-    psnr = f", {run.scores.psnr_db:.2f} dB" if run.scores else ""
-    error = run.error
-    return f"{case}, {what}: TRE {error.median_mm:.2f} / {error.p90_mm:.2f} mm{psnr}, {run.seconds:.0f} s"
+def _say(case: str, what: str, row: Row) -> None:
+    psnr = f", {row['psnr_db']:.2f} dB" if "psnr_db" in row else ""
+    tre = f"TRE {row['median_mm']:.2f} / {row['p90_mm']:.2f} mm"
+    print(f"{case}, {what}: {tre}{psnr}, {row['seconds']:.0f} s", flush=True)
 
 
 def tables(record: Record) -> dict[str, str]:

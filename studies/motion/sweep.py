@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from statistics import median
 
 from g3r.errors import G3RError
-from g3r.planning.presets import PRESETS
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.runs import Run, reconstructed, registered
+from studies.runs import pose_row, run
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, details, table
 
@@ -71,12 +70,12 @@ def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
     header = case.header_error()
     wall, cpu = time.perf_counter(), time.process_time()
     try:
-        run = (reconstructed if options.full else registered)(case, PRESETS[options.preset], options.ckpt)
+        _, row = run(case, options, full=options.full)
     except G3RError as error:  # a refusal is an honest answer: nothing was moved, and the user was told
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-        run = Run(error=header, seconds=seconds, cpu_seconds=cpu_seconds, warnings=(str(error),))
+        row = pose_row(header, [str(error)], seconds, cpu_seconds)
     shown = {"level": spec.motion, "seed": spec.seed, "turned": spec.turned}
-    return {**shown, "header_mm": header.mean_mm, **run.record()}
+    return {**shown, "header_mm": header.mean_mm, **row}
 
 
 def line(name: str, row: Row) -> str:

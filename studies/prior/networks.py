@@ -105,7 +105,7 @@ def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
 def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], options: argparse.Namespace) -> Row | None:
     """Train and score one variant."""
     run = options.output / variant.name
-    checkpoint, seconds = train(variant, run, n_epochs, [*data_arguments(*data), *options.train_args])
+    checkpoint, seconds = _train(variant, run, n_epochs, [*_data_arguments(*data), *options.train_args])
     if checkpoint is None:
         print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
         return None
@@ -155,14 +155,8 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
     return max(1, round(steps / per_epoch))
 
 
-def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
-    """What all variants are told about their data.
-
-    Args:
-        source: folder of the atlas.
-        cache: folder of synthetic subjects.
-        val_subjects: number of volumes of validation.
-    """
+def _data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
+    """What all variants are told about their data."""
     listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
     return [
         f"--data.source={source}",
@@ -172,14 +166,8 @@ def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
     ]
 
 
-def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
+def _train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
     """Train a variant in a process of its own, going on where an earlier one stopped.
-
-    Args:
-        variant: to be trained.
-        run: its folder.
-        n_epochs: of training.
-        arguments: of g3r-pretrain.
 
     Returns:
         Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.

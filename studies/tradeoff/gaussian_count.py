@@ -109,39 +109,35 @@ STAGE = PriorStageSettings(scale_weight=0.0)
 ADAPTIVE = AdaptiveSettings()
 
 
-def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
-    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds.
-
-    Args:
-        subject: volume [I, J, K], mask and grid.
-        name: of the subject, which decides bounds and spacings.
-        voxel_mm: of its grid.
-        seed: of the fits.
-    """
+def _curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[str, Any]:
+    """Both curves of a subject: number of Gaussians, PSNR, CPU seconds."""
     volume, mask, grid = subject
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     finest = FINEST_MM.get(name, 2.5 * voxel_mm)
     adaptive = replace(ADAPTIVE, start=4.0) if name == "ball" else ADAPTIVE
     adaptive = replace(adaptive, last_steps=adaptive.round_steps)
     rows: dict[str, Any] = {"adaptive": [], "uniform": []}
+
+    def keep(kind: str, cloud: GaussianCloud, start: float, more: Row) -> None:
+        seconds = round(time.process_time() - start, 2)
+        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **more}
+        rows[kind].append(row)
+        print(
+            f"{name}: {kind}, {len(cloud)} Gaussians, {row['psnr_db']:.2f} dB, {seconds} s", file=sys.stderr, flush=True
+        )
+
     max_steps = 0
     for bound in BOUNDS.get(name, USUAL_BOUNDS):
         start = time.process_time()
         settings = replace(adaptive, bound=bound)
         cloud, done = fit_adaptive(volume, mask, grid, finest, settings, STAGE, np.random.default_rng(seed))
-        seconds = round(time.process_time() - start, 2)
-        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **done.record()}
-        rows["adaptive"].append(row)
+        keep("adaptive", cloud, start, done.record())
         max_steps = max(max_steps, done.steps)
-        _say(name, "adaptive", row)
     iterations = ADAPTIVE.amplitude_iterations * (max_steps // adaptive.round_steps)
     for spacing_mm in LATTICE_MM.get(name, USUAL_LATTICE):
         start = time.process_time()
         cloud = lattice_cloud(subject, spacing_mm, max_steps, iterations, seed)
-        seconds = round(time.process_time() - start, 2)
-        row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds}
-        rows["uniform"].append(row | {"spacing_mm": spacing_mm})
-        _say(name, "uniform", row)
+        keep("uniform", cloud, start, {"spacing_mm": spacing_mm})
     return rows | {"steps": max_steps, "n_voxels": int(mask.sum())}
 
 
@@ -194,14 +190,6 @@ def draw(record: Record, options: argparse.Namespace) -> None:
     save_figure(figure, options.figure)
 
 
-def _say(name: str, kind: str, row: dict[str, Any]) -> None:
-    print(
-        f"{name}: {kind}, {row['n']} Gaussians, {row['psnr_db']:.2f} dB, {row['cpu_seconds']} s",
-        file=sys.stderr,
-        flush=True,
-    )
-
-
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """Both curves of every subject."""
     for name in options.subjects or SUBJECTS:
@@ -216,7 +204,7 @@ def measure(name: str, voxel_mm: float) -> Row:
         if not name.startswith("atlas"):
             raise
         return {"skipped": "no test data (set G3R_TEST_DATA to the folder with atlas/)"}
-    return curves(subject, name, voxel_mm)
+    return _curves(subject, name, voxel_mm)
 
 
 STUDY = Study(

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from g3r.bench.command_run import infer_arguments, run_infer
 from g3r.bench.record import machine_line
+from g3r.bench.scores import quality_of_folder
+from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase, load_case
 from studies.harness import Record, Row, Study, Task
 from studies.tables import table
-from studies.tradeoff.memory_limits import is_kept, limited_rows, limits_table
 
 FIRST_SEED = 61200
 
@@ -55,14 +56,14 @@ LIMITED = (Configuration(30, 3, "draft", 0.8), Configuration(30, 1, "draft", 0.5
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
 
 
-def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
-    """A simulated subject, made if it is not there.
+SHARES = (1.0, 0.9, 0.8, 0.7)
+"""Limits, as shares of what is stated without one."""
 
-    Args:
-        weeks: of gestation.
-        n_stacks: that it is scanned with.
-        folder: of all phantoms.
-    """
+GB = 1e9
+
+
+def _phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
+    """A simulated subject, made if it is not there."""
     from data_synth import cli as simulate
 
     where = folder / f"phantom-{weeks}-{n_stacks}"
@@ -72,14 +73,8 @@ def phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
     return load_case(where)
 
 
-def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
-    """Of g3r-infer.
-
-    Args:
-        one: what is asked for.
-        case: the phantom.
-        output: folder to write.
-    """
+def _arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
+    """Of g3r-infer."""
     return [
         *infer_arguments(case, one.preset, output),
         "--threads",
@@ -92,8 +87,8 @@ def arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list
 
 def stated(one: Configuration, folder: Path) -> Row:
     """Stated and measured bytes of one run of the command."""
-    case = phantom(one.weeks, one.n_stacks, folder)
-    run = run_infer(arguments_for(one, case, folder / "out"), folder / "out")
+    case = _phantom(one.weeks, one.n_stacks, folder)
+    run = run_infer(_arguments_for(one, case, folder / "out"), folder / "out")
     said = run.record.memory
     assert said is not None
     return {
@@ -111,9 +106,65 @@ def stated(one: Configuration, folder: Path) -> Row:
 
 def limited(one: Configuration, folder: Path) -> Row:
     """The command without a limit and below several."""
-    case, output = phantom(one.weeks, one.n_stacks, folder), folder / "out"
+    case, output = _phantom(one.weeks, one.n_stacks, folder), folder / "out"
     name = f"{one.weeks} weeks, {one.n_stacks} stacks, {one.preset}, {one.voxel_mm:g} mm"
-    return {"limited": limited_rows(case, name, arguments_for(one, case, output), output)}
+    return {"limited": _limited_rows(case, name, _arguments_for(one, case, output), output)}
+
+
+def _limited_rows(
+    case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, shares: Sequence[float] = SHARES
+) -> list[Row]:
+    """A row without a limit, and one for each limit."""
+    first = _row(case, name, arguments, output, None)
+    limits = [round(share * first["stated_bytes"]) for share in shares]
+    return [first, *[_row(case, name, arguments, output, limit) for limit in limits]]
+
+
+def _row(case: SimulatedCase, name: str, arguments: Sequence[str], output: Path, limit: int | None) -> Row:
+    row: Row = {"name": name, "limit_bytes": limit}
+    try:
+        run = run_infer([*arguments, *([] if limit is None else ["--max-memory", str(limit)])], output)
+    except InputError as error:
+        return row | {"refused": str(error)}
+    said = run.record.memory
+    assert said is not None
+    return row | {
+        "stated_bytes": said.stated_bytes,
+        "measured_bytes": run.peak_bytes,
+        "changes": said.changes,
+        "seconds": round(run.seconds, 1),
+        "cpu_seconds": round(run.cpu_seconds, 1),
+        "psnr_db": quality_of_folder(case, output).psnr_db,
+    }
+
+
+def is_kept(row: Row) -> bool:
+    """Whether a run stayed below its limit, or was refused."""
+    limit = row["limit_bytes"]
+    return limit is None or "refused" in row or row["measured_bytes"] <= limit
+
+
+def limits_table(rows: Sequence[Row]) -> str:
+    """The rows in Markdown."""
+
+    def given_up(row: Row) -> str:
+        if "refused" in row:
+            return str(row["refused"]).split(";")[0]
+        return "; ".join(change.removeprefix("memory limit: ") for change in row["changes"]) or "nothing"
+
+    def gigabytes(row: Row, key: str, otherwise: str) -> str:
+        return f"{row[key] / GB:.2f} GB" if row.get(key) is not None else otherwise
+
+    columns: dict[str, Any] = {
+        "run": "{name}",
+        "limit": lambda row: gigabytes(row, "limit_bytes", "none"),
+        "stated": lambda row: gigabytes(row, "stated_bytes", "refused"),
+        "measured": lambda row: gigabytes(row, "measured_bytes", ""),
+        "CPU seconds": "{cpu_seconds:.0f}",
+        "PSNR, dB": "{psnr_db:.2f}",
+        "given up": given_up,
+    }
+    return table(rows, columns)
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:

@@ -44,21 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace an earlier case in --output")
     options = parser.parse_args(argv)
     try:
-        write_case(options.output, options.seed, replace_it=options.force)
+        _write_case(options.output, options.seed, replace_it=options.force)
     except G3RError as error:
         print(f"peer_phantom: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def write_case(folder: Path, seed: int, *, replace_it: bool) -> None:
-    """Simulate the subject and write it.
-
-    Args:
-        folder: to write.
-        seed: of the phantom and of the motion.
-        replace_it: whether an earlier case there is replaced.
-    """
+def _write_case(folder: Path, seed: int, *, replace_it: bool) -> None:
+    """Simulate the subject and write it."""
     check_output(folder, replace=replace_it)
     truth = small_head(seed)
     settings = orthogonal_settings(3, "moderate", resolution_mm=PIXEL_MM, thickness_mm=THICKNESS_MM)

@@ -15,7 +15,7 @@ from g3r.reconstruct import GaussianReconstructor
 from g3r.uncertainty.error_model import fit_model, load_calibration, save_calibration, terms
 from g3r.uncertainty.estimate import CALIBRATION, WITH_PRIOR, WITHOUT_PRIOR, calibration
 from studies.harness import FITS, Record, Row, Study, Task, positive, weights
-from studies.uncertainty.data import NO_REGISTRATION, Judged, check_subjects, fit_subjects, judged, unregistered_subject
+from studies.uncertainty.data import CHECK_SUBJECTS, FIT_SUBJECTS, NO_REGISTRATION, UNREGISTERED, Judged, judged
 from studies.uncertainty.figure import draw_calibration
 from studies.uncertainty.judgement import check_record, check_text
 
@@ -37,11 +37,11 @@ def reconstructed(options: argparse.Namespace, *, fitting: bool) -> list[Judged]
     """Every subject, voxel by voxel; of the check also one that is not registered."""
     settings = replace(PRESETS[options.preset], use_prior=not options.no_prior)
     reconstructor = GaussianReconstructor(options.ckpt, settings)
-    subjects = (fit_subjects() if fitting else check_subjects())[: options.subjects]
+    subjects = (FIT_SUBJECTS if fitting else CHECK_SUBJECTS)[: options.subjects]
     todo = [(*one, reconstructor) for one in subjects]
     if not fitting and not options.subjects:
         unregistered = GaussianReconstructor(options.ckpt, changed(settings, NO_REGISTRATION))
-        todo.append((*unregistered_subject(), unregistered))
+        todo.append((*UNREGISTERED, unregistered))
     found = []
     for spec, n_stacks, by in todo:
         one = judged(spec, n_stacks, by, options.cache, registered=by is reconstructor)

@@ -23,7 +23,16 @@ from studies.runs import aligned
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import stacks
 
-FIT_VOLUMES = (
+Subject = tuple[SubjectSpec, int]
+"""With the number of its stacks that are used."""
+
+
+def _subjects(*chosen: tuple[str, int, str, int]) -> list[Subject]:
+    """Of volume, stacks, motion and seed."""
+    return [(SubjectSpec(volume=volume, motion=motion, seed=seed), n) for volume, n, motion, seed in chosen]
+
+
+FIT_SUBJECTS = _subjects(
     ("spina-bifida/sb26-operated", 3, "mild", 51_200),
     ("spina-bifida/sb33-operated", 1, "mild", 51_209),
     ("spina-bifida/sb28-operated", 3, "moderate", 51_201),
@@ -38,7 +47,7 @@ FIT_VOLUMES = (
 """Volume, stacks, motion and seed of the subjects that the coefficients are fitted to. No prior was
 trained on these volumes (checkpoints are chosen by them)."""
 
-CHECK_VOLUMES = (
+CHECK_SUBJECTS = _subjects(
     ("crl-sta/sta24", 3, "mild", 52_200),
     ("crl-sta/sta30", 1, "mild", 52_201),
     ("crl-sta/sta34", 3, "moderate", 52_202),
@@ -52,7 +61,7 @@ CHECK_VOLUMES = (
 )
 """The same of the subjects that they are checked on: weeks left out of every training and choice."""
 
-UNREGISTERED = ("crl-sta/sta24", 3, "moderate", 52_250)
+UNREGISTERED = _subjects(("crl-sta/sta24", 3, "moderate", 52_250))[0]
 """One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
 
 NO_REGISTRATION = {
@@ -102,25 +111,6 @@ class Judged:
         return name if self.registered else f"{name}, not registered"
 
 
-def fit_subjects() -> list[tuple[SubjectSpec, int]]:
-    """Subjects of the fit with their number of stacks; always the same."""
-    return [_subject(*one) for one in FIT_VOLUMES]
-
-
-def check_subjects() -> list[tuple[SubjectSpec, int]]:
-    """Subjects of the check with their number of stacks; always the same."""
-    return [_subject(*one) for one in CHECK_VOLUMES]
-
-
-def unregistered_subject() -> tuple[SubjectSpec, int]:
-    """The subject that the check leaves unregistered."""
-    return _subject(*UNREGISTERED)
-
-
-def _subject(volume: str, n_stacks: int, motion: str, seed: int) -> tuple[SubjectSpec, int]:
-    return SubjectSpec(volume=volume, motion=motion, seed=seed), n_stacks
-
-
 def judged(
     spec: SubjectSpec, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path, *, registered: bool = True
 ) -> Judged:
@@ -134,7 +124,7 @@ def judged(
         registered: False reconstructs from the headers.
     """
     case = simulated_case(spec, cache)
-    motion = cached_registration(case, n_stacks, reconstructor, cache) if registered else None
+    motion = _cached_registration(case, n_stacks, reconstructor, cache) if registered else None
     start = time.perf_counter()
     result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
     pose_error = case.pose_error(result.slices)
@@ -195,17 +185,10 @@ def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]
     )
 
 
-def cached_registration(
+def _cached_registration(
     case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
-    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept.
-
-    Args:
-        case: the subject.
-        n_stacks: of its stacks.
-        reconstructor: that registers them.
-        cache: folder to keep it in.
-    """
+    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
     path = cache / f"{case.name}-{n_stacks}.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:

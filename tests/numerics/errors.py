@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -54,12 +55,21 @@ def gradient_tolerance(ratio: float) -> float:
 
 def shape_rows(ratios: tuple[float, ...] = RATIOS) -> list[Row]:
     """Error of values by axis ratio, for V(x) and for slices, of every way of computing them."""
+    return _largest_by_ratio(value_errors, ratios)
+
+
+def gradient_rows(ratios: tuple[float, ...] = RATIOS) -> list[Row]:
+    """Relative error of numba's gradients by axis ratio, against autograd of the reference in float64."""
+    return _largest_by_ratio(gradient_errors, ratios)
+
+
+def _largest_by_ratio(errors: Callable[[Scene], Row], ratios: tuple[float, ...]) -> list[Row]:
     rows = []
     for psf in (False, True):
         for ratio in ratios:
             row: Row = {"psf": psf, "ratio": ratio}
             for scene in slender_scenes(ratio, WIDEST_MM if ratio > 1000 else WIDEST_MM / 5, psf):
-                for name, error in value_errors(scene).items():
+                for name, error in errors(scene).items():
                     row[name] = max(row.get(name, 0.0), error)
             rows.append(row)
     return rows
@@ -129,19 +139,6 @@ def gradients(
         "shift": twist[:, 3:],
         "gain": gain,
     }
-
-
-def gradient_rows(ratios: tuple[float, ...] = RATIOS) -> list[Row]:
-    """Relative error of numba's gradients by axis ratio, against autograd of the reference in float64."""
-    rows = []
-    for psf in (False, True):
-        for ratio in ratios:
-            row: Row = {"psf": psf, "ratio": ratio}
-            for scene in slender_scenes(ratio, WIDEST_MM if ratio > 1000 else WIDEST_MM / 5, psf):
-                for name, error in gradient_errors(scene).items():
-                    row[name] = max(row.get(name, 0.0), error)
-            rows.append(row)
-    return rows
 
 
 def gradient_errors(scene: Scene, seed: int = 0) -> Row:

@@ -6,7 +6,7 @@ import argparse
 import logging
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,35 +63,25 @@ def shown(value: float) -> str:
 def shape_table(rows: Rows) -> str:
     """Errors of values by axis ratio."""
     names = ("float64", "reference float32", "numba", "naive float32", "naive float32, epsilon", "naive float64")
-    return markdown_table(
-        ["", "axis ratio", *names, "bound for float32"],
-        [
-            [
-                _place(row),
-                f"{row['ratio']:g}",
-                *(shown(row[name]) for name in names),
-                shown(shape_tolerance(row["ratio"])),
-            ]
-            for row in rows
-        ],
-    )
+    return _by_ratio(rows, names, "bound for float32", shape_tolerance)
 
 
 def gradient_table(rows: Rows) -> str:
     """Errors of gradients by axis ratio."""
-    names = ("centre", "shape", "amplitude", "turn", "shift", "gain")
-    return markdown_table(
-        ["", "axis ratio", *names, "bound"],
+    return _by_ratio(rows, ("centre", "shape", "amplitude", "turn", "shift", "gain"), "bound", gradient_tolerance)
+
+
+def _by_ratio(rows: Rows, names: Sequence[str], bound: str, tolerance: Callable[[float], float]) -> str:
+    cells = [
         [
-            [
-                _place(row),
-                f"{row['ratio']:g}",
-                *(shown(row[name]) for name in names),
-                shown(gradient_tolerance(row["ratio"])),
-            ]
-            for row in rows
-        ],
-    )
+            "slices" if row["psf"] else "V(x)",
+            f"{row['ratio']:g}",
+            *(shown(row[name]) for name in names),
+            shown(tolerance(row["ratio"])),
+        ]
+        for row in rows
+    ]
+    return markdown_table(["", "axis ratio", *names, bound], cells)
 
 
 def size_table(rows: Rows) -> str:
@@ -159,10 +149,6 @@ def step_table(rows: Rows) -> str:
             for row in rows
         ],
     )
-
-
-def _place(row: Mapping[str, Any]) -> str:
-    return "slices" if row["psf"] else "V(x)"
 
 
 TABLES: dict[str, tuple[Any, Any]] = {

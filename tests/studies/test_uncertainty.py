@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from g3r.uncertainty.error_model import ErrorModel
-from studies.uncertainty.data import CHECK_VOLUMES, FIT_VOLUMES, check_subjects, fit_subjects, relative_error
+from studies.uncertainty.data import CHECK_SUBJECTS, FIT_SUBJECTS, relative_error
 from studies.uncertainty.figure import draw_calibration
 from studies.uncertainty.judgement import EXPONENTIAL_COVERAGE, check_record, check_text, judge
 
@@ -61,11 +61,11 @@ def test_error_does_not_depend_on_the_scale_of_the_volume() -> None:
 
 
 def test_fit_and_check_share_no_volume_and_no_seed() -> None:
-    assert not {v for v, *_ in FIT_VOLUMES} & {v for v, *_ in CHECK_VOLUMES}
-    fitted, checked = fit_subjects(), check_subjects()
-    assert not {r.seed for r, _ in fitted} & {r.seed for r, _ in checked}
-    assert len({r.name for r, _ in fitted}) == len(fitted)
-    assert all(r.volume.startswith("spina-bifida/") and r.volume.endswith("-operated") for r, _ in fitted)
+    fitted, checked = ([spec for spec, _ in chosen] for chosen in (FIT_SUBJECTS, CHECK_SUBJECTS))
+    for what in ("volume", "seed"):
+        assert not {getattr(spec, what) for spec in fitted} & {getattr(spec, what) for spec in checked}
+    assert len({spec.name for spec in fitted}) == len(fitted)
+    assert all(spec.volume.startswith("spina-bifida/") and spec.volume.endswith("-operated") for spec in fitted)
 
 
 def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
