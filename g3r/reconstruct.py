@@ -18,9 +18,8 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import fit_adaptive
 from g3r.fitting.initial_volumes import FitStart, gaussian_spacing_mm, with_pixels_of
-from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import VolumeTarget, fit_prior
-from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
 from g3r.gaussians.seeding import seed_cloud
 from g3r.output.assemble import Cut, RunSoFar, cut_short, finished
 from g3r.output.record import Clock, skipped_slice_notes
@@ -292,14 +291,22 @@ class GaussianReconstructor:
         with run.stages.clock("fit to prior"):
             if settings.adaptive is not None:
                 cloud, found = fit_adaptive(
-                    prior, start.mask, start.grid, spacing_mm, settings.adaptive, stage, rng, report, deadline
+                    prior,
+                    start.mask,
+                    start.grid,
+                    finest_spacing_mm=spacing_mm,
+                    settings=settings.adaptive,
+                    stage=stage,
+                    rng=rng,
+                    progress=report,
+                    deadline=deadline,
                 )
                 counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
                 return PriorCloud(cloud, found.loss, counts)
             cloud = seed_cloud(prior, start.mask, start.grid, spacing_mm)
             counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
             target = VolumeTarget.of(prior, start.mask.astype(np.float32), start.grid)
-            cloud, history = fit_prior(cloud, target, stage, rng, report, deadline)
+            cloud, history = fit_prior(cloud, target, stage, rng, progress=report, deadline=deadline)
             return PriorCloud(cloud, history, counts)
 
     def _fit(self, run: RunSoFar, first: PriorCloud, deadline: Deadline | None) -> SliceFit:
@@ -317,14 +324,14 @@ class GaussianReconstructor:
             return fit_slices(
                 first.cloud,
                 start.slices,
-                run.volume.gain,
-                run.motion.weight,
-                distil_to,
-                settings.slice_stage,
-                stage_rng(settings.seed, "fit to slices"),
-                self._report("fit to slices"),
-                deadline,
-                self.observer,
+                gain=run.volume.gain,
+                weight=run.motion.weight,
+                prior=distil_to,
+                settings=settings.slice_stage,
+                rng=stage_rng(settings.seed, "fit to slices"),
+                progress=self._report("fit to slices"),
+                deadline=deadline,
+                observer=self.observer,
             )
 
     def _report(self, stage: str) -> Callable[[int, int], None]:

@@ -150,7 +150,14 @@ def cut_short(run: RunSoFar, cut: Cut, first: PriorCloud | None, fit: SliceFit |
     grid, start = run.grid, run.volume.start
     if fit is None or first is None:
         first = PriorCloud(_no_gaussians(), [], {})
-        fit = SliceFit(first.cloud, start.slices, run.volume.gain, run.motion.weight, [], [])
+        fit = SliceFit(
+            cloud=first.cloud,
+            slices=start.slices,
+            gain=run.volume.gain,
+            weight=run.motion.weight,
+            history=[],
+            bias_field=[],
+        )
         mask = _mask(run, fit, grid)
         volume = on_grid(run.volume.prior, start.grid, grid, outside=0.0) * mask
     else:
