@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+from g3r.planning import PRESET_NAMES
 
 DEFAULTS = {"preset": "balanced", "space": "standard", "prior_voxel": 0.8, "resolution": 0.8, "seed": 0}
 """Of the options that --config takes the place of, --no-prior and --time-budget besides."""

@@ -218,7 +218,7 @@ class CloudObjective:
 
     def begin(self, terms: Terms) -> LossStep:
         """A step at the present parameters; overlap lists are made again if they may miss a Gaussian by now."""
-        derive_shapes(*self._geometry, self.shapes)
+        derive_shapes(*self._geometry, self.shapes)  # type: ignore[call-arg]
         self.buffers[:] = 0.0
         known = self.overlaps
         if any(name not in known or known[name].term is not terms[name][0] for name in terms) or self._moved(terms):
@@ -227,7 +227,7 @@ class CloudObjective:
                 np.linalg.norm(self.parameters.value["mean_mm"], axis=1).max(initial=0.0)
                 + max(np.linalg.norm(state.center_mm, axis=1).max(initial=0.0) for _, state in terms.values())
             )
-            kernels.remember(*self._geometry, self._then)
+            kernels.remember(*self._geometry, self._then)  # type: ignore[call-arg]
             self.n_searches += 1
         return LossStep(self, terms)
 
@@ -276,7 +276,7 @@ class LossStep:
         )
         residual = np.zeros(n)
         plane_gradient, field_gradient = np.zeros((n, N_PLANE_GRADIENTS)), np.zeros((n, N_TERMS), np.float32)
-        kernels.image_l1(  # type: ignore[call-arg]
+        kernels.image_l1(
             CloudArrays(self.objective.shapes, self.objective.parameters.value["amplitude"]),
             planes,
             held.pairs.arrays,

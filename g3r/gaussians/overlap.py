@@ -81,7 +81,7 @@ class OverlapFinder:
         # float32 is enough from the middle of the planes, wherever the cloud's origin is
         middle = center_mm.mean(0) if len(center_mm) else np.zeros(3)
         single = [array.astype(np.float32) for array in (rotation, center_mm - middle, planes.psf_var_mm2)]
-        extents = PlaneExtents(*single, half)
+        extents = PlaneExtents(single[0], single[1], single[2], half)
         start = np.zeros(len(planes) + 1, np.int64)
         cut = np.float32(cutoff_sigma**2 * (1 + 1e-5))
         columns_of(shapes, middle, self.columns)

@@ -121,7 +121,7 @@ class _Render(torch.autograd.Function):
         work = Workspace.of(planes, pairs.most)
         given = (CloudArrays.of(cloud), PlaneArrays.of(moved, origin_mm, gain), pairs.arrays, cutoff_sigma**2, exact)
         out = np.zeros(planes.n_pixels, np.float32)
-        kernels.forward(*given, work, out)  # type: ignore[call-arg]
+        kernels.forward(*given, work, out)
         ctx.saved = (given, work, cloud, twist)
         ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, amplitude, twist, log_gain)]
         return torch.from_numpy(out).to(mean.dtype)
@@ -133,10 +133,10 @@ class _Render(torch.autograd.Function):
         buffers = np.zeros((len(work.images), n, kernels.N_GRADIENTS))
         plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
         weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
-        kernels_backward.backward(*given, work, weight, buffers, plane_gradient)
+        kernels_backward.backward(*given, work, weight, buffers, plane_gradient)  # type: ignore[call-arg]
         found = [np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)]
         log_scale, quaternion = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters[1:3])
-        kernels_backward.shape_gradients(log_scale, quaternion, buffers, *found)  # type: ignore[call-arg]
+        kernels_backward.shape_gradients(log_scale, quaternion, buffers, *found)
         pose = plane_gradient[:, :6]
         if twist is not None:
             # the kernels differentiate in a rotation after the present one: exp(w + dw) = exp(w) exp(J_r dw)

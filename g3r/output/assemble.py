@@ -29,7 +29,7 @@ from g3r.registration import Registration
 from g3r.registration.quality import StackQuality, registration_reliable
 from g3r.run.allocator import release_memory
 from g3r.run.stage_store import PriorCloud, PriorVolume, Stages, stage_rng
-from g3r.uncertainty import estimate_uncertainty
+from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
 from g3r.uncertainty.prior_share import estimate_prior_share
 
 logger = logging.getLogger(__name__)
@@ -108,25 +108,29 @@ def finished(run: RunSoFar, first: PriorCloud, fit: SliceFit) -> ReconstructionR
         with clock("prior share"):
             prior_share = estimate_prior_share(
                 fit,
-                start.density,
-                start.grid,
-                mask,
-                grid,
-                stage_rng(settings.seed, "prior share"),
-                settings.share_probes,
+                density=start.density,
+                density_grid=start.grid,
+                mask=mask,
+                grid=grid,
+                rng=stage_rng(settings.seed, "prior share"),
+                n_probes=settings.share_probes,
+                cutoff_sigma=settings.slice_stage.cutoff_sigma,
                 projection_bytes=settings.slice_stage.projection_bytes,
             )
             release_memory()
     with clock("uncertainty"):
         uncertainty = estimate_uncertainty(
-            volume,
-            mask,
-            grid,
-            fit,
-            prior=run.volume.prior,
-            density=start.density,
-            prior_grid=start.grid,
-            prior_share=prior_share,
+            UncertaintyInputs(
+                volume=volume,
+                mask=mask,
+                grid=grid,
+                fit=fit,
+                prior=run.volume.prior,
+                density=start.density,
+                prior_grid=start.grid,
+                prior_share=prior_share,
+                cutoff_sigma=settings.slice_stage.cutoff_sigma,
+            ),
             with_prior=settings.use_prior,
             intensity=run.intensity,
             reliable=registration_reliable(run.qualities),

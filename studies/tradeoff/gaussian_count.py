@@ -115,7 +115,15 @@ def curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict[
     for bound in BOUNDS.get(name, USUAL_BOUNDS):
         start = time.process_time()
         settings = replace(adaptive, bound=bound)
-        cloud, done = fit_adaptive(volume, mask, grid, finest, settings, STAGE, np.random.default_rng(seed))
+        cloud, done = fit_adaptive(
+            volume,
+            mask,
+            grid,
+            finest_spacing_mm=finest,
+            settings=settings,
+            stage=STAGE,
+            rng=np.random.default_rng(seed),
+        )
         seconds = round(time.process_time() - start, 2)
         row = {"n": len(cloud), "psnr_db": psnr_db(cloud, target), "cpu_seconds": seconds, **done.record()}
         rows["adaptive"].append(row)
