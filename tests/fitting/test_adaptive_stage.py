@@ -20,7 +20,10 @@ QUICK = AdaptiveSettings(bound=0.08, round_steps=15, n_rounds=5)
 
 
 def fitted(bound: float = 0.08, volume=SHEETS, mask=BALL, finest_mm: float = 2.0):
-    return fit_adaptive(volume, mask, GRID, finest_mm, replace(QUICK, bound=bound), STAGE, np.random.default_rng(3))
+    settings = replace(QUICK, bound=bound)
+    return fit_adaptive(
+        volume, mask, GRID, finest_spacing_mm=finest_mm, settings=settings, stage=STAGE, rng=np.random.default_rng(3)
+    )
 
 
 def test_tighter_bounds_need_more_gaussians_and_leave_less():
@@ -73,7 +76,8 @@ def test_a_ball_needs_few():
     """On voxels of 1.6 mm, to be quick: under 500 Gaussians, where a lattice of twice as many is worse."""
     volume, mask, grid = ball(1.6)
     settings = AdaptiveSettings(bound=0.1, start=4.0, round_steps=25, last_steps=25)
-    cloud, done = fit_adaptive(volume, mask, grid, 4.0, settings, STAGE, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    cloud, done = fit_adaptive(volume, mask, grid, finest_spacing_mm=4.0, settings=settings, stage=STAGE, rng=rng)
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     assert len(cloud) < BALL_MOST
     psnr = psnr_db(cloud, target)
