@@ -16,10 +16,9 @@ from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
-from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
-from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.assemble import StageResults, assemble
@@ -249,12 +248,12 @@ class GaussianReconstructor:
             settings = plan.settings
             return fit_to_prior(
                 prior,
-                gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),
-                settings.adaptive,
-                settings.prior_stage,
-                stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
-                run.report(Stage.FIT_TO_PRIOR),
-                deadline,
+                spacing_mm=gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),
+                adaptive=settings.adaptive,
+                stage=settings.prior_stage,
+                rng=stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
+                progress=run.report(Stage.FIT_TO_PRIOR),
+                deadline=deadline,
             )
 
         return run.droppable_stage(Stage.FIT_TO_PRIOR, fit)
@@ -271,14 +270,14 @@ class GaussianReconstructor:
             return fit_slices(
                 cloud.cloud,
                 prior.volumes.slices,
-                prior.gain,
-                poses.weight,
-                distillation_target(prior) if settings.use_prior and settings.distillation else None,
-                settings.slice_stage,
-                stage_rng(settings.seed, Stage.FIT_TO_SLICES),
-                run.report(Stage.FIT_TO_SLICES),
-                run.deadline(plan.for_fit_to_slices()),
-                self.observer,
+                gain=prior.gain,
+                weight=poses.weight,
+                prior=distillation_target(prior) if settings.use_prior and settings.distillation else None,
+                settings=settings.slice_stage,
+                rng=stage_rng(settings.seed, Stage.FIT_TO_SLICES),
+                progress=run.report(Stage.FIT_TO_SLICES),
+                deadline=run.deadline(plan.for_fit_to_slices()),
+                observer=self.observer,
             )
 
         def steps_of(result: SliceFit) -> tuple[int, int]:

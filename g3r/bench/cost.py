@@ -1,4 +1,4 @@
-"""Seconds and memory of one call, as free of the machine's other work as can be."""
+"""Seconds and memory of one call, disturbed as little as possible by other work of the machine."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+
+import psutil
 
 MIN_REPEATS, MAX_REPEATS = 3, 30
 ENOUGH_SECONDS = 0.3
@@ -19,7 +21,7 @@ _CLEAR = Path("/proc/self/clear_refs")
 
 
 def min_cpu_seconds(call: Callable[[], object]) -> float:
-    """Least CPU time of several calls; after one that is not counted."""
+    """Least CPU time of several calls, after one that is not counted."""
     call()
     best, spent, n = float("inf"), 0.0, 0
     while n < MIN_REPEATS or (spent < ENOUGH_SECONDS and n < MAX_REPEATS):
@@ -31,7 +33,7 @@ def min_cpu_seconds(call: Callable[[], object]) -> float:
 
 
 def peak_extra_bytes(call: Callable[[], object]) -> int | None:
-    """Most memory that a call held beyond what the process had before; None where Linux does not tell.
+    """Most memory that a call held beyond what the process had before; None on systems other than Linux.
 
     At least one page, so that it has a logarithm.
     """
@@ -40,17 +42,18 @@ def peak_extra_bytes(call: Callable[[], object]) -> int | None:
         ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed memory otherwise, and growth does not show
     try:
         _CLEAR.write_text("5", encoding="ascii")  # the high-water mark falls to what is held now
-        before = _status_bytes("VmRSS")
+        before = psutil.Process().memory_info().rss
         kept = call()
-        peak = _status_bytes("VmHWM")
+        peak = _high_water_bytes()
     except OSError:
         return None
     del kept
     return max(PAGE_BYTES, peak - before)
 
 
-def _status_bytes(field: str) -> int:
+def _high_water_bytes() -> int:
+    """Most memory since the mark was cleared, which psutil does not read."""
     for line in _STATUS.read_text(encoding="ascii").splitlines():
-        if line.startswith(f"{field}:"):
+        if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024
-    raise OSError(f"{_STATUS}: no {field}")
+    raise OSError(f"{_STATUS}: no VmHWM")

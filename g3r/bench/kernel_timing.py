@@ -1,22 +1,23 @@
-"""Seconds of the renderer's passes and of an optimiser step, for `g3r-bench kernels`."""
+"""Seconds of the renderer's passes and of an optimiser step, and what one core can do at best."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 
-from g3r.bench.kernel_rates import best_seconds
-from g3r.bench.kernel_scene import count_pixels, head_scene, record_space
+from g3r.bench.scenes import evaluations, head_scene
 from g3r.fitting import kernels as fit_kernels
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
-from g3r.fitting.slice_term import SliceTerm
+from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
 from g3r.gaussians import GaussianCloud, find_overlaps, kernels, kernels_backward, render
-from g3r.gaussians.overlap import CloudArrays, Workspace
-from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
+from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
+from g3r.gaussians.render import CUTOFF_SIGMA
 
 CLOCK = time.thread_time
 STEP_FACTOR = 0.1
@@ -25,28 +26,87 @@ STEP_FACTOR = 0.1
 STEPS = 10
 
 
+f32 = np.float32
+
+COPY_BYTES = 2**27
+"""Beyond any cache."""
+
+N_IN_CACHE, N_TURNS, N_FUSED = 2048, 2000, 64
+"""Numbers that stay in the innermost cache, how often they are taken, and operations on each."""
+
+
+def best_seconds(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
+    """Least time of several calls, after one that is not counted."""
+    call()
+    seconds = []
+    for _ in range(repeats):
+        start = clock()
+        call()
+        seconds.append(clock() - start)
+    return min(seconds)
+
+
+@numba.njit(cache=True)
+def _copy(source, target):
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@numba.njit(cache=True, fastmath={"contract"})
+def _fused(values, turns, a, b, c, d):
+    """Four chains of sixteen fused multiply-adds on each value, independent of each other."""
+    total = f32(0.0)
+    for _ in range(turns):
+        for i in range(len(values)):
+            x = values[i]
+            p, q, r, s = x, x, x, x
+            for _ in range(16):
+                p = p * x + a
+                q = q * x + b
+                r = r * x + c
+                s = s * x + d
+            values[i] = (p + q) + (r + s)
+        total += values[0]
+        values[:] = f32(0.5)
+    return total
+
+
+def copy_bytes_per_second(repeats: int = 5) -> float:
+    """Bytes read and written per second by one core."""
+    source, target = np.ones(COPY_BYTES // 4, np.float32), np.zeros(COPY_BYTES // 4, np.float32)
+    return 2 * COPY_BYTES / best_seconds(lambda: _copy(source, target), repeats, time.thread_time)
+
+
+def fused_per_second(repeats: int = 5) -> float:
+    """Fused multiply-adds (of one number each) per second by one core."""
+    values = np.full(N_IN_CACHE, 0.5, np.float32)
+    small = [f32(x) for x in (0.1, 0.2, 0.3, 0.4)]
+    seconds = best_seconds(lambda: _fused(values, N_TURNS, *small), repeats, time.thread_time)
+    return N_IN_CACHE * N_TURNS * N_FUSED / seconds
+
+
 def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
     """Pairs, pixels inside the cut-off, and seconds of one forward and one backward pass."""
     scene = head_scene(n_gaussians)
-    planes, arrays = scene.slices.planes, CloudArrays.of(scene.cloud)
-    pairs = find_overlaps(scene.cloud, planes, CUTOFF_SIGMA)
-    described: Any = plane_arguments(planes, planes.center_mm, np.ones(len(planes)), pairs)
-    work, cut = Workspace.of(planes, pairs.most), CUTOFF_SIGMA**2
-    n_pixels, n_pairs = count_pixels(arrays.shapes, *described, cut, record_space(pairs.most))  # type: ignore[call-arg]
+    cloud, planes = scene.cloud, scene.slices.planes
+    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
+    n_pixels, n_pairs = evaluations(cloud, planes, CUTOFF_SIGMA)
     out = np.zeros(planes.n_pixels, np.float32)
     buffers = np.zeros((1, n_gaussians, kernels.N_GRADIENTS))
     plane_gradient = np.zeros((len(planes), kernels.N_PLANE_GRADIENTS))
-    common = (arrays.shapes, arrays.amplitude, *described, cut, True, work.images, work.projections)
+    described = PlaneArrays.of(planes, cloud.origin_mm)
+    work = Workspace.of(planes, pairs.most)
+    common = (CloudArrays.of(cloud), described, pairs.arrays, CUTOFF_SIGMA**2, True, work)
 
     def forward() -> None:
-        kernels.forward(*common, out)  # type: ignore[call-arg]
+        kernels.forward(*common, out)
 
     def backward() -> None:
-        kernels_backward.backward(*common, out, buffers, plane_gradient)  # type: ignore[call-arg]
+        kernels_backward.backward(*common, out, buffers, plane_gradient)
 
     return {
-        "n_pairs": int(n_pairs),
-        "n_pixels": int(n_pixels),
+        "n_pairs": n_pairs,
+        "n_pixels": n_pixels,
         "forward_seconds": best_seconds(forward, repeats, CLOCK),
         "backward_seconds": best_seconds(backward, repeats, CLOCK),
     }
@@ -86,12 +146,12 @@ def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
     pairs that the step uses.
     """
     scene = head_scene(n_gaussians)
-    slices, n = scene.slices, len(scene.slices)
-    further = {"turn": (np.zeros((n, 3)), 1e-3), "shift": (np.zeros((n, 3)), 0.03), "log_gain": (np.zeros(n), 2e-3)}
-    parameters = FitParameters(scene.cloud, LearningRates(), further)
-    term = SliceTerm(slices, np.ones(n), np.ones(n), parameters)
-    terms: list[ImageTerm] = [term]
-    objective = CloudObjective(parameters, terms, 0.02)
+    slices, ones = scene.slices, np.ones(len(scene.slices))
+    rates = LearningRates()
+    parameters = FitParameters(scene.cloud, rates, slice_blocks(slices, ones, None, rates, optimise_poses=True))
+    unknowns = SliceParameters(slices, ones, parameters)
+    term = ImageTerm.of(slices.planes, slices.value, slices.mask.astype(np.float32), with_pose=True)
+    objective = CloudObjective(parameters, 0.02)
     inside = [0.0]
     plain: Any = fit_kernels.image_l1
 
@@ -101,10 +161,9 @@ def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
         inside[0] += CLOCK() - start
 
     def step() -> None:
-        term.update()
-        objective.begin()
-        image = objective.add(term, 1.0)
-        parameters.step(image + objective.finish() + term.finish(image, 10.0, 0.0), STEP_FACTOR)
+        loss = objective.begin({"slices": (term, unknowns.state(ones))})
+        image = loss.add("slices", 1.0)
+        parameters.step(image.mean + loss.finish() + unknowns.finish(image, 10.0, 0.0), STEP_FACTOR)
 
     setattr(fit_kernels, plain.__name__, timed)
     try:

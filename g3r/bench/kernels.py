@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from pathlib import Path
 from typing import Any
+
+from g3r.bench.record import add_output_arguments, machine, markdown_table, run_measurement
 
 SIZES = (1000, 4000, 16000, 64000)
 REFERENCE_GAUSSIANS, REFERENCE_SLICES = 200, 2
@@ -24,27 +24,16 @@ EXPLANATION = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `g3r-bench kernels`."""
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), help="numbers of Gaussians")
-    parser.add_argument("--repeats", type=int, default=7, help="the least time of so many counts")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench/kernels"), help="for JSON and table")
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the table between its markers")
+    parser.add_argument("--repeats", type=int, default=7, help="of each call; the least time counts")
+    add_output_arguments(parser, "kernels", "")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure, print the table, write the record."""
-    from g3r.bench.record import put_between_markers
-
-    record = run_kernels(options)
-    text = table(record)
-    print(text)
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "kernels.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    (options.output / "kernels.md").write_text(text, encoding="utf-8")
-    if options.docs:
-        put_between_markers(options.docs, "kernels", text)
-    return 0
+    """Measure, and write what was found; returns the exit code."""
+    return run_measurement(options, "kernels", measure=lambda keep: _measure(options), tables=table)
 
 
-def run_kernels(options: argparse.Namespace) -> dict[str, Any]:
+def _measure(options: argparse.Namespace) -> dict[str, Any]:
     """All measurements, by one thread: CPU seconds, the least of several.
 
     The copy and fused-multiply-add rates are measured before each size again, so that a machine that others
@@ -52,9 +41,13 @@ def run_kernels(options: argparse.Namespace) -> dict[str, Any]:
     """
     import numba
 
-    from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
-    from g3r.bench.kernel_timing import numba_rates, reference_rates, step_seconds
-    from g3r.bench.record import machine
+    from g3r.bench.kernel_timing import (
+        copy_bytes_per_second,
+        fused_per_second,
+        numba_rates,
+        reference_rates,
+        step_seconds,
+    )
 
     before, rows = numba.get_num_threads(), []
     numba.set_num_threads(1)
@@ -102,13 +95,7 @@ def table(record: dict[str, Any]) -> str:
         "step / kernels",
         "not kernel",
     ]
-    lines = [
-        f"{where['processor']}, one core; g3r {where['g3r']}"
-        f"{' at ' + where['commit'] if where['commit'] else ''}, numba {where['numba']}; {record['date']}.",
-        "",
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-    ]
+    rows = []
     for row in record["rows"]:
         pixels_per_pair = row["n_pixels"] / row["n_pairs"]
         cells = [row["backend"], f"{row['n_gaussians']:,}", f"{row['n_pairs']:,}", f"{pixels_per_pair:.0f}"]
@@ -122,6 +109,9 @@ def table(record: dict[str, Any]) -> str:
             cells += [f"{row['step_over_kernels']:.2f}", f"{100 * row['not_kernel_share']:.0f} %"]
         else:
             cells += ["", ""]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", EXPLANATION]
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    where_line = (
+        f"{where['processor']}, one core; g3r {where['g3r']}"
+        f"{' at ' + where['commit'] if where['commit'] else ''}, numba {where['numba']}; {record['date']}."
+    )
+    return "\n\n".join([where_line, markdown_table(head, rows), EXPLANATION])

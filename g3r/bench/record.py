@@ -1,12 +1,13 @@
-"""Records of measurements: on which machine, as JSON, and as tables between a document's markers."""
+"""Records of measurements: on which machine, as JSON, as tables between a document's markers; and how each is run."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,60 @@ def use_threads(n_threads: int) -> None:
     torch.set_num_threads(min(n_threads, most))
 
 
+def add_output_arguments(parser: argparse.ArgumentParser, name: str, figure: str) -> None:
+    """Options of every measuring command: where its record, tables and figure go.
+
+    Args:
+        parser: of the command.
+        name: of the command.
+        figure: what the figure shows; empty where there is none.
+    """
+    folder = Path("runs") / "bench" / name
+    parser.add_argument("--output", type=Path, default=folder, help=f"for {name}.json and {name}.md")
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
+    if figure:
+        parser.add_argument("--figure", type=Path, metavar="PNG", help=f"also draw {figure}")
+    parser.add_argument("--redraw", action="store_true", help=f"no measuring: from --output's {name}.json")
+
+
+def run_measurement(
+    options: argparse.Namespace,
+    name: str,
+    *,
+    measure: Callable[[Callable[[dict[str, Any]], None]], dict[str, Any]],
+    tables: Callable[[dict[str, Any]], str],
+    draw: Callable[[dict[str, Any], Path], None] | None = None,
+) -> int:
+    """Measure (or read the earlier record), write record, tables and figure; returns the exit code.
+
+    Args:
+        options: with those of `add_output_arguments`.
+        name: of the command, its files and its markers.
+        measure: makes the record; called with what keeps the record so far.
+        tables: the record as Markdown.
+        draw: the record as a figure; None where there is none.
+
+    Raises:
+        InputError: no earlier record, or files that cannot be written.
+    """
+    path = options.output / f"{name}.json"
+    if options.redraw:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; measure first, without --redraw")
+        record = json.loads(path.read_text(encoding="utf-8"))
+    else:
+        record = measure(lambda so_far: write_json(path, so_far))
+        write_json(path, record)
+    text = tables(record)
+    write_text(options.output / f"{name}.md", text)
+    print(text)
+    if options.docs:
+        put_between_markers(options.docs, name, text)
+    if draw is not None and options.figure:
+        draw(record, options.figure)
+    return 0
+
+
 def _processor() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -87,7 +142,7 @@ def _installed(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Of the checkout that this file lies in, with a + for changes that are not committed."""
+    """Commit of the checkout that holds this file, with a + for changes that are not committed."""
     here = Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():
         return None
@@ -108,6 +163,10 @@ def _commit() -> str | None:
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table in Markdown; the first column is left-aligned, the others right.
 
+    Args:
+        head: names of the columns.
+        rows: cells.
+
     Raises:
         ValueError: a row of another length than the head.
     """
@@ -119,7 +178,12 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str
 
 
 def between_markers(text: str, name: str, content: str) -> str:
-    """The text with what stands between `<!-- name:begin -->` and `<!-- name:end -->` replaced.
+    """The text with another content between `<!-- name:begin -->` and `<!-- name:end -->`.
+
+    Args:
+        text: of a document.
+        name: of the markers.
+        content: that goes between them.
 
     Raises:
         InputError: the markers are not there exactly once, in this order.
@@ -133,6 +197,11 @@ def between_markers(text: str, name: str, content: str) -> str:
 
 def put_between_markers(path: Path, name: str, content: str) -> None:
     """Rewrite one table of a document in place.
+
+    Args:
+        path: of the document.
+        name: of the markers.
+        content: that goes between them.
 
     Raises:
         InputError: no such file, or no markers in it.

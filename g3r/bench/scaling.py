@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g3r.bench.record import add_output_arguments, machine, run_measurement, use_threads
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from g3r.bench.scenes import SceneSize
     from g3r.gaussians import GaussianCloud
 
-STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "pair search", "peaks", "volume"
+STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "overlap search", "amplitudes", "volume"
 """What is measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
 
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
@@ -38,43 +38,34 @@ TIMED_STEPS = 6
 
 MIN_EXPONENT, MAX_EXPONENT = 0.9, 1.15
 
-MARKERS = "scaling"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument(
-        "--output", type=Path, default=Path("runs") / "bench" / "scaling", help="for scaling.json and .md"
-    )
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw seconds against size")
+    add_output_arguments(parser, "scaling", "seconds against size")
     parser.add_argument("--sizes", type=int, default=N_SIZES, help="how many, each twice the one before")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads; seconds are CPU time of all")
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and write what was found; returns the exit code."""
-    from g3r.bench.record import machine, put_between_markers, use_threads, write_json, write_text
     from g3r.bench.scaling_tables import draw_scaling, scaling_tables
 
     if options.sizes < 2:
         raise InputError(f"--sizes {options.sizes}; expected at least 2, for a slope")
     if options.threads < 1:
         raise InputError(f"--threads {options.threads}; expected at least 1")
+    measure = lambda keep: _measure(options, keep)  # noqa: E731
+    return run_measurement(options, "scaling", measure=measure, tables=scaling_tables, draw=draw_scaling)
+
+
+def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     use_threads(options.threads)
     record: dict[str, Any] = {"machine": machine(options.threads), "growing": {}}
     for name in GROWING:
         print(f"g3r-bench scaling: {name}", file=sys.stderr, flush=True)
         record["growing"][name] = measured_growth(name, options.sizes)
-        write_json(options.output / "scaling.json", record)
-    text = scaling_tables(record)
-    write_text(options.output / "scaling.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, MARKERS, text)
-    if options.figure:
-        draw_scaling(record, options.figure)
-    return 0
+        keep(record)
+    return record
 
 
 def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
@@ -91,9 +82,15 @@ def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
 
 
 def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> dict[str, Any]:
-    """One size: work, seconds and memory of each operation."""
+    """One size: work, seconds and memory of each operation.
+
+    Args:
+        size: of the scene.
+        field: of `SceneSize` that grows.
+        operations: that are measured.
+    """
     from g3r.bench.cost import peak_extra_bytes
-    from g3r.bench.scenes import corner_slices, corners, made_cloud, made_slices, made_volume_planes, pixel_evaluations
+    from g3r.bench.scenes import corner_slices, corners, evaluations, made_cloud, made_slices, made_volume_planes
     from g3r.gaussians import find_overlaps
     from g3r.gaussians.render import CUTOFF_SIGMA
 
@@ -105,7 +102,7 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
     row: dict[str, Any] = {
         "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
         "pairs": len(pairs),
-        "evaluations": round(pixel_evaluations(cloud, planes, pairs, CUTOFF_SIGMA)),
+        "evaluations": evaluations(cloud, planes, CUTOFF_SIGMA)[0],
         "seconds": {name: calls[name][0]() for name in operations},
         "bytes": {name: peak_extra_bytes(calls[name][1]) for name in operations},
     }
@@ -118,7 +115,13 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
 def scene_calls(
     cloud: GaussianCloud, slices: Slices, volume: Planes
 ) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
-    """Of each operation: what gives its seconds, and a single call of it."""
+    """What gives the seconds of each operation, and a single call of it.
+
+    Args:
+        cloud: Gaussians.
+        slices: that are fitted.
+        volume: planes of the volume that is written.
+    """
     from g3r.bench.cost import min_cpu_seconds
     from g3r.gaussians import find_overlaps, render, solve_amplitudes
     from g3r.gaussians.render import CUTOFF_SIGMA
@@ -162,7 +165,16 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
 
     settings = SliceStageSettings(n_steps=TIMED_STEPS, amplitude_iterations=0)
     ones = np.ones(len(slices))
-    fit_slices(cloud, slices, ones, ones, None, settings, np.random.default_rng(0), observer=Watch())
+    fit_slices(
+        cloud,
+        slices,
+        gain=ones,
+        weight=ones,
+        prior=None,
+        settings=settings,
+        rng=np.random.default_rng(0),
+        observer=Watch(),
+    )
     return float(np.diff(moments).min())
 
 

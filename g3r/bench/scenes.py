@@ -1,28 +1,87 @@
-"""Made-up clouds and slices of any size, so that one size can grow while all else stays."""
+"""Made-up clouds and slices: a head of any number of Gaussians, and scenes of which one size grows at a time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices, volume_planes
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.cloud import rotation_from_quaternion
-from g3r.gaussians.overlap import OverlapList
+from g3r.gaussians import GaussianCloud, find_overlaps, render
+from g3r.gaussians.arrays import CloudArrays, PlaneArrays
+from g3r.gaussians.kernels import PROJECTION, project
 from g3r.geometry import VolumeGrid
 
-HEAD_MM = 50.0
-"""Edge of the cube that Gaussians, slices and voxels share."""
+SEMI_AXES_MM = np.array([40.0, 48.0, 38.0])
+"""Of the ellipsoid that `head_scene` fills with Gaussians."""
+
+SIGMA_PER_SPACING, LOG_SIGMA_SPREAD = 0.6, 0.25
+"""Sigma of its Gaussians over the edge of their share of the head, as the fit seeds them; deviation of ln sigma."""
+
+HEAD_THICKNESS_MM = 2.2
+
+CUBE_MM = 50.0
+"""Edge of the cube that Gaussians, slices and voxels of the growing scenes share."""
 
 SIGMA_MM = 1.2
 THICKNESS_MM = 2.5
-PIXEL_MM = 0.8
-"""In-plane width of the PSF, whatever the spacing of the pixels: finer ones shall not mean another scene."""
 
-N_STACKS = 3
+PIXEL_MM = 0.8
+"""In-plane width of the PSF, whatever the spacing of the pixels: finer pixels must not change the scene."""
+
+FRAMES = (
+    np.eye(3),
+    Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+    Rotation.from_euler("y", 90, degrees=True).as_matrix(),
+)
+"""Rotations of three orthogonal stacks."""
+
+
+@dataclass(frozen=True)
+class HeadScene:
+    """A cloud and three stacks of slices of it, each cropped to the head and slightly tilted."""
+
+    cloud: GaussianCloud
+    slices: Slices
+
+
+def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> HeadScene:
+    """Random Gaussians that fill an ellipsoid, and slices of noise (their values do not matter).
+
+    Args:
+        n_gaussians: in the head; their size follows.
+        n_slices: of each stack; None covers the head.
+        seed: of everything random.
+    """
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n_gaussians, 3))
+    points *= (rng.random(n_gaussians) ** (1 / 3) / np.linalg.norm(points, axis=1))[:, None]
+    points = (points * SEMI_AXES_MM)[np.lexsort(np.rint(points * SEMI_AXES_MM / 4).T)]  # neighbours near in memory
+    spacing_mm = float(4 / 3 * np.pi * SEMI_AXES_MM.prod() / n_gaussians) ** (1 / 3)
+    log_scale = np.log(SIGMA_PER_SPACING * spacing_mm) + rng.normal(0, LOG_SIGMA_SPREAD, (n_gaussians, 3))
+    cloud = _cloud(points, log_scale, rng.normal(size=(n_gaussians, 4)), rng.uniform(0, 1, n_gaussians))
+    rotation, center, shape, stack = [], [], [], []
+    for number, frame in enumerate(FRAMES):
+        reach = np.abs(frame.T) @ SEMI_AXES_MM
+        n = n_slices or int(2 * reach[2] / HEAD_THICKNESS_MM)
+        for i in range(n):
+            offset = (i - (n - 1) / 2) * HEAD_THICKNESS_MM
+            width = np.sqrt(max(1 - (offset / reach[2]) ** 2, 0.02))
+            rotation.append(frame @ Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix())
+            center.append(frame[:, 2] * offset)
+            shape.append(np.maximum(2, 2 * reach[:2] * width / PIXEL_MM))
+            stack.append(number)
+    k = len(stack)
+    spacing = np.full((k, 2), PIXEL_MM)
+    variance = psf_variance_mm2(spacing, np.full(k, HEAD_THICKNESS_MM))
+    planes = Planes(np.array(rotation), np.array(center), spacing, np.array(shape, dtype=np.int64), variance)
+    value = rng.random(planes.n_pixels, dtype=np.float32)
+    return HeadScene(cloud, _slices(planes, value, np.array(stack), HEAD_THICKNESS_MM))
 
 
 @dataclass(frozen=True)
@@ -30,11 +89,10 @@ class SceneSize:
     """How much there is of everything.
 
     Args:
-        n_gaussians: of the same size in the same head, ever more on top of each other: each touches as many
-            planes and pixels as before.
-        n_slices: through the same head, in three stacks, ever closer.
-        n_pixels: per slice, ever finer over the same area.
-        n_voxels: of the volume, ever finer over the same head.
+        n_gaussians: of the same size in the same cube, so that each touches as many planes and pixels as before.
+        n_slices: through the same cube, in three stacks.
+        n_pixels: per slice, over the same area.
+        n_voxels: of the volume, over the same cube.
     """
 
     n_gaussians: int = 8000
@@ -44,59 +102,42 @@ class SceneSize:
 
 
 def made_cloud(size: SceneSize, seed: int = 0) -> GaussianCloud:
-    """Gaussians at random in the head, their axes 0.8 to 1.25 times the common sigma."""
+    """Gaussians at random in the cube, their axes 0.8 to 1.25 times the common sigma."""
     rng = np.random.default_rng(seed)
     n = size.n_gaussians
-    return GaussianCloud.of(
-        [
-            torch.from_numpy(array.astype(np.float32))
-            for array in (
-                rng.uniform(-HEAD_MM / 2, HEAD_MM / 2, (n, 3)),
-                np.log(SIGMA_MM) + rng.uniform(np.log(0.8), np.log(1.25), (n, 3)),
-                rng.standard_normal((n, 4)),
-                rng.uniform(0.5, 1.0, n) * (8000 / n),
-            )
-        ],
-        np.zeros(3),
-    )
+    mean = rng.uniform(-CUBE_MM / 2, CUBE_MM / 2, (n, 3))
+    log_scale = np.log(SIGMA_MM) + rng.uniform(np.log(0.8), np.log(1.25), (n, 3))
+    return _cloud(mean, log_scale, rng.standard_normal((n, 4)), rng.uniform(0.5, 1.0, n) * (8000 / n))
 
 
 def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
-    """Slices of a cloud in three orthogonal stacks, with noise."""
+    """Slices of a cloud in three orthogonal stacks, with noise.
+
+    Args:
+        size: number of slices and of their pixels.
+        cloud: that is imaged.
+        seed: of the noise.
+    """
     rng = np.random.default_rng(seed)
-    frames = [np.eye(3)[:, order] for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1])]
-    per_stack = [len(part) for part in np.array_split(np.arange(size.n_slices), N_STACKS)]
-    rotation, center = [], []
-    for frame, n in zip(frames, per_stack, strict=True):
-        offsets = (np.arange(n) + 0.5) / max(n, 1) * HEAD_MM - HEAD_MM / 2
-        rotation += [frame] * n
-        center += [frame[:, 2] * offset for offset in offsets]
+    per_stack = [len(part) for part in np.array_split(np.arange(size.n_slices), len(FRAMES))]
+    stack_id = np.repeat(np.arange(len(FRAMES)), per_stack)
+    rotation = np.array(FRAMES)[stack_id]
+    offset = np.concatenate([(np.arange(n) + 0.5) / max(n, 1) * CUBE_MM - CUBE_MM / 2 for n in per_stack])
     side = max(2, round(size.n_pixels**0.5))
-    variance = psf_variance_mm2(np.full(2, PIXEL_MM), THICKNESS_MM)
     planes = Planes(
-        rotation=np.array(rotation),
-        center_mm=np.array(center),
-        spacing_mm=np.full((size.n_slices, 2), HEAD_MM / side),
+        rotation=rotation,
+        center_mm=rotation[:, :, 2] * offset[:, None],
+        spacing_mm=np.full((size.n_slices, 2), CUBE_MM / side),
         shape=np.full((size.n_slices, 2), side),
-        psf_var_mm2=np.tile(variance, (size.n_slices, 1)),
+        psf_var_mm2=np.tile(psf_variance_mm2(np.full(2, PIXEL_MM), THICKNESS_MM), (size.n_slices, 1)),
     )
     value = render(cloud, planes).numpy()
     value = value + 0.02 * rng.standard_normal(len(value)).astype(np.float32) * value.mean()
-    index = np.concatenate([np.arange(n) for n in per_stack])
-    stack_id = np.repeat(np.arange(N_STACKS), per_stack)
-    return Slices(
-        planes=planes,
-        value=value.astype(np.float32),
-        mask=np.ones(len(value), bool),
-        stack_id=stack_id,
-        slice_index=index,
-        thickness_mm=np.full(size.n_slices, THICKNESS_MM),
-        header_pose=planes.pose,
-    )
+    return _slices(planes, value.astype(np.float32), stack_id, THICKNESS_MM)
 
 
 def corners(planes: Planes) -> Planes:
-    """The same rectangles with a pixel in each corner only: the same pairs, and hardly a pixel in them."""
+    """The same rectangles with a pixel in each corner only: the same overlaps, and hardly a pixel in them."""
     return replace(planes, shape=np.full((len(planes), 2), 2), spacing_mm=(planes.shape - 1) * planes.spacing_mm)
 
 
@@ -107,26 +148,54 @@ def corner_slices(slices: Slices) -> Slices:
 
 
 def made_volume_planes(size: SceneSize) -> Planes:
-    """The planes of a volume of the head."""
+    """The planes of a volume of the cube."""
     side = max(2, round(size.n_voxels ** (1 / 3)))
-    spacing = HEAD_MM / side
+    spacing = CUBE_MM / side
     affine = np.diag([spacing, spacing, spacing, 1.0])
     affine[:3, 3] = -spacing * (side - 1) / 2
     return volume_planes(VolumeGrid((side, side, side), affine))
 
 
-def pixel_evaluations(cloud: GaussianCloud, planes: Planes, pairs: OverlapList, cutoff_sigma: float) -> float:
-    """How many pixels the ellipses of all pairs cover, planes taken as endless: the work inside of pairs."""
-    rotation = rotation_from_quaternion(cloud.quaternion_wxyz).double().numpy()
-    root = rotation * np.exp(cloud.log_scale.double().numpy())[:, None, :]
-    mean = cloud.mean_mm.double().numpy() + cloud.origin_mm
-    total = 0.0
-    for k in range(len(planes)):
-        chosen = pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
-        local = planes.rotation[k].T @ root[chosen]
-        observed = local @ local.transpose(0, 2, 1) + np.diag(planes.psf_var_mm2[k])
-        height = (mean[chosen] - planes.center_mm[k]) @ planes.rotation[k][:, 2]
-        left = np.maximum(cutoff_sigma**2 - height**2 / observed[:, 2, 2], 0)
-        in_plane = np.sqrt(np.linalg.det(observed) / observed[:, 2, 2])
-        total += float((np.pi * left * in_plane).sum() / planes.spacing_mm[k].prod())
-    return total
+def evaluations(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> tuple[int, int]:
+    """The work of rendering: pixels inside the cut-off, one for each Gaussian, and (Gaussian, plane) pairs with any.
+
+    Args:
+        cloud: N Gaussians.
+        planes: K planes.
+        cutoff_sigma: where a Gaussian ends.
+    """
+    pairs = find_overlaps(cloud, planes, cutoff_sigma)
+    described = PlaneArrays.of(planes, cloud.origin_mm)
+    space = np.zeros(pairs.most, PROJECTION)
+    n_pixels, n_pairs = _count(CloudArrays.of(cloud).shapes, described, pairs.arrays, cutoff_sigma**2, space)
+    return int(n_pixels), int(n_pairs)
+
+
+@numba.njit(cache=True)
+def _count(shapes, planes, overlaps, cut, projections):
+    n_pixels, n_pairs = 0, 0
+    for k in range(len(planes.rotation)):
+        n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
+        n = project(shapes, planes, overlaps, k, cut, True, projections)
+        n_pairs += n
+        for i in range(n):
+            p = projections[i]
+            for x in range(max(0, int(p.row - p.half_x)), min(n_x, int(p.row + p.half_x) + 3)):
+                dx = x - p.row - p.x
+                for y in range(max(0, int(p.column - p.half_y)), min(n_y, int(p.column + p.half_y) + 3)):
+                    u = y - p.column - p.y - p.slope * dx
+                    n_pixels += p.e_0 + p.q_x * dx * dx + p.q_u * u * u >= -0.5 * cut
+    return n_pixels, n_pairs
+
+
+def _cloud(*arrays: NDArray[np.float64]) -> GaussianCloud:
+    """Centres, log-scales, quaternions and amplitudes as a cloud about the world's origin."""
+    return GaussianCloud.of([torch.from_numpy(array.astype(np.float32)) for array in arrays], np.zeros(3))
+
+
+def _slices(planes: Planes, value: NDArray[np.float32], stack_id: NDArray[np.int64], thickness_mm: float) -> Slices:
+    """Planes with pixels as slices without a mask, numbered in each stack."""
+    k = len(planes)
+    index = np.arange(k) - np.searchsorted(stack_id, stack_id)
+    thickness = np.full(k, thickness_mm)
+    return Slices(planes, value, np.ones(len(value), bool), stack_id, index, thickness, planes.pose)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g3r.bench.record import add_output_arguments, run_measurement
 from g3r.errors import InputError
+from g3r.planning import PRESET_NAMES
 
 if TYPE_CHECKING:
     from g3r.evaluation.case import SimulatedCase
-
-PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
-
-MARKERS = "trade"
 
 OUTSIDE_STAGES = "start-up, reading, writing"
 """What the command does besides the stages that run.json times."""
@@ -24,51 +23,27 @@ OUTSIDE_STAGES = "start-up, reading, writing"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("cases", nargs="*", type=Path, metavar="CASE", help="folders of g3r-simulate")
-    parser.add_argument(
-        "--output", type=Path, default=Path("runs") / "bench" / "trade", help="for trade.json and trade.md"
-    )
-    parser.add_argument("--docs", type=Path, metavar="FILE", help="also put the tables between its markers")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="also draw PSNR against seconds")
+    add_output_arguments(parser, "trade", "PSNR against seconds")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each command; medians are shown")
     parser.add_argument("--presets", nargs="+", choices=PRESET_NAMES, default=PRESET_NAMES, metavar="PRESET")
     parser.add_argument("--sweeps", action="store_true", help="on the first case: sweeps, and curves of fits")
     parser.add_argument("--base", choices=PRESET_NAMES, default="balanced", help="preset that sweeps vary")
     parser.add_argument("--thickness", type=float, metavar="MM", help="of slices (None: simulation.json)")
     parser.add_argument("--threads", type=int, help="CPU threads (None: all cores)")
-    parser.add_argument(
-        "--redraw", action="store_true", help="tables and figure from --output's trade.json, no measuring"
-    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and write what was found; returns the exit code."""
-    from g3r.bench.record import put_between_markers, write_text
+    from g3r.bench.trade_figure import draw_trade
     from g3r.bench.trade_tables import trade_tables
 
-    record = _earlier(options.output / "trade.json") if options.redraw else _measure(options)
-    text = trade_tables(record)
-    write_text(options.output / "trade.md", text)
-    print(text)
-    if options.docs:
-        put_between_markers(options.docs, MARKERS, text)
-    if options.figure:
-        from g3r.bench.trade_figure import draw_trade
-
-        draw_trade(record, options.figure)
-    return 0
+    measure = lambda keep: _measure(options, keep)  # noqa: E731
+    return run_measurement(options, "trade", measure=measure, tables=trade_tables, draw=draw_trade)
 
 
-def _earlier(path: Path) -> dict[str, Any]:
-    import json
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; measure first, without --redraw")
-    return dict(json.loads(path.read_text(encoding="utf-8")))
-
-
-def _measure(options: argparse.Namespace) -> dict[str, Any]:
+def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     from g3r.bench.command_run import infer_arguments, run_infer
-    from g3r.bench.record import available_cores, machine, use_threads, write_json
+    from g3r.bench.record import available_cores, machine, use_threads
     from g3r.evaluation.case import load_case
 
     if not options.cases:
@@ -85,7 +60,6 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         "base": options.base,
         "cases": {},
     }
-    path = options.output / "trade.json"
     with tempfile.TemporaryDirectory(prefix="g3r-bench-") as scratch:
         output = Path(scratch) / "result"
         more = [] if options.threads is None else ["--threads", str(threads)]
@@ -98,16 +72,22 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
                 _say(f"{case.name}: {preset}")
                 arguments = [*infer_arguments(case, preset, output), *more]
                 rows[preset] = measured_command(case, arguments, output, options.repeats)
-                write_json(path, record)
+                keep(record)
     if options.sweeps:
         use_threads(threads)
         _measure_fits(cases[0], options, record)
-        write_json(path, record)
     return record
 
 
 def measured_command(case: SimulatedCase, arguments: list[str], output: Path, repeats: int) -> dict[str, Any]:
-    """Medians over runs of one command, and the quality of what the last of them wrote."""
+    """Medians over runs of one command, and the quality of what the last of them wrote.
+
+    Args:
+        case: simulated subject.
+        arguments: of g3r-infer.
+        output: its output folder.
+        repeats: number of runs.
+    """
     from statistics import median
 
     from g3r.bench.command_run import run_infer

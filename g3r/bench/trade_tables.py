@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from g3r.bench.pareto import pareto_front
 from g3r.bench.record import machine_line, markdown_table
 
 ALLOWED_SECONDS = {"draft": 15.0, "fast": 30.0, "balanced": 75.0, "accurate": 240.0}
@@ -22,7 +21,7 @@ GB = 1e9
 
 @dataclass(frozen=True)
 class Point:
-    """One setting on one case: what it cost, what it gave."""
+    """Seconds and quality of one setting on one case."""
 
     group: str
     label: str
@@ -57,6 +56,27 @@ def sweep_offset(case: Mapping[str, Any], base: str) -> float:
     if base not in case["presets"] or not alike:
         return 0.0
     return float(case["presets"][base]["seconds"] - alike[0]["seconds"])
+
+
+def pareto_front(seconds: Sequence[float], quality: Sequence[float]) -> list[int]:
+    """Numbers of the points that no other reaches in less time and with better quality, fastest first.
+
+    Of points that are alike in both the first stays.
+
+    Args:
+        seconds: less is better.
+        quality: more is better.
+
+    Raises:
+        ValueError: lists of different lengths.
+    """
+    if len(seconds) != len(quality):
+        raise ValueError(f"{len(seconds)} times and {len(quality)} qualities; expected as many")
+    front: list[int] = []
+    for n in sorted(range(len(seconds)), key=lambda k: (seconds[k], -quality[k])):
+        if not front or quality[n] > quality[front[-1]]:
+            front.append(n)
+    return front
 
 
 def trade_tables(record: Mapping[str, Any]) -> str:

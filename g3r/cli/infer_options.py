@@ -6,8 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from g3r._version import __version__
-
-PRESET_NAMES = ("draft", "fast", "balanced", "accurate")
+from g3r.planning import PRESET_NAMES
 
 DEFAULTS = {"preset": "balanced", "space": "standard", "resolution": 0.8, "seed": 0}
 """Of the options that --config takes the place of, --no-prior and --time-budget besides."""

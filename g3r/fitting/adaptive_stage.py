@@ -22,26 +22,35 @@ from g3r.gaussians.densification import (
 )
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import bounding_box
 from g3r.run.deadline import Deadline
 
 WINDOW_SHARE = 0.5
 """Sigma of the neighbourhood in which the residual is judged, over the finest spacing."""
 
+GROWTH = 1.7
+"""Largest ratio of Gaussians after a round to those before it: new ones need the next fit to find their place."""
 
-@dataclass(frozen=True)
+FILTER_SHARE = 0.2
+"""Sigma of the filter that finds residual extrema, over the mean spacing of the Gaussians there are."""
+
+MIN_SIGMA_SHARE = 0.25
+"""Smallest sigma of a new Gaussian, over the finest spacing."""
+
+PRUNE_TOLERANCE = 0.1
+"""A Gaussian is pruned, and duplicates are merged, where that changes the volume by less than this times bound^2 in a
+cell of the finest lattice."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class AdaptiveSettings:
     """How the number of Gaussians is found.
 
     Args:
-        bound: largest root mean square residual that is left in the neighbourhood of a voxel, in units of
-            the volume, wherever Gaussians of the finest spacing can bring it there.
+        bound: largest root mean square residual that is left in the neighbourhood of a voxel, in units of the volume,
+            wherever Gaussians of the finest spacing can bring it there.
         start: spacing of the first lattice, over the finest.
-        growth: a round makes at most so many Gaussians of one.
-        n_rounds: at most so many rounds.
-        filter_share: sigma of the filter that finds blobs, over the mean spacing of the Gaussians there are.
-        min_share: least sigma of a new Gaussian, over the finest spacing.
-        prune_tolerance: a Gaussian is dropped, and a pair merged, where that changes the volume by less than so many
-            times bound^2 in a cell of the finest lattice.
+        n_rounds: largest number of rounds of densification.
         round_steps: optimiser steps before each look at the residual.
         last_steps: and after the last; those of `PriorStageSettings` when None.
         amplitude_iterations: conjugate-gradient steps for the amplitudes at the start of each round, and at the end.
@@ -49,28 +58,25 @@ class AdaptiveSettings:
 
     bound: float = 0.05
     start: float = 3.0
-    growth: float = 1.7
     n_rounds: int = 6
-    filter_share: float = 0.2
-    min_share: float = 0.25
-    prune_tolerance: float = 0.1
     round_steps: int = 45
     last_steps: int | None = None
     amplitude_iterations: int = 8
 
 
-@dataclass
-class Refinement:
+@dataclass(kw_only=True)
+class Densification:
     """What was done to a cloud on the way to the bound.
 
     Attributes:
-        bound: that was asked for.
+        bound: as in the settings.
         n_seeded: Gaussians of the first lattice.
         n_added, n_merged, n_dropped: in all rounds; a merge takes one away.
-        n_rounds: of adding.
-        steps: optimiser steps, all rounds together.
-        rms: root mean square of what is left, in the mask.
-        share_over_bound: share of the mask in whose neighbourhood it is over the bound.
+        n_rounds: rounds that added Gaussians.
+        steps: optimiser steps of all rounds.
+        rms: root mean square of the final residual in the mask.
+        share_over_bound: share of the mask in whose neighbourhood the final residual is over the bound.
+        loss: image loss of each step.
     """
 
     bound: float
@@ -93,29 +99,29 @@ def fit_adaptive(
     volume: NDArray[np.float32],
     mask: NDArray[np.bool_],
     grid: VolumeGrid,
+    *,
     finest_spacing_mm: float,
     settings: AdaptiveSettings,
     stage: PriorStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
     deadline: Deadline | None = None,
-) -> tuple[GaussianCloud, Refinement]:
-    """A cloud that shows a volume to within a bound, with few Gaussians.
+) -> tuple[GaussianCloud, Densification]:
+    """A cloud that shows a volume to within a bound, with few Gaussians (G3R Eq. 8 in rounds).
 
-    A coarse lattice is fitted. Then, in rounds: Gaussians that would not be missed go, pairs that one could
-    stand for are merged, and new ones are put on the extrema of what is left, shaped like it, largest gain
-    first - where the residual is over the bound and Gaussians do not stand at the finest spacing already.
-    The old ones keep their place and give way in the fit that follows.
+    A coarse lattice is fitted. Then, in rounds: Gaussians that hardly matter are pruned, duplicates are merged, and new
+    ones are put on the extrema of the residual, shaped like it, largest gain first, where the residual is over the
+    bound and Gaussians are not at the finest spacing already. The old ones stay and adjust in the fit that follows.
 
     Args:
         volume: [I, J, K], of order one.
         mask: [I, J, K], where the volume counts.
         grid: their grid.
-        finest_spacing_mm: edge of the cell per Gaussian where they stand closest.
+        finest_spacing_mm: edge of the cell per Gaussian where they are closest.
         settings: bound and rounds.
         stage: how the optimiser runs.
         rng: draws the planes of the optimiser's steps.
-        progress: called with (steps done, steps in all at most).
+        progress: called with (steps done, largest number of steps).
         deadline: fewer steps in each round if they would end after it.
 
     Raises:
@@ -125,45 +131,48 @@ def fit_adaptive(
         raise ValueError(f"bound {settings.bound}; expected a positive number")
     if not mask.any():
         raise ValueError("the foreground is empty")
-    volume, mask, grid = _cropped(volume, mask, grid)
+    box = bounding_box(mask)
+    volume, mask, grid = np.ascontiguousarray(volume[box]), np.ascontiguousarray(mask[box]), grid.cropped(box)
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     last_steps = stage.n_steps if settings.last_steps is None else settings.last_steps
     at_most = settings.n_rounds * settings.round_steps + last_steps
-    prune_tolerance = settings.prune_tolerance * settings.bound**2 * finest_spacing_mm**3
+    prune_tolerance = PRUNE_TOLERANCE * settings.bound**2 * finest_spacing_mm**3
     window_mm = WINDOW_SHARE * finest_spacing_mm
     cloud = seed_cloud(volume, mask, grid, settings.start * finest_spacing_mm)
-    done = Refinement(settings.bound, len(cloud))
+    done = Densification(bound=settings.bound, n_seeded=len(cloud))
 
     def fitted(cloud: GaussianCloud, n_steps: int) -> GaussianCloud:
         before = done.steps
         run = replace(stage, n_steps=n_steps, amplitude_iterations=settings.amplitude_iterations)
         # the rounds to come take as many steps as they would without a deadline, of what time is left
         by_then = deadline.part(n_steps / max(1, at_most - before)) if deadline else None
-        cloud, loss = fit_prior(cloud, target, run, rng, lambda n, _: progress(before + n, at_most), by_then)
+        cloud, loss = fit_prior(
+            cloud, target, run, rng, progress=lambda n, _: progress(before + n, at_most), deadline=by_then
+        )
         done.steps += len(loss)
         done.loss += loss
         return cloud
 
     def left(cloud: GaussianCloud) -> NDArray[np.float32]:
-        shown = render(cloud, target.planes).detach().numpy()
+        shown = render(cloud, target.planes, cutoff_sigma=stage.cutoff_sigma).detach().numpy()
         return volume_from_pixels((target.value - shown) * target.weight, grid)
 
     for _ in range(settings.n_rounds):
         cloud = fitted(cloud, settings.round_steps)
         residual = left(cloud)
         spacing_mm = (mask.sum() * grid.voxel_volume_mm3 / max(len(cloud), 1)) ** (1 / 3)
-        filter_mm = max(settings.filter_share * spacing_mm, float(grid.spacing_mm.max()))
-        blobs = find_extrema(residual, mask, grid, filter_mm, settings.min_share * finest_spacing_mm)
+        filter_mm = max(FILTER_SHARE * spacing_mm, float(grid.spacing_mm.max()))
+        extrema = find_extrema(residual, mask, grid, filter_mm, MIN_SIGMA_SHARE * finest_spacing_mm)
         over = local_rms(residual, mask, grid, window_mm) > settings.bound
-        blobs = blobs.take(over[tuple(blobs.index.T)])
-        blobs = blobs.take(~exceeds_density(cloud, grid.world(blobs.index), finest_spacing_mm))
-        most = max(1, int((settings.growth - 1) * len(cloud)))
-        blobs = blobs.take(np.sort(np.argsort(-blobs.gain, kind="stable")[:most]))
-        if not len(blobs):
+        extrema = extrema.take(over[tuple(extrema.index.T)])
+        extrema = extrema.take(~exceeds_density(cloud, grid.world(extrema.index), finest_spacing_mm))
+        most = max(1, int((GROWTH - 1) * len(cloud)))
+        extrema = extrema.take(np.sort(np.argsort(-extrema.gain, kind="stable")[:most]))
+        if not len(extrema):
             break
         cloud = _thinned(cloud, prune_tolerance, done)
-        cloud = concatenated(cloud, blobs.cloud(grid, cloud.origin_mm))
-        done.n_added += len(blobs)
+        cloud = concatenated(cloud, extrema.cloud(grid, cloud.origin_mm))
+        done.n_added += len(extrema)
         done.n_rounds += 1
     cloud = _thinned(fitted(cloud, last_steps), prune_tolerance, done)
     cloud = solve_amplitudes_on(
@@ -176,23 +185,10 @@ def fit_adaptive(
     return cloud, done
 
 
-def _thinned(cloud: GaussianCloud, prune_tolerance: float, done: Refinement) -> GaussianCloud:
-    """The cloud without what would not be missed; the counts are kept."""
+def _thinned(cloud: GaussianCloud, prune_tolerance: float, done: Densification) -> GaussianCloud:
+    """The cloud pruned, with duplicates merged; both are counted in `done`."""
     kept = pruned(cloud, prune_tolerance)
     merged = with_duplicates_merged(kept, prune_tolerance)
     done.n_dropped += len(cloud) - len(kept)
     done.n_merged += len(kept) - len(merged)
     return merged
-
-
-def _cropped(
-    volume: NDArray[np.float32], mask: NDArray[np.bool_], grid: VolumeGrid
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], VolumeGrid]:
-    """Volume, mask and grid of the box around the mask."""
-    inside = np.argwhere(mask)
-    low, high = inside.min(0), inside.max(0) + 1
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    affine = grid.affine.copy()
-    affine[:3, 3] = grid.world(low)
-    shape = (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2]))
-    return np.ascontiguousarray(volume[box]), np.ascontiguousarray(mask[box]), VolumeGrid(shape, affine)

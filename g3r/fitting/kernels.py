@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from g3r.gaussians.kernels import clear, rasterise_plane, set_up_plane
-from g3r.gaussians.kernels_backward import gather_plane
+from g3r.gaussians.kernels import clear, project, rasterise
+from g3r.gaussians.kernels_backward import gather
 from g3r.gaussians.simd import N_LANES
 
 f32 = np.float32
@@ -17,9 +19,42 @@ SUMS = {"contract", "arcp", "nsz", "reassoc"}
 """Sums over a row may be taken in any order, so that they run in vectors; NaN keeps its meaning."""
 
 
+class PixelArrays(NamedTuple):
+    """Pixels of the planes of a term, read from each plane's offset on.
+
+    Attributes:
+        value: [P].
+        weight: [P] not negative.
+        basis: [5, P] terms of the log-intensity fields; [5, 0] without fields.
+    """
+
+    value: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    basis: NDArray[np.float32]
+
+
+class AdamRate(NamedTuple):
+    """Numbers of one step of Adam.
+
+    Attributes:
+        step: step size.
+        beta_1: decay of the mean of gradients.
+        beta_2: decay of the mean of their squares.
+        correction: 1 - beta_1^t.
+        root_correction: sqrt(1 - beta_2^t).
+    """
+
+    step: float
+    beta_1: float
+    beta_2: float
+    correction: float
+    root_correction: float
+
+
 @numba.njit(fastmath=SUMS)
-def _row(image, row, target, weight, begin, n, factor):
+def _row(image, row, pixels, begin, n, factor):
     """Weighted absolute residual of a row of pixels, whose gradient takes the place of the pixels."""
+    target, weight = pixels.value, pixels.weight
     total = f32(0.0)
     for y in range(n):
         residual = image[row + y] - target[begin + y]
@@ -31,8 +66,9 @@ def _row(image, row, target, weight, begin, n, factor):
 
 
 @numba.njit(fastmath=SUMS)
-def _shaded_row(image, row, target, weight, begin, n, factor, basis, c, slopes):
-    """As `_row`, with the pixels under a stack's field exp(sum_n c_n basis_n); adds dL/dc to `slopes`."""
+def _row_under_field(image, row, pixels, begin, n, factor, c, slopes):
+    """As `_row`, with the pixels under a bias field exp(sum_n c_n basis_n); adds dL/dc to `slopes`."""
+    target, weight, basis = pixels.value, pixels.weight, pixels.basis
     total = f32(0.0)
     g0 = g1 = g2 = g3 = g4 = f32(0.0)
     for y in range(n):
@@ -73,99 +109,77 @@ def _exp(e):
 
 @numba.njit(parallel=True, cache=True)
 def image_l1(
-    shapes,
-    amplitude,
-    rotation,
-    center,
-    gain,
-    psf,
-    shape,
-    spacing,
-    offset,
-    start,
-    order,
+    cloud,
+    planes,
+    overlaps,
     cut,
-    exact,
-    images,
-    projections,
-    target,
-    weight,
+    work,
+    pixels,
     slice_weight,
+    coefficients,
     factor,
     with_pose,
-    basis,
-    coefficients,
     buffers,
     plane_gradient,
     field_gradient,
     residual,
 ):
-    """L1 of rendered planes and its gradients, plane after plane: each is rendered, compared and gathered.
+    """L1 of rendered planes and its gradients: each plane is rendered, compared and differentiated in turn.
 
-    The loss is factor sum_k trust_k residual_k with residual_k the sum of weight |pixel - target| over plane
-    k (written to `residual`). Gradients are added to buffers [n_workers, N, 11] and written to
-    plane_gradient [K, 7] and field_gradient [K, 5]. basis [5, P] and coefficients [K, 5] give the planes'
-    fields; an empty basis means that there are none. target, weight, basis are read from offset [K] on.
+    The loss is factor sum_k slice_weight_k residual_k, with residual_k the sum of weight |pixel - target| over plane k.
+
+    Args:
+        cloud: `CloudArrays`.
+        planes: `PlaneArrays`.
+        overlaps: `OverlapArrays`.
+        cut: square of the cut-off in sigma.
+        work: `Workspace`.
+        pixels: `PixelArrays`.
+        slice_weight: [K].
+        coefficients: [K, 5] of the planes' fields.
+        factor: of the loss.
+        with_pose: whether gradients of poses are wanted.
+        buffers: [n_workers, N, 11], gradients of the Gaussians are added.
+        plane_gradient: [K, 7] is written, columns as in `gaussians.kernels`.
+        field_gradient: [K, 5] is written.
+        residual: [K] is written.
     """
-    n_workers = len(images)
+    n_workers = len(work.images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], projections[worker]
-        for k in range(worker, len(rotation), n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
+        image, mine = work.images[worker], work.projections[worker]
+        for k in range(worker, len(planes.rotation), n_workers):
+            n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
             pitch = n_y + N_LANES
             clear(image, n_x, n_y)
-            n = set_up_plane(
-                shapes,
-                order,
-                start[k],
-                start[k + 1],
-                rotation[k],
-                center[k],
-                psf[k],
-                shape[k],
-                spacing[k],
-                gain[k],
-                cut,
-                exact,
-                mine,
-            )
-            rasterise_plane(mine, n, amplitude, cut, n_x, n_y, image)
+            n = project(cloud.shapes, planes, overlaps, k, cut, True, mine)
+            rasterise(mine, n, cloud.amplitude, cut, n_x, n_y, image)
             total, scale = 0.0, f32(factor * slice_weight[k])
             slopes = field_gradient[k]
             slopes[:] = 0.0
             for x in range(n_x):
-                row, begin = x * pitch, offset[k] + x * n_y
-                if basis.shape[1]:
-                    total += _shaded_row(image, row, target, weight, begin, n_y, scale, basis, coefficients[k], slopes)
+                row, begin = x * pitch, planes.offset[k] + x * n_y
+                if pixels.basis.shape[1]:
+                    total += _row_under_field(image, row, pixels, begin, n_y, scale, coefficients[k], slopes)
                 else:
-                    total += _row(image, row, target, weight, begin, n_y, scale)
+                    total += _row(image, row, pixels, begin, n_y, scale)
                 image[row + n_y : row + pitch] = f32(0.0)
             image[n_x * pitch : n_x * pitch + N_LANES] = f32(0.0)
             residual[k] = total
             plane_gradient[k] = 0.0
             if scale != f32(0.0):
-                gather_plane(
-                    mine,
-                    n,
-                    shapes,
-                    amplitude,
-                    rotation[k],
-                    center[k],
-                    psf[k],
-                    shape[k],
-                    spacing[k],
-                    cut,
-                    exact,
-                    image,
-                    buffers[worker],
-                    plane_gradient[k],
-                    with_pose,
-                )
+                gather(mine, n, cloud, planes, k, cut, True, image, buffers[worker], plane_gradient[k], with_pose)
 
 
 @numba.njit(parallel=True, cache=True, fastmath=SUMS)
 def scale_penalty(log_scale, seed, factor, gradient):
-    """Sum of (log_scale - seed)^2; adds factor times its gradient to that of the log-scales [N, 3]."""
+    """Scale regulariser: sum of (log_scale - seed)^2 over [N, 3].
+
+    Args:
+        log_scale: [N, 3].
+        seed: [N, 3] log-scales where the fit began.
+        factor: of the gradient.
+        gradient: [N, 3], factor times the gradient is added.
+    """
     total = 0.0
     for j in numba.prange(len(log_scale)):
         for a in range(3):
@@ -176,11 +190,19 @@ def scale_penalty(log_scale, seed, factor, gradient):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=SUMS)
-def adam(values, gradient, first, second, step, beta_1, beta_2, correction, root_correction):
-    """One step of Adam (Kingma and Ba 2015, Algorithm 1); returns how many gradients are not finite.
+def adam(values, gradient, first, second, rate):
+    """One step of Adam; returns how many gradients are not finite.
 
-    correction is 1 - beta_1^t and root_correction sqrt(1 - beta_2^t).
+    Args:
+        values: [n] parameters, changed.
+        gradient: [n].
+        first: [n] mean of gradients, changed.
+        second: [n] mean of their squares, changed.
+        rate: `AdamRate`.
+
+    Source: Kingma and Ba 2015, Algorithm 1.
     """
+    step, beta_1, beta_2, correction, root_correction = rate
     length, decay_1, decay_2 = f32(step / correction), f32(beta_1), f32(beta_2)
     over_root = f32(1.0 / root_correction)
     n_bad = 0
@@ -198,12 +220,20 @@ def adam(values, gradient, first, second, step, beta_1, beta_2, correction, root
 
 @numba.njit(parallel=True, cache=True)
 def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, min_psf_mm2):
-    """Largest change that a pair's distance from its cut-off can have seen, in units of its sigma.
+    """Bound of the change of any Gaussian's distance from a plane less its reach there, in units of its sigma.
 
-    `then` [N, 12] is what `remember` wrote. With n a unit vector, the distance along n changes by at most
-    |mean - then| + common_mm (what planes moved), and sigma_n = sqrt(n^T Sigma n + D) by at most
-    max|s - s_then| + angle (s_max - s_min), the steepest that |S n| can be on the unit sphere. sigma_n
-    is at least sqrt(s_min^2 + min_psf_mm2).
+    With n a unit vector, the distance along n changes by at most |mean - then| + common_mm, and
+    sigma_n = sqrt(n^T Sigma n + D) by at most max|s - s_then| + angle (s_max - s_min), the steepest that |S n| can be
+    on the unit sphere. sigma_n is at least sqrt(s_min^2 + min_psf_mm2).
+
+    Args:
+        mean: [N, 3] mm.
+        log_scale: [N, 3].
+        quaternion: [N, 4].
+        then: [N, 12] of `remember`.
+        cutoff_sigma: where a Gaussian ends.
+        common_mm: what planes have moved by.
+        min_psf_mm2: least variance of the PSF in any direction.
     """
     largest = 0.0
     for j in numba.prange(len(mean)):
@@ -224,7 +254,14 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, mi
 
 @numba.njit(parallel=True, cache=True)
 def remember(mean, log_scale, quaternion, then):
-    """Centres, log-scales, unit quaternions, least and largest sigma [N, 12], to measure movement from."""
+    """Write what `farthest_move` measures movement from.
+
+    Args:
+        mean: [N, 3] mm.
+        log_scale: [N, 3].
+        quaternion: [N, 4].
+        then: [N, 12], written: centres, log-scales, unit quaternions, least and largest sigma.
+    """
     for j in numba.prange(len(mean)):
         w = quaternion[j]
         norm = math.sqrt(float(w[0]) ** 2 + float(w[1]) ** 2 + float(w[2]) ** 2 + float(w[3]) ** 2)

@@ -1,201 +1,308 @@
-"""The loss of a fit as a value and explicit gradients, in memory that is taken once.
+"""The loss of a fit as a value and explicit gradients.
 
-A step calls `CloudObjective.begin`, `ImageTerm.add` for each image term, and `CloudObjective.finish`; then
-the parameters' gradient is that of the sum. The same loss through `render()` and autograd is the oracle of
-the tests.
+`CloudObjective.begin` returns a `LossStep` at the present parameters. `LossStep.add` evaluates an image term,
+`LossStep.finish` adds the scale regulariser and writes the gradient of the sum into the parameters. The tests compare
+it with the same loss through `render` and autograd.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.bias_basis import N_TERMS
 from g3r.acquisition.planes import Planes
 from g3r.fitting import kernels
-from g3r.fitting.parameters import FitParameters
+from g3r.fitting.kernels import PixelArrays
+from g3r.fitting.parameters import CLOUD_BLOCKS, FitParameters
+from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
 from g3r.gaussians.kernels import N_GRADIENTS, N_PLANE_GRADIENTS, SHAPE_COLUMNS, derive_shapes
 from g3r.gaussians.kernels_backward import shape_gradients
-from g3r.gaussians.overlap import OverlapFinder, OverlapList, Workspace
+from g3r.gaussians.overlap import OverlapFinder, OverlapList
 from g3r.gaussians.render import CUTOFF_SIGMA
+from g3r.geometry import RigidPose
 
-PAIR_MARGIN_SIGMA = 1.0
-"""Pair lists are built this much beyond the cut-off, and again before anything has moved by as much."""
-
-N_FIELD_TERMS = 5
-"""Coefficients of an intensity field (`bias_field`)."""
+OVERLAP_MARGIN_SIGMA = 1.0
+"""Overlap lists are made with a cut-off larger by this, and again before anything has moved by as much."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlaneState:
+    """K planes at one step of a fit.
+
+    Attributes:
+        rotation: [K, 3, 3].
+        center_mm: [K, 3] from the cloud's origin.
+        gain: [K] intensity factors.
+        slice_weight: [K].
+        coefficients: [K, 5] of the log-intensity fields.
+    """
+
+    rotation: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    slice_weight: NDArray[np.float64]
+    coefficients: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, planes: Planes, origin_mm: NDArray[np.float64]) -> PlaneState:
+        """Planes where they are, with gain and weight 1 and no field.
+
+        Args:
+            planes: K planes.
+            origin_mm: [3] of the cloud.
+        """
+        n = len(planes)
+        return cls(
+            rotation=planes.rotation,
+            center_mm=planes.center_mm - origin_mm,
+            gain=np.ones(n),
+            slice_weight=np.ones(n),
+            coefficients=np.zeros((n, N_TERMS), np.float32),
+        )
+
+    def pose(self, origin_mm: NDArray[np.float64]) -> RigidPose:
+        """World from plane, for a cloud with this origin [3]."""
+        return RigidPose(self.rotation, self.center_mm + origin_mm)
+
+    def moved_mm(self, then: PlaneState, reach_mm: float) -> float:
+        """Bound of how far any Gaussian has moved relative to a plane.
+
+        Args:
+            then: the same planes earlier.
+            reach_mm: largest distance of a Gaussian from the centre of a plane.
+        """
+        if self is then or not len(self.rotation):
+            return 0.0
+        shifted = np.linalg.norm(self.center_mm - then.center_mm, axis=1)
+        chord = np.linalg.norm(self.rotation - then.rotation, axis=(1, 2)) / np.sqrt(8)
+        angle = 2 * np.arcsin(np.minimum(chord, 1))
+        return float((shifted + angle * reach_mm).max())
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImageTerm:
-    """Mean weighted absolute difference of rendered planes and pixels, with the gradients of everything.
+    """Mean weighted absolute difference of rendered planes and pixels.
 
-    What `add` leaves in `residual` [K] (sums of weight |difference|), `plane_gradient` [K, 7] and
-    `field_gradient` [K, 5] is that of the last step. The attributes rotation, center_mm (from the cloud's
-    origin), gain, trust and coefficients [K, ...] may be set between steps; `moved_mm` bounds how far the
-    planes' pixels have moved since pairs were last sought.
-
-    Args:
+    Attributes:
         planes: K planes.
-        value: [P] their pixels.
-        weight: [P], not negative; zero leaves a pixel out.
-        origin_mm: of the cloud.
-        basis: [5, P] terms of the planes' log-intensity fields; None where there are none.
+        offset: [K] number of each plane's first pixel in `pixels`.
+        pixels: targets, weights and field terms, of more planes than these perhaps.
+        total_weight: [K] sum of the weights of each plane's pixels.
         with_pose: whether gradients of poses are wanted.
-        exact: the amplitude, as in `render`.
         cutoff_sigma: where a Gaussian ends.
     """
 
-    moved_mm = 0.0
+    planes: Planes
+    offset: NDArray[np.int64]
+    pixels: PixelArrays
+    total_weight: NDArray[np.float64]
+    with_pose: bool
+    cutoff_sigma: float
 
-    def __init__(
-        self,
+    @classmethod
+    def of(
+        cls,
         planes: Planes,
         value: NDArray[np.float32],
         weight: NDArray[np.float32],
-        origin_mm: NDArray[np.float64],
         *,
         basis: NDArray[np.float32] | None = None,
         with_pose: bool = False,
-        exact: bool = True,
         cutoff_sigma: float = CUTOFF_SIGMA,
-    ) -> None:
-        self.every, self.value, self.weight, self.origin_mm = planes, value, weight, origin_mm
-        self.with_pose, self.exact, self.cutoff_sigma = with_pose, exact, cutoff_sigma
-        self.basis = np.zeros((N_FIELD_TERMS, 0), np.float32) if basis is None else basis
-        self.weight_of_plane = np.add.reduceat(weight, planes.offset[:-1], dtype=np.float64)
-        self.finder: OverlapFinder | None = None
-        self.work: Workspace | None = None
-        self.choose(np.arange(len(planes)))
+    ) -> ImageTerm:
+        """The term of all pixels of some planes.
 
-    def choose(self, index: NDArray[np.integer]) -> None:
-        """Let only these planes count, where they stand at first; pairs must be sought again."""
-        n = len(index)
-        self.planes, self.offset = self.every.take(index), self.every.offset[index]
-        self.total = self.weight_of_plane[index]
-        self.rotation, self.center_mm = self.planes.rotation, self.planes.center_mm - self.origin_mm
-        self.gain, self.slice_weight = np.ones(n), np.ones(n)
-        self.coefficients = np.zeros((n, N_FIELD_TERMS), np.float32)
-        self.plane_gradient = np.zeros((n, N_PLANE_GRADIENTS))
-        self.field_gradient = np.zeros((n, N_FIELD_TERMS), np.float32)
-        self.residual = np.zeros(n)
-        self.pairs: OverlapList | None = None
-
-    @property
-    def min_psf_mm2(self) -> float:
-        """Least variance of the PSF in any direction."""
-        return float(self.planes.psf_var_mm2.min(initial=np.inf))
-
-    def find_overlaps(self, shapes: NDArray[np.float64]) -> None:
-        """Search the pairs of the present planes, with the margin."""
-        self.finder = self.finder or OverlapFinder(len(shapes))
-        cutoff = self.cutoff_sigma + PAIR_MARGIN_SIGMA
-        self.pairs = self.finder.find(shapes, self.planes, self.rotation, self.center_mm, cutoff)
-        if self.work is None or self.work.projections.shape[1] < self.pairs.most:
-            self.work = Workspace.of(self.every, self.pairs.most + self.pairs.most // 8)
-
-    def add(
-        self, shapes: NDArray[np.float64], amplitude: NDArray[np.float32], buffers: NDArray[np.float64], factor: float
-    ) -> float:
-        """The term, as a mean; adds factor times its gradient to the buffers of the Gaussians."""
-        assert self.pairs is not None, "begin first"
-        assert self.work is not None
-        total = max(float(self.slice_weight @ self.total), TINY)
-        planes = self.planes
-        kernels.image_l1(
-            shapes,
-            amplitude,
-            self.rotation,
-            self.center_mm,
-            self.gain,
-            planes.psf_var_mm2,
-            planes.shape,
-            planes.spacing_mm,
-            self.offset,
-            self.pairs.start,
-            self.pairs.gaussian,
-            self.cutoff_sigma**2,
-            self.exact,
-            self.work.images,
-            self.work.projections,
-            self.value,
-            self.weight,
-            self.slice_weight,
-            factor / total,
-            self.with_pose,
-            self.basis,
-            self.coefficients,
-            buffers,
-            self.plane_gradient,
-            self.field_gradient,
-            self.residual,
+        Args:
+            planes: K planes.
+            value: [P] their pixels.
+            weight: [P] not negative; a pixel of weight zero does not count.
+            basis: [5, P] terms of the planes' log-intensity fields; None without fields.
+            with_pose: whether gradients of poses are wanted.
+            cutoff_sigma: where a Gaussian ends.
+        """
+        pixels = PixelArrays(value, weight, np.zeros((N_TERMS, 0), np.float32) if basis is None else basis)
+        total = np.add.reduceat(weight, planes.offset[:-1], dtype=np.float64)
+        return cls(
+            planes=planes,
+            offset=planes.offset[:-1],
+            pixels=pixels,
+            total_weight=total,
+            with_pose=with_pose,
+            cutoff_sigma=cutoff_sigma,
         )
-        return float(self.slice_weight @ self.residual) / total
+
+    def take(self, index: NDArray[np.integer]) -> ImageTerm:
+        """The term of some of the planes."""
+        return ImageTerm(
+            planes=self.planes.take(index),
+            offset=self.offset[index],
+            pixels=self.pixels,
+            total_weight=self.total_weight[index],
+            with_pose=self.with_pose,
+            cutoff_sigma=self.cutoff_sigma,
+        )
+
+    def mean(self, residual: NDArray[np.float64], slice_weight: NDArray[np.float64]) -> float:
+        """The term from sums of weight |difference| [K] and slice weights [K]."""
+        return float(slice_weight @ residual) / self.scale(slice_weight)
+
+    def scale(self, slice_weight: NDArray[np.float64]) -> float:
+        """Sum of all weights, which the term is divided by."""
+        return max(float(slice_weight @ self.total_weight), TINY)
+
+
+Terms = Mapping[str, tuple[ImageTerm, PlaneState]]
+"""Image terms by name, each with the state of its planes."""
+
+
+@dataclass(frozen=True)
+class TermOverlaps:
+    """The overlap list of a term, the planes that it was made for, and scratch space for them."""
+
+    term: ImageTerm
+    state: PlaneState
+    pairs: OverlapList
+    work: Workspace
+
+
+@dataclass(frozen=True)
+class TermLoss:
+    """An image term, and its gradients times the factor that it was added with.
+
+    Attributes:
+        mean: the term.
+        residual: [K] sums of weight |difference|.
+        plane_gradient: [K, 7] of body-frame rotation (3), world translation (3) and log-gain.
+        field_gradient: [K, 5] of the fields' coefficients.
+    """
+
+    mean: float
+    residual: NDArray[np.float64]
+    plane_gradient: NDArray[np.float64]
+    field_gradient: NDArray[np.float32]
 
 
 class CloudObjective:
-    """What all terms of a loss share: derived shapes, gradient buffers, and when pairs are sought again.
+    """The loss over a cloud: derived shapes, gradient buffers, and when overlap lists are made again.
 
     Args:
-        parameters: whose gradient is made.
-        terms: all image terms.
-        scale_weight: of the scale regulariser, the mean squared logarithm of how far each sigma has gone from
-            where it is now; it keeps Gaussians that few pixels see from shrinking to needles or growing.
+        parameters: whose gradient is written.
+        scale_weight: of the scale regulariser, the mean squared logarithm of how far each sigma has gone from where it
+            is now; it keeps Gaussians that few pixels see from shrinking to needles or growing.
     """
 
-    def __init__(self, parameters: FitParameters, terms: list[ImageTerm], scale_weight: float) -> None:
+    def __init__(self, parameters: FitParameters, scale_weight: float) -> None:
         n = len(parameters)
-        self.parameters, self.terms, self.scale_weight = parameters, terms, scale_weight
+        self.parameters, self.scale_weight = parameters, scale_weight
         self.shapes = np.empty((n, SHAPE_COLUMNS))
         self.buffers = np.zeros((numba.get_num_threads(), n, N_GRADIENTS))
         self.seed_log_scale = parameters.value["log_scale"].copy()
-        self.then = np.zeros((n, 12))
+        self.overlaps: dict[str, TermOverlaps] = {}
         self.n_searches = 0
+        self._finders: dict[str, OverlapFinder] = {}
+        self._then = np.zeros((n, 12))
+        self._reach_mm = 0.0
 
     @property
     def _geometry(self) -> tuple[Any, ...]:
         value = self.parameters.value
         return value["mean_mm"], value["log_scale"], value["quaternion_wxyz"]
 
-    def begin(self) -> None:
-        """Derive the shapes of the present parameters; search pairs if any may have been missed by now."""
+    def begin(self, terms: Terms) -> LossStep:
+        """A step at the present parameters; overlap lists are made again if they may miss a Gaussian by now."""
         derive_shapes(*self._geometry, self.shapes)  # type: ignore[call-arg]
         self.buffers[:] = 0.0
-        if any(term.pairs is None for term in self.terms) or self._have_moved():
-            for term in self.terms:
-                term.find_overlaps(self.shapes)
-            kernels.remember(*self._geometry, self.then)  # type: ignore[call-arg]
+        known = self.overlaps
+        if any(name not in known or known[name].term is not terms[name][0] for name in terms) or self._moved(terms):
+            self.overlaps = {name: self._search(name, *terms[name]) for name in terms}
+            self._reach_mm = float(
+                np.linalg.norm(self.parameters.value["mean_mm"], axis=1).max(initial=0.0)
+                + max(np.linalg.norm(state.center_mm, axis=1).max(initial=0.0) for _, state in terms.values())
+            )
+            kernels.remember(*self._geometry, self._then)  # type: ignore[call-arg]
             self.n_searches += 1
+        return LossStep(self, terms)
 
-    def _have_moved(self) -> bool:
-        # the largest shift of any plane goes with the narrowest PSF of all: too early rather than too late
+    def _search(self, name: str, term: ImageTerm, state: PlaneState) -> TermOverlaps:
+        finder = self._finders.setdefault(name, OverlapFinder(len(self.shapes)))
+        cutoff = term.cutoff_sigma + OVERLAP_MARGIN_SIGMA
+        pairs = finder.find(self.shapes, term.planes, state.rotation, state.center_mm, cutoff)
+        return TermOverlaps(term, state, pairs, Workspace.of(term.planes, pairs.most))
+
+    def _moved(self, terms: Terms) -> bool:
+        # the largest movement of any plane goes with the narrowest PSF of all: too early rather than too late
         farthest = kernels.farthest_move(  # type: ignore[call-arg]
             *self._geometry,
-            self.then,
-            max(term.cutoff_sigma for term in self.terms),
-            max(term.moved_mm for term in self.terms),
-            min(term.min_psf_mm2 for term in self.terms),
+            self._then,
+            max(term.cutoff_sigma for term, _ in terms.values()),
+            max(state.moved_mm(self.overlaps[name].state, self._reach_mm) for name, (_, state) in terms.items()),
+            min(float(term.planes.psf_var_mm2.min(initial=np.inf)) for term, _ in terms.values()),
         )
-        return farthest > PAIR_MARGIN_SIGMA
+        return bool(farthest > OVERLAP_MARGIN_SIGMA)
 
-    def add(self, term: ImageTerm, factor: float) -> float:
-        """An image term (without the factor); its gradient times the factor goes into the sum."""
-        return term.add(self.shapes, self.parameters.value["amplitude"], self.buffers, factor)
+
+@dataclass(frozen=True)
+class LossStep:
+    """One evaluation of the loss; made by `CloudObjective.begin`, valid until the next."""
+
+    objective: CloudObjective
+    terms: Terms
+
+    def add(self, name: str, factor: float) -> TermLoss:
+        """An image term (without the factor); its gradient times the factor goes into the sum.
+
+        Args:
+            name: of the term.
+            factor: weight of the term in the loss.
+        """
+        (term, state), held = self.terms[name], self.objective.overlaps[name]
+        n = len(term.planes)
+        planes = PlaneArrays(
+            state.rotation,
+            state.center_mm,
+            state.gain,
+            term.planes.psf_var_mm2,
+            term.planes.shape,
+            term.planes.spacing_mm,
+            term.offset,
+        )
+        residual = np.zeros(n)
+        plane_gradient, field_gradient = np.zeros((n, N_PLANE_GRADIENTS)), np.zeros((n, N_TERMS), np.float32)
+        kernels.image_l1(
+            CloudArrays(self.objective.shapes, self.objective.parameters.value["amplitude"]),
+            planes,
+            held.pairs.arrays,
+            term.cutoff_sigma**2,
+            held.work,
+            term.pixels,
+            state.slice_weight,
+            state.coefficients,
+            factor / term.scale(state.slice_weight),
+            term.with_pose,
+            self.objective.buffers,
+            plane_gradient,
+            field_gradient,
+            residual,
+        )
+        return TermLoss(term.mean(residual, state.slice_weight), residual, plane_gradient, field_gradient)
 
     def finish(self) -> float:
         """The scale regulariser times its weight; writes the gradient of the sum of all terms."""
-        value, gradient = self.parameters.value, self.parameters.gradient
+        value, gradient = self.objective.parameters.value, self.objective.parameters.gradient
         shape_gradients(
             value["log_scale"],
             value["quaternion_wxyz"],
-            self.buffers,
-            gradient["amplitude"],
-            gradient["mean_mm"],
-            gradient["log_scale"],
-            gradient["quaternion_wxyz"],
+            self.objective.buffers,
+            *(gradient[name] for name in CLOUD_BLOCKS),
         )
-        share = self.scale_weight / max(1, value["log_scale"].size)
-        return share * kernels.scale_penalty(value["log_scale"], self.seed_log_scale, share, gradient["log_scale"])
+        share = self.objective.scale_weight / max(1, value["log_scale"].size)
+        seed = self.objective.seed_log_scale
+        return share * kernels.scale_penalty(value["log_scale"], seed, share, gradient["log_scale"])

@@ -17,15 +17,28 @@ from g3r.gaussians import GaussianCloud
 BETA_1, BETA_2 = 0.9, 0.99
 """Decay of Adam's means of gradients and of their squares."""
 
+CLOUD_BLOCKS = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
+"""Names of the cloud's own blocks, in the order of `GaussianCloud.parameters`."""
+
+Block = tuple[NDArray[np.floating], float]
+"""Start values and step size of a block of parameters."""
+
 NOT_FINITE = "the loss of the fit is not finite; lower the step sizes or check the intensities"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LearningRates:
     """Adam step sizes: about the largest change of a parameter in one step.
 
-    mean_share is relative to a Gaussian's own seed sigma and amplitude_share to the mean absolute amplitude, so that
-    neither depends on the spacing of the seeds or the intensities. Turns are in rad, shifts in mm.
+    Attributes:
+        mean_share: of the centres, over the mean sigma of the seeds, so that their spacing does not matter.
+        log_scale: of the log-scales.
+        quaternion: of the quaternions.
+        amplitude_share: over the mean absolute amplitude, so that intensities do not matter.
+        log_gain: of the slices' log-gains.
+        bias_field: of the coefficients of the stacks' log-fields.
+        rotation_rad: of the slices' rotation vectors.
+        translation_mm: of the slices' translations.
     """
 
     mean_share: float = 0.04
@@ -51,20 +64,14 @@ class FitParameters:
         further: start values and step size of other blocks, by name.
     """
 
-    def __init__(
-        self,
-        cloud: GaussianCloud,
-        rates: LearningRates,
-        further: Mapping[str, tuple[NDArray[np.floating], float]] | None = None,
-    ) -> None:
+    def __init__(self, cloud: GaussianCloud, rates: LearningRates, further: Mapping[str, Block] | None = None) -> None:
         self.origin_mm = cloud.origin_mm
         sigma = float(cloud.log_scale.mean().exp()) if len(cloud) else 1.0
         height = float(cloud.amplitude.abs().mean()) if len(cloud) else 1.0
-        names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         steps = (rates.mean_share * sigma, rates.log_scale, rates.quaternion, rates.amplitude_share * height)
         start = {
             name: (tensor.detach().numpy(), step)
-            for name, tensor, step in zip(names, cloud.parameters, steps, strict=True)
+            for name, tensor, step in zip(CLOUD_BLOCKS, cloud.parameters, steps, strict=True)
         } | dict(further or {})
         n = sum(array.size for array, _ in start.values())
         self._buffers = np.zeros((4, n), np.float32)  # values, gradients, Adam's means
@@ -107,8 +114,7 @@ class FitParameters:
         Raises:
             NumericalError: it has left the numbers that a cloud may have.
         """
-        names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
-        copies = [torch.from_numpy(self.value[name].copy()) for name in names]
+        copies = [torch.from_numpy(self.value[name].copy()) for name in CLOUD_BLOCKS]
         try:
             return GaussianCloud.of(copies, self.origin_mm)
         except ValueError as error:
@@ -131,6 +137,7 @@ class FitParameters:
         n_bad = 0
         for block, step in self._blocks:
             arrays = [buffer[block] for buffer in self._buffers]
-            n_bad += kernels.adam(*arrays, step * factor, BETA_1, BETA_2, correction, root)  # type: ignore[call-arg]
+            rate = kernels.AdamRate(step * factor, BETA_1, BETA_2, correction, root)
+            n_bad += kernels.adam(*arrays, rate)  # type: ignore[call-arg]
         if n_bad:
             raise NumericalError(NOT_FINITE)

@@ -11,37 +11,40 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import bounding_box
 from g3r.run.deadline import Deadline, timed_steps
+
+PLANE_SHARE = 0.34
+"""Share of the volume's planes in a step: a third of the work, and every plane is drawn several times in a fit."""
+
+STEPS_PER_DRAW = 10
+"""Steps between two draws of a volume's planes; each draw needs new overlap lists."""
 
 NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PriorStageSettings:
     """How stage 1 runs.
 
     Args:
         n_steps: optimiser steps after the amplitudes are solved for.
         amplitude_iterations: conjugate-gradient steps for the amplitudes.
-        plane_share: share of the volume's planes in a step.
         scale_weight: weight of the scale regulariser.
-        steps_per_draw: steps between two draws of the planes.
         cutoff_sigma: where a Gaussian ends.
         projection_bytes: see `solve_amplitudes`; less memory, more seconds, the same result.
     """
 
     n_steps: int = 30
     amplitude_iterations: int = 12
-    plane_share: float = 0.34
     scale_weight: float = 0.01
-    steps_per_draw: int = 10
     cutoff_sigma: float = CUTOFF_SIGMA
     projection_bytes: int = MAX_PROJECTION_BYTES
 
@@ -59,7 +62,10 @@ class PriorCloud:
 class VolumeTarget:
     """A volume as planes with pixels: what stage 1 fits and what stage 2 is distilled towards.
 
-    planes [K] cover the bounding box of the mask; value [P] and weight [P] are the volume and its trust.
+    Attributes:
+        planes: [K] of the bounding box of positive weight.
+        value: [P] the volume.
+        weight: [P] not negative.
     """
 
     planes: Planes
@@ -68,24 +74,25 @@ class VolumeTarget:
 
     @classmethod
     def of(cls, volume: NDArray[np.float32], weight: NDArray[np.float32], grid: VolumeGrid) -> VolumeTarget:
-        """Planes of a volume [I, J, K], cropped to where the weight [I, J, K] is positive.
+        """Planes of a volume, cropped to where the weight is positive.
+
+        Args:
+            volume: [I, J, K].
+            weight: [I, J, K].
+            grid: of both.
 
         Raises:
             ValueError: the weight is zero everywhere.
         """
-        inside = np.argwhere(weight > 0)
-        if not len(inside):
+        inside = weight > 0
+        if not inside.any():
             raise ValueError("the weight is zero everywhere")
-        low, high = inside.min(0), inside.max(0) + 1
-        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        affine = grid.affine.copy()
-        affine[:3, 3] = grid.world(low)
-        cropped = VolumeGrid(tuple(high - low), affine)
+        box = bounding_box(inside)
 
         def pixels(array: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.ascontiguousarray(array[box].transpose(2, 0, 1)).ravel().astype(np.float32)
 
-        return cls(volume_planes(cropped), pixels(volume), pixels(weight))
+        return cls(volume_planes(grid.cropped(box)), pixels(volume), pixels(weight))
 
     def take(self, index: NDArray[np.integer]) -> VolumeTarget:
         """Some of the planes with their pixels."""
@@ -99,14 +106,22 @@ def fit_prior(
     target: VolumeTarget,
     settings: PriorStageSettings,
     rng: np.random.Generator,
+    *,
     progress: Callable[[int, int], None] = NO_PROGRESS,
     deadline: Deadline | None = None,
 ) -> tuple[GaussianCloud, list[float]]:
-    """Fit a seeded cloud to the prior volume.
+    """Fit a seeded cloud to the prior volume (G3R Eq. 8).
 
-    Amplitudes first, by least squares on every second plane; then Adam on everything with the L1 loss on random
-    planes and the scale regulariser; fewer steps if they would end after the deadline. A loss that rises is
-    answered by going back to the best state with shorter steps (`DivergenceGuard`).
+    Amplitudes first, by least squares on every second plane; then Adam on everything with the L1 loss on random planes
+    and the scale regulariser. A loss that rises is answered by a rollback with shorter steps (`DivergenceGuard`).
+
+    Args:
+        cloud: seeded Gaussians.
+        target: the prior volume.
+        settings: how long.
+        rng: draws the planes of each step.
+        progress: called with (steps done, steps in all).
+        deadline: fewer steps if they would end after it.
 
     Returns:
         The fitted cloud, and the image loss of each step.
@@ -116,18 +131,19 @@ def fit_prior(
         cloud, every_second, settings.amplitude_iterations, settings.cutoff_sigma, settings.projection_bytes
     )
     parameters = FitParameters(cloud, LearningRates())
-    term = ImageTerm(target.planes, target.value, target.weight, cloud.origin_mm, cutoff_sigma=settings.cutoff_sigma)
-    objective = CloudObjective(parameters, [term], settings.scale_weight)
+    whole = ImageTerm.of(target.planes, target.value, target.weight, cutoff_sigma=settings.cutoff_sigma)
+    objective = CloudObjective(parameters, settings.scale_weight)
     guard = DivergenceGuard(parameters, float(np.average(np.abs(target.value), weights=target.weight)))
     history = []
-    n_planes = max(1, round(settings.plane_share * len(target.planes)))
+    n_planes = max(1, round(PLANE_SHARE * len(target.planes)))
     for step, fraction in timed_steps(settings.n_steps, deadline):
         progress(step, settings.n_steps)
-        if step % settings.steps_per_draw == 0:
-            term.choose(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
-        objective.begin()
-        image = objective.add(term, 1.0)
-        guard.step(image + objective.finish(), cosine_decay(fraction))
+        if step % STEPS_PER_DRAW == 0:
+            term = whole.take(np.sort(rng.choice(len(target.planes), n_planes, replace=False)))
+            terms = {"prior": (term, PlaneState.of(term.planes, cloud.origin_mm))}
+        loss = objective.begin(terms)
+        image = loss.add("prior", 1.0).mean
+        guard.step(image + loss.finish(), cosine_decay(fraction))
         history.append(image)
     progress(settings.n_steps, settings.n_steps)
     guard.finish()
@@ -141,7 +157,15 @@ def solve_amplitudes_on(
     cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> GaussianCloud:
-    """Amplitudes of a cloud by least squares on the planes of a volume."""
+    """The cloud with amplitudes by least squares on the planes of a volume; see `solve_amplitudes`.
+
+    Args:
+        cloud: shapes, and the amplitudes to start from.
+        target: the volume.
+        n_iterations: largest number of conjugate-gradient steps.
+        cutoff_sigma: where a Gaussian ends.
+        projection_bytes: memory for projections.
+    """
     return solve_amplitudes(
         cloud,
         target.planes,

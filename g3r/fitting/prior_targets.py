@@ -19,6 +19,7 @@ MIN_DISTILLATION = 1e-3
 
 def fit_to_prior(
     prior: PriorVolume,
+    *,
     spacing_mm: float,
     adaptive: AdaptiveSettings | None,
     stage: PriorStageSettings,
@@ -40,14 +41,22 @@ def fit_to_prior(
     volumes, values = prior.volumes, prior.values
     if adaptive is not None:
         cloud, found = fit_adaptive(
-            values, volumes.mask, volumes.grid, spacing_mm, adaptive, stage, rng, progress, deadline
+            values,
+            volumes.mask,
+            volumes.grid,
+            finest_spacing_mm=spacing_mm,
+            settings=adaptive,
+            stage=stage,
+            rng=rng,
+            progress=progress,
+            deadline=deadline,
         )
         counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
         return PriorCloud(cloud, found.loss, counts)
     cloud = seed_cloud(values, volumes.mask, volumes.grid, spacing_mm)
     counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
     target = VolumeTarget.of(values, volumes.mask.astype(np.float32), volumes.grid)
-    cloud, history = fit_prior(cloud, target, stage, rng, progress, deadline)
+    cloud, history = fit_prior(cloud, target, stage, rng, progress=progress, deadline=deadline)
     return PriorCloud(cloud, history, counts)
 
 

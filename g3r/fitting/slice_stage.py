@@ -4,50 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.bias_field import N_TERMS, StackBiasField
+from g3r.acquisition.robust import slice_weights
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.objective import CloudObjective, ImageTerm
-from g3r.fitting.observer import FitObserver
+from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState, TermLoss
 from g3r.fitting.parameters import FitParameters, LearningRates
-from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
+from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
-from g3r.fitting.slice_term import SliceTerm
+from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
+from g3r.geometry import RigidPose
 from g3r.run.deadline import Deadline, timed_steps
 
 MAX_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""
 
+AMPLITUDE_DAMPING = 0.05
+"""Pull of the amplitudes, solved for at the start, towards those of stage 1 (relative): slices alone leave the
+amplitudes of Gaussians between them undetermined."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class SliceStageSettings:
     """How stage 2 runs.
 
     Args:
         n_steps: optimiser steps.
-        amplitude_iterations: conjugate-gradient steps for the amplitudes at the start; 0 leaves them as stage 1 did.
-        amplitude_damping: pull of those towards the prior's amplitudes (relative).
+        amplitude_iterations: conjugate-gradient steps for the amplitudes at the start; 0 keeps those of stage 1.
         scale_weight: weight of the scale regulariser.
         distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
-        prior_error: mean absolute error of the prior, in normalised intensities (0.054 from one, 0.043 from
-            three stacks on the validation subjects of the shipped weights); see `prior_strength`. 0 leaves
-            the strength to the schedule.
+        prior_error: mean absolute error of the prior, in normalised intensities (0.054 from one, 0.043 from three
+            stacks on the validation subjects of the shipped weights); see `prior_strength`. With 0 the schedule
+            alone decides.
         distillation_planes: share of the prior's planes in a step (random).
         optimise_poses: whether slices move.
-        pose_prior_mm: a slice that moves this far from where registration left it pays as much as a change of
-            the mean residual by its own size would; keeps slices put that the data say nothing about.
-        reweight_every: steps between two estimates of the trust in slices.
-        steps_per_draw: steps between two draws of the prior's planes.
+        pose_prior_mm: movement from the registered pose at which the pose prior of a slice equals the mean residual;
+            holds slices of which the data say nothing.
+        reweight_every: steps between two estimates of the slice weights.
         optimise_bias_field: whether stacks have a smooth intensity field each (two stacks or more).
         bias_field_ridge: weight of the mean squared coefficient of the fields.
-        attenuation: "exact", or "printed" for comparison.
         cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
         projection_bytes: see `solve_amplitudes`; less memory, more seconds, the same result.
         rates: step sizes.
@@ -55,7 +58,6 @@ class SliceStageSettings:
 
     n_steps: int = 100
     amplitude_iterations: int = 6
-    amplitude_damping: float = 0.05
     scale_weight: float = 0.02
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.2, 0.02))
     prior_error: float = 0.05
@@ -63,22 +65,24 @@ class SliceStageSettings:
     optimise_poses: bool = True
     pose_prior_mm: float = 10.0
     reweight_every: int = 20
-    steps_per_draw: int = 10
     optimise_bias_field: bool = True
     bias_field_ridge: float = 0.005
-    attenuation: str = "exact"
     cutoff_sigma: float = CUTOFF_SIGMA
     projection_bytes: int = MAX_PROJECTION_BYTES
     rates: LearningRates = field(default_factory=LearningRates)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SliceFit:
     """Result of stage 2.
 
-    cloud; slices in their last poses; gain [K], weight [K]; loss of each step, marked `rollback` where the
-    loss had risen and the step was back to the best state (`DivergenceGuard`); coefficients of each stack's shading
-    (see `StackBiasField`; empty where it was not estimated).
+    Attributes:
+        cloud: the Gaussians.
+        slices: in their last poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        history: terms of the loss of each step, with `rollback` where the divergence guard went back.
+        bias_field: [n_stacks][5] coefficients (see `StackBiasField`); empty where it was not estimated.
     """
 
     cloud: GaussianCloud
@@ -89,9 +93,26 @@ class SliceFit:
     bias_field: list[list[float]]
 
 
+class FitObserver(Protocol):
+    """Watches a fit from outside."""
+
+    every: int
+    """Steps between two calls; the last step always has one."""
+
+    def __call__(self, step: int, cloud: GaussianCloud, pose: RigidPose) -> None:
+        """Called during the fit.
+
+        Args:
+            step: number of steps done.
+            cloud: detached, as it is at the moment.
+            pose: [K] of the slices at the moment.
+        """
+
+
 def fit_slices(
     cloud: GaussianCloud,
     slices: Slices,
+    *,
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
     prior: VolumeTarget | None,
@@ -101,20 +122,20 @@ def fit_slices(
     deadline: Deadline | None = None,
     observer: FitObserver | None = None,
 ) -> SliceFit:
-    """Refine a cloud against slices.
+    """Refine a cloud against slices (G3R Eq. 9).
 
     Args:
         cloud: from stage 1.
-        slices: intensities of order one, poses from registration.
+        slices: K slices, intensities of order one, poses from registration.
         gain: [K] intensity factor of each slice, from registration.
-        weight: [K] trust in each slice, from registration.
-        prior: what to stay near to, with a weight from 0 (measured) to 1 (not measured) for each voxel; None
-            leaves the term out.
+        weight: [K] slice weights, from registration.
+        prior: target of the distillation, with a weight from 0 (measured) to 1 (not measured) for each voxel; None
+            without distillation.
         settings: how long and how hard.
         rng: draws the prior's planes.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it; schedules run to their ends even so.
-        observer: sees the cloud as the fit goes on; None for nobody.
+        observer: sees the cloud during the fit.
 
     Raises:
         NumericalError: a loss that is not finite from the start.
@@ -128,20 +149,28 @@ def fit_slices(
             slices.mask * slice_weight[slices.planes.plane_id()],
             gain=gain,
             n_iterations=settings.amplitude_iterations,
-            damping=settings.amplitude_damping,
-            attenuation=settings.attenuation,
+            damping=AMPLITUDE_DAMPING,
             cutoff_sigma=settings.cutoff_sigma,
             projection_bytes=settings.projection_bytes,
         )
-    several = slices.n_stacks > 1  # one stack cannot tell its shading from anatomy
+    several = slices.n_stacks > 1  # one stack cannot tell its bias field from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
-    parameters = FitParameters(cloud, settings.rates, _blocks(slices, gain, bias_field, settings))
-    loss = SliceLoss(parameters, slices, gain, slice_weight.astype(np.float64), bias_field, prior, settings)
+    blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses)
+    parameters = FitParameters(cloud, settings.rates, blocks)
+    loss = SliceLoss(
+        parameters,
+        slices,
+        gain=gain,
+        slice_weight=slice_weight.astype(np.float64),
+        bias_field=bias_field,
+        prior=prior,
+        settings=settings,
+    )
     guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
     for step, fraction in timed_steps(settings.n_steps, deadline):
         progress(step, settings.n_steps)
-        if step % settings.steps_per_draw == 0:
+        if step % STEPS_PER_DRAW == 0:
             loss.draw(rng)
         value, entry = loss.evaluate(fraction)
         if not guard.step(value, cosine_decay(fraction)):
@@ -150,32 +179,30 @@ def fit_slices(
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
         if observer and ((step + 1) % observer.every == 0 or step + 1 == settings.n_steps):
-            loss.term.update()
-            observer(step + 1, parameters.cloud(), loss.term.moved_planes().pose)
+            observer(step + 1, parameters.cloud(), loss.state().pose(cloud.origin_mm))
     progress(settings.n_steps, settings.n_steps)
     guard.finish()
-    term = loss.term
-    term.update()
+    state = loss.state()
     return SliceFit(
-        parameters.cloud(),
-        slices.with_pose(term.moved_planes().pose),
-        term.gain,
-        term.slice_weight,
-        history,
-        parameters.value["shading"].astype(float).tolist() if bias_field else [],
+        cloud=parameters.cloud(),
+        slices=slices.with_pose(state.pose(cloud.origin_mm)),
+        gain=state.gain,
+        weight=state.slice_weight,
+        history=history,
+        bias_field=parameters.value["bias_field"].astype(float).tolist() if bias_field else [],
     )
 
 
 class SliceLoss:
-    """The loss of stage 2 with all its terms; its gradient is written into the parameters.
+    """The loss of stage 2 with all its terms (G3R Eq. 9); its gradient is written into the parameters.
 
-    L = L1(slices) + lambda R_scale + w(i) L1(prior), and the terms that hold poses and fields (`SliceTerm`).
+    L = L1(slices) + lambda R_scale + w(i) L1(prior), and the terms of poses and fields alone (`SliceParameters`).
 
     Args:
         parameters: with the blocks that are fitted along.
         slices: K slices.
         gain: [K] where no block holds it.
-        slice_weight: [K] in each slice.
+        slice_weight: [K].
         bias_field: fields of the stacks, or None.
         prior: distillation target, or None.
         settings: weights of the terms.
@@ -185,76 +212,79 @@ class SliceLoss:
         self,
         parameters: FitParameters,
         slices: Slices,
+        *,
         gain: NDArray[np.float64],
         slice_weight: NDArray[np.float64],
         bias_field: StackBiasField | None,
         prior: VolumeTarget | None,
         settings: SliceStageSettings,
     ) -> None:
-        self.settings = settings
-        self.term = SliceTerm(
-            slices, gain, slice_weight, parameters, bias_field, settings.attenuation == "exact", settings.cutoff_sigma
+        self.settings, self.slice_weight = settings, slice_weight
+        self.origin_mm = parameters.origin_mm
+        self.unknowns = SliceParameters(slices, gain, parameters)
+        self.term = ImageTerm.of(
+            slices.planes,
+            slices.value,
+            slices.mask.astype(np.float32),
+            basis=bias_field.basis if bias_field else None,
+            with_pose=self.unknowns.with_pose,
+            cutoff_sigma=settings.cutoff_sigma,
         )
         self.level = float(np.abs(slices.masked_value).mean()) if len(slices.masked_value) else 0.0
-        self.distilled: ImageTerm | None = None
-        terms: list[ImageTerm] = [self.term]
+        self.objective = CloudObjective(parameters, settings.scale_weight)
+        self.last: TermLoss | None = None
+        self.prior: ImageTerm | None = None
         if prior is not None:
-            self.distilled = ImageTerm(
-                prior.planes, prior.value, prior.weight, parameters.origin_mm, cutoff_sigma=settings.cutoff_sigma
-            )
-            # the distance is a mean over the prior's trust, so this makes the term the mean over the head of
-            # trust times difference: well-measured heads feel little of it, sparsely measured ones much
+            self.prior = ImageTerm.of(prior.planes, prior.value, prior.weight, cutoff_sigma=settings.cutoff_sigma)
+            # the distance is a weighted mean, so this makes the term the mean over the head of weight times
+            # difference: well-measured heads feel little of it, sparsely measured ones much
             self.prior_share = float(prior.weight[prior.weight > 0].mean())
-            terms.append(self.distilled)
-        self.objective = CloudObjective(parameters, terms, settings.scale_weight)
+            self._distil(self.prior)
+
+    def _distil(self, term: ImageTerm) -> None:
+        self.distilled, self.distilled_state = term, PlaneState.of(term.planes, self.origin_mm)
 
     def draw(self, rng: np.random.Generator) -> None:
-        """Let other planes of the prior count, at random."""
-        if self.distilled is not None:
-            n = len(self.distilled.every)
+        """Take other planes of the prior, at random."""
+        if self.prior is not None:
+            n = len(self.prior.planes)
             n_planes = max(1, round(self.settings.distillation_planes * n))
-            self.distilled.choose(np.sort(rng.choice(n, n_planes, replace=False)))
+            self._distil(self.prior.take(np.sort(rng.choice(n, n_planes, replace=False))))
+
+    def state(self) -> PlaneState:
+        """The slices at the present parameters."""
+        return self.unknowns.state(self.slice_weight)
 
     def evaluate(self, fraction: float) -> tuple[float, dict[str, float]]:
         """The loss at the present parameters and a fraction of the fit, and its terms by name."""
-        settings = self.settings
-        self.term.update()
-        self.objective.begin()
-        image = self.objective.add(self.term, 1.0)
-        loss, entry = image, {"image": image}
-        strength = prior_strength(settings, fraction, image)
-        if self.distilled is not None and strength > 0:
-            distance = self.objective.add(self.distilled, strength * self.prior_share)
+        settings, terms = self.settings, {"slices": (self.term, self.state())}
+        if self.prior is not None:
+            terms["prior"] = self.distilled, self.distilled_state
+        step = self.objective.begin(terms)
+        slices = step.add("slices", 1.0)
+        loss, entry = slices.mean, {"image": slices.mean}
+        strength = prior_strength(settings, fraction, slices.mean)
+        if self.prior is not None and strength > 0:
+            distance = step.add("prior", strength * self.prior_share).mean
             loss += strength * self.prior_share * distance
             entry |= {"distillation": distance, "distillation_weight": strength}
-        loss += self.objective.finish()
-        loss += self.term.finish(image, settings.pose_prior_mm, settings.bias_field_ridge)
+        loss += step.finish()
+        loss += self.unknowns.finish(slices, settings.pose_prior_mm, settings.bias_field_ridge)
+        self.last = slices
         return loss, entry
 
     def reweight(self) -> float:
-        """Trust the slices by how they fitted last; returns what the image term is, over what it was."""
-        before = self.term.mean_residual
-        self.term.reweight()
-        return self.term.mean_residual / before if before > 0 else 1.0
-
-
-def _blocks(
-    slices: Slices, gain: NDArray[np.float64], bias_field: StackBiasField | None, settings: SliceStageSettings
-) -> dict[str, tuple[NDArray[np.floating], float]]:
-    """What is fitted along with the cloud: start values and step sizes."""
-    n, rates = len(slices), settings.rates
-    blocks: dict[str, tuple[NDArray[np.floating], float]] = {}
-    if settings.optimise_poses:
-        blocks |= {"turn": (np.zeros((n, 3)), rates.rotation_rad), "shift": (np.zeros((n, 3)), rates.translation_mm)}
-    if n > 1:  # the gain of a single slice cannot be told from the amplitudes
-        blocks["log_gain"] = (np.log(gain), rates.log_gain)
-    if bias_field:
-        blocks["shading"] = (np.zeros((len(bias_field.stacks), N_TERMS)), rates.bias_field)
-    return blocks
+        """Slice weights from the residuals of the last evaluation; returns the image term over what it was."""
+        assert self.last is not None, "nothing was evaluated yet"
+        residual = self.last.residual
+        before = self.term.mean(residual, self.slice_weight)
+        typical = residual / np.maximum(self.term.total_weight, 1)
+        self.slice_weight = slice_weights(typical).astype(np.float32).astype(np.float64)
+        return self.term.mean(residual, self.slice_weight) / before if before > 0 else 1.0
 
 
 def prior_strength(settings: SliceStageSettings, fraction: float, residual: float) -> float:
-    """w(i): annealed as in G3R, but not below what the slices' residual and the prior's error ask for.
+    """w(i) of G3R Eq. 9: annealed as there, but not below what the slices' residual and the prior's error ask for.
 
     A voxel with confidence c counts as if 1 - c missing pixels had been read off the prior. Under L1 (Laplace
     distributions) a pixel weighs one over its mean absolute error, so one read off the prior weighs

@@ -9,91 +9,79 @@ import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes
-from g3r.gaussians import kernels
-from g3r.gaussians import kernels_amplitudes as kernels_amplitudes
+from g3r.gaussians import kernels_amplitudes as kernels
+from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.overlap import CloudArrays, OverlapList, Workspace, find_overlaps
-from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
+from g3r.gaussians.kernels import PROJECTION
+from g3r.gaussians.kernels_amplitudes import HeldProjections
+from g3r.gaussians.overlap import OverlapList, find_overlaps
+from g3r.gaussians.render import CUTOFF_SIGMA
 
 MAX_PROJECTION_BYTES = 400_000_000
-"""Pairs are set up once and kept for all products if their records take no more than this."""
+"""Gaussians are projected once for all products if the projections take no more than this."""
 
 
 class AmplitudeSystem:
-    """The linear map from amplitudes [N] to pixels [P] and its exact adjoint (CPU)."""
+    """The linear map A from amplitudes [N] to pixels [P] and its exact adjoint (CPU).
+
+    Args:
+        cloud: its shapes; its amplitudes are not read.
+        planes: K planes.
+        gain: [K] intensity factors; 1 when None.
+        pairs: list from `find_overlaps`; made here when None.
+        cutoff_sigma: where a Gaussian ends.
+        projection_bytes: memory for projections; with less than they need they are made again in every product.
+    """
 
     def __init__(
         self,
         cloud: GaussianCloud,
         planes: Planes,
-        gain: NDArray[np.floating] | None,
-        pairs: OverlapList,
-        cutoff_sigma: float,
-        exact: bool,
-        projection_bytes: int = MAX_PROJECTION_BYTES,
-    ) -> None:
-        self.n_gaussians, self.n_pixels = len(cloud), planes.n_pixels
-        self.cut, self.exact = cutoff_sigma**2, exact
-        factor = np.asarray(np.ones(len(planes)) if gain is None else gain, dtype=np.float64)
-        self.shapes = CloudArrays.of(cloud).shapes
-        self.described = plane_arguments(planes, planes.center_mm - cloud.origin_mm, factor, pairs)
-        self.layout = (planes.shape, planes.offset, pairs.start)
-        self.parts = _parts(pairs.start, projection_bytes // kernels.PAIR.itemsize)
-        longest = max((int(pairs.start[b] - pairs.start[a]) for a, b in self.parts), default=0)
-        self.projections = np.zeros(longest, kernels.PAIR)
-        self.count = np.zeros(len(planes), np.int64)
-        self.images = Workspace.of(planes, 0).images
-        self.is_set_up = False
-
-    @classmethod
-    def of(
-        cls,
-        cloud: GaussianCloud,
-        planes: Planes,
+        *,
         gain: NDArray[np.floating] | None = None,
         pairs: OverlapList | None = None,
         cutoff_sigma: float = CUTOFF_SIGMA,
-        attenuation: str = "exact",
         projection_bytes: int = MAX_PROJECTION_BYTES,
-    ) -> AmplitudeSystem:
-        """The system for the shapes of a cloud (its amplitudes are not read)."""
-        if pairs is None:
-            pairs = find_overlaps(cloud, planes, cutoff_sigma)
-        return cls(cloud, planes, gain, pairs, cutoff_sigma, attenuation == "exact", projection_bytes)
+    ) -> None:
+        pairs = find_overlaps(cloud, planes, cutoff_sigma) if pairs is None else pairs
+        self.n_gaussians, self.n_pixels = len(cloud), planes.n_pixels
+        self.cut = cutoff_sigma**2
+        self.shapes = CloudArrays.of(cloud).shapes
+        self.planes, self.overlaps = PlaneArrays.of(planes, cloud.origin_mm, gain), pairs.arrays
+        self.parts = _parts(pairs.start, projection_bytes // PROJECTION.itemsize)
+        longest = max((int(pairs.start[b] - pairs.start[a]) for a, b in self.parts), default=0)
+        self.held = HeldProjections(pairs.start, np.zeros(longest, PROJECTION), np.zeros(len(planes), np.int64))
+        self.images = Workspace.of(planes, 0).images
+        self.is_set_up = False
 
     def _set_up_parts(self) -> Iterator[tuple[int, int]]:
-        """Ranges of planes, each with its records in place; one range of all where they can be kept."""
-        for first, last in self.parts:
+        """Ranges of planes whose projections are held while each is yielded."""
+        for part in self.parts:
             if not self.is_set_up:
-                kernels_amplitudes.set_up(  # type: ignore[call-arg]
-                    first, last, self.shapes, *self.described, self.cut, self.exact, self.projections, self.count
-                )
-            yield first, last
+                _, projections, n_touching = self.held
+                kernels.set_up(part, self.shapes, self.planes, self.overlaps, self.cut, projections, n_touching)
+            yield part
         self.is_set_up = len(self.parts) == 1
 
     def forward(self, amplitude: NDArray[np.floating]) -> NDArray[np.float32]:
         """Pixels [P] of amplitudes [N]."""
         out = np.empty(self.n_pixels, np.float32)
         single = amplitude.astype(np.float32)
-        for first, last in self._set_up_parts():
-            kernels_amplitudes.apply(
-                first, last, single, *self.layout, self.cut, self.projections, self.count, self.images, out
-            )
+        for part in self._set_up_parts():
+            kernels.apply(part, single, self.planes, self.cut, self.held, self.images, out)
         return out
 
     def adjoint(self, pixels: NDArray[np.float32]) -> NDArray[np.float64]:
         """A^T of pixels [P], as [N] float64."""
         buffers = np.zeros((len(self.images), self.n_gaussians))
         weight = np.ascontiguousarray(pixels, dtype=np.float32)
-        for first, last in self._set_up_parts():
-            kernels_amplitudes.apply_adjoint(
-                first, last, weight, *self.layout, self.cut, self.projections, self.count, self.images, buffers
-            )
+        for part in self._set_up_parts():
+            kernels.apply_adjoint(part, weight, self.planes, self.cut, self.held, self.images, buffers)
         return buffers.sum(0)
 
 
 def _parts(start: NDArray[np.int64], max_pairs: int) -> list[tuple[int, int]]:
-    """Ranges of planes with at most so many pairs each (or one plane)."""
+    """Ranges of planes (first, one past the last) with at most `max_pairs` pairs each, or of one plane."""
     parts, first = [], 0
     while first < len(start) - 1:
         last = int(np.searchsorted(start, start[first] + max_pairs, side="right")) - 1
@@ -114,7 +102,6 @@ def solve_amplitudes(
     damping: float = 1e-3,
     pairs: OverlapList | None = None,
     cutoff_sigma: float = CUTOFF_SIGMA,
-    attenuation: str = "exact",
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> GaussianCloud:
     """The cloud with the amplitudes that minimise sum_p weight_p (A c - target)_p^2 + damping d ||c - c_0||^2.
@@ -128,16 +115,17 @@ def solve_amplitudes(
         target: [P] pixels.
         weight: [P] non-negative; zero leaves a pixel out.
         gain: [K] intensity factor of each plane.
-        n_iterations: at most so many products with A and A^T.
+        n_iterations: largest number of products with A and A^T.
         damping: relative; above zero keeps Gaussians that no pixel sees where they were.
         pairs: list from `find_overlaps`.
         cutoff_sigma: as in `render`.
-        attenuation: as in `render`.
-        projection_bytes: pairs are set up once if that takes no more memory, else again in every product.
+        projection_bytes: see `AmplitudeSystem`; less memory, more seconds, the same result.
 
     Source: Hestenes and Stiefel (1952), in the CGLS order of operations (Bjoerck 1996, 7.4.1).
     """
-    system = AmplitudeSystem.of(cloud, planes, gain, pairs, cutoff_sigma, attenuation, projection_bytes)
+    system = AmplitudeSystem(
+        cloud, planes, gain=gain, pairs=pairs, cutoff_sigma=cutoff_sigma, projection_bytes=projection_bytes
+    )
     start = cloud.amplitude.detach().double().numpy()
     residual = target.astype(np.float64) - system.forward(start)
     row_sum = system.adjoint(weight * system.forward(np.ones(len(cloud), np.float32)))

@@ -1,9 +1,12 @@
-"""Numba kernels of the renderer: shapes, set-up of (Gaussian, plane) pairs, forward.
+"""Numba kernels of the renderer, forward: shapes, projection of Gaussians onto planes, pixels (G3R Eq. 3-5).
 
-Mathematics and names as in docs/method.md, "The renderer". The set-up of a pair is float64 (a nearly flat
-Gaussian has a condition number of 1e6, beyond float32); the sweep over its pixels is float32 (`lanes`).
-A plane is swept in a worker's own small image whose rows are padded, so that sixteen pixels at a time may
-run over the end of a row. Each worker takes every n-th plane; the sums of a pixel do not depend on it.
+The backward pass is in `kernels_backward`. Mathematics as in docs/method.md, "Gaussians". A projection is computed in
+float64 (a nearly flat Gaussian has a condition number of 1e6, beyond float32) and rasterised in float32 (`simd`).
+A plane is rasterised in a worker's own small image whose rows are padded, so that sixteen pixels at a time may run over
+the end of a row. Each worker takes every n-th plane; the sums of a pixel do not depend on the number of workers.
+
+Arguments named `cloud`, `planes`, `overlaps` and `work` are the named tuples of `arrays`. `cut` is the square of the
+cut-off in sigma; `exact` says whether the height is attenuated by B = sqrt(|Sigma| / |S|).
 """
 
 from __future__ import annotations
@@ -24,14 +27,15 @@ SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
 
 MAX_PIXELS = 1e9
-"""Ellipses that reach further than that are not drawn: 32 bits number the pixels. `render` refuses them."""
+"""Ellipses that reach further are not drawn: pixels are counted in 32 bits. `render` refuses them."""
 
-# Gradient columns of a Gaussian in the buffers: amplitude, mean (3), covariance xx xy xz yy yz zz, log-volume.
 N_GRADIENTS = 11
-# Gradient columns of a plane: body-frame rotation (3), world translation (3), log-gain.
-N_PLANE_GRADIENTS = 7
+"""Gradient columns of a Gaussian: amplitude, mean (3), covariance xx xy xz yy yz zz, log-volume."""
 
-PAIR = np.dtype(
+N_PLANE_GRADIENTS = 7
+"""Gradient columns of a plane: body-frame rotation (3), world translation (3), log-gain."""
+
+PROJECTION = np.dtype(
     [
         ("unit", np.float32),
         ("e_0", np.float32),
@@ -47,16 +51,16 @@ PAIR = np.dtype(
         ("gaussian", np.int32),
     ]
 )
-"""The 2D Gaussian that a pair leaves on its plane, in pixels.
+"""The 2D Gaussian that a 3D Gaussian is on a plane, in pixels.
 
-Height over the amplitude (with gain); exponent as in `lanes`; centre at (row + x, column + y); half the sides of
-the box around the ellipse at the cut-off; number of the Gaussian.
+Height over the amplitude (with gain); exponent as in `simd`; centre at (row + x, column + y); half the sides of the box
+around the ellipse at the cut-off; number of the Gaussian.
 """
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
 def observe(shapes, j, r, t, psf):
-    """Mean m and covariance S = R^T Sigma R + D of Gaussian j in the frame of a plane (r, t, psf)."""
+    """The observed Gaussian (G3R Eq. 4) in the frame of a plane: m = R^T (mu - t), S = R^T Sigma R + D_psf."""
     dx, dy, dz = shapes[j, 0] - t[0], shapes[j, 1] - t[1], shapes[j, 2] - t[2]
     mx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
     my = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
@@ -81,17 +85,21 @@ def observe(shapes, j, r, t, psf):
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
-def set_up_plane(shapes, order, begin, end, r, t, psf, size, spacing, gain, cut, exact, projections):
-    """Describe the pairs of a plane that touch it, one after the other in `projections`; returns their number."""
-    n_x, n_y = size[0], size[1]
-    over_x, over_y = 1.0 / spacing[0], 1.0 / spacing[1]
-    sx, sy = spacing[0], spacing[1]
+def project(shapes, planes, overlaps, k, cut, exact, projections):
+    """Project the Gaussians that touch plane k (G3R Eq. 5), one after the other; returns their number.
+
+    On u_z = 0 the observed 3D Gaussian is a 2D Gaussian of exponent -m_z^2 / 2 S_zz at its centre
+    m_xy - S_xy,z m_z / S_zz, with covariance S_xy,xy - S_xy,z S_z,xy / S_zz.
+    """
+    r, t, psf, gain = planes.rotation[k], planes.center[k], planes.psf[k], planes.gain[k]
+    n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
+    sx, sy = planes.spacing[k, 0], planes.spacing[k, 1]
+    over_x, over_y = 1.0 / sx, 1.0 / sy
     middle_x, middle_y = 0.5 * (n_x - 1), 0.5 * (n_y - 1)
     n = 0
-    for pair in range(begin, end):
-        j = order[pair]
+    for pair in range(overlaps.start[k], overlaps.start[k + 1]):
+        j = overlaps.order[pair]
         mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(shapes, j, r, t, psf)
-        # given u_z = 0 the other two are a 2D Gaussian: exponent at its centre, centre, covariance
         iz = 1.0 / szz
         kx, ky = sxz * iz, syz * iz
         e_0 = -0.5 * mz * mz * iz
@@ -146,6 +154,15 @@ def strip_rows(record, cut, first, last, n_x):
     return start, stop - start + 1
 
 
+@numba.njit(forceinline=True, fastmath=LOOSE)
+def strip_at(record, cut, column, stop, n_x, pitch):
+    """A strip of the ellipse from a column on: its first pixel, number of rows, dx and dy of that pixel."""
+    dy = f32(column) - record.y
+    last = f32(min(column + N_LANES - 1, stop)) - record.y
+    row, n_rows = strip_rows(record, cut, dy, last, n_x)
+    return (record.row + row) * pitch + record.column + column, n_rows, f32(row) - record.x, dy
+
+
 @numba.njit(forceinline=True)
 def strip_columns(record, n_y):
     """First and last column of the ellipse on the plane, relative to the record's."""
@@ -155,8 +172,8 @@ def strip_columns(record, n_y):
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
-def rasterise_plane(projections, n, amplitude, cut, n_x, n_y, image):
-    """Add the Gaussians of `n` records to the padded image of their plane."""
+def rasterise(projections, n, amplitude, cut, n_x, n_y, image):
+    """Add `n` projections, times their amplitudes, to the padded image of their plane."""
     pitch = n_y + N_LANES
     limit = f32(-0.5 * cut)
     for i in range(n):
@@ -164,11 +181,7 @@ def rasterise_plane(projections, n, amplitude, cut, n_x, n_y, image):
         height = record.unit * f32(amplitude[record.gaussian])
         start, stop = strip_columns(record, n_y)
         for column in range(start, stop + 1, N_LANES):
-            dy = f32(column) - record.y
-            last = f32(min(column + N_LANES - 1, stop)) - record.y
-            row, n_rows = strip_rows(record, cut, dy, last, n_x)
-            dx = f32(row) - record.x
-            first = (record.row + row) * pitch + record.column + column
+            first, n_rows, dx, dy = strip_at(record, cut, column, stop, n_x, pitch)
             add_strip(
                 image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy, limit, height
             )
@@ -202,56 +215,29 @@ def unload(image, pixels, offset, n_x, n_y):
 
 
 @numba.njit(parallel=True, cache=True)
-def forward(
-    shapes,
-    amplitude,
-    rotation,
-    center,
-    gain,
-    psf,
-    shape,
-    spacing,
-    offset,
-    start,
-    order,
-    cut,
-    exact,
-    images,
-    projections,
-    out,
-):
-    """Every pair's Gaussian, gain included, on the flat pixels `out`.
-
-    images and records are scratch space, one row for each worker (`Workspace`).
-    """
-    n_workers = len(images)
+def forward(cloud, planes, overlaps, cut, exact, work, out):
+    """The sum of all Gaussians on each pixel, gain included (G3R Eq. 5), written to the flat pixels `out`."""
+    n_workers = len(work.images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], projections[worker]
-        for k in range(worker, len(rotation), n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
+        image, mine = work.images[worker], work.projections[worker]
+        for k in range(worker, len(planes.rotation), n_workers):
+            n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
             clear(image, n_x, n_y)
-            n = set_up_plane(
-                shapes,
-                order,
-                start[k],
-                start[k + 1],
-                rotation[k],
-                center[k],
-                psf[k],
-                shape[k],
-                spacing[k],
-                gain[k],
-                cut,
-                exact,
-                mine,
-            )
-            rasterise_plane(mine, n, amplitude, cut, n_x, n_y, image)
-            unload(image, out, offset[k], n_x, n_y)
+            n = project(cloud.shapes, planes, overlaps, k, cut, exact, mine)
+            rasterise(mine, n, cloud.amplitude, cut, n_x, n_y, image)
+            unload(image, out, planes.offset[k], n_x, n_y)
 
 
 @numba.njit(parallel=True, cache=True)
 def derive_shapes(mean, log_scale, quaternion, shapes):
-    """Centre, Sigma and s1 s2 s3 of every Gaussian, float64 (columns as `SHAPE_COLUMNS` says)."""
+    """Centre, Sigma = R diag(s^2) R^T (G3R Eq. 3) and s1 s2 s3 of every Gaussian [N, 10], float64.
+
+    Args:
+        mean: [N, 3] mm from the cloud's origin.
+        log_scale: [N, 3] ln mm.
+        quaternion: [N, 4] w x y z, of any length but zero.
+        shapes: [N, 10] is written; columns as `SHAPE_COLUMNS` says.
+    """
     for j in numba.prange(len(log_scale)):
         r = quaternion_matrix(quaternion, j)
         s0, s1, s2 = math.exp(log_scale[j, 0]), math.exp(log_scale[j, 1]), math.exp(log_scale[j, 2])

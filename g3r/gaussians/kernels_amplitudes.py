@@ -1,98 +1,79 @@
-"""Numba kernels of the linear map from amplitudes to pixels: pairs set up once, swept many times."""
+"""Numba kernels of the linear map from amplitudes to pixels: projected once, rasterised many times.
+
+`part` is a range of planes (first, one past the last). `held` is the named tuple of their projections. Other arguments
+as in `kernels`.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from g3r.gaussians.kernels import clear, load, rasterise_plane, set_up_plane, strip_columns, strip_rows, unload
+from g3r.gaussians.kernels import clear, load, project, rasterise, strip_at, strip_columns, unload
 from g3r.gaussians.simd import N_LANES, strip_sum
 
 f32 = np.float32
 
 
+class HeldProjections(NamedTuple):
+    """Projections onto a range of planes.
+
+    Attributes:
+        start: [K + 1] of the overlap list; plane k begins at `start[k] - start[first]`.
+        projections: room for those of the whole range.
+        n_touching: [K] how many of them touch each plane.
+    """
+
+    start: NDArray[np.int64]
+    projections: NDArray[np.void]
+    n_touching: NDArray[np.int64]
+
+
 @numba.njit(parallel=True, cache=True)
-def set_up(
-    first,
-    last,
-    shapes,
-    rotation,
-    center,
-    gain,
-    psf,
-    shape,
-    spacing,
-    offset,
-    start,
-    order,
-    cut,
-    exact,
-    projections,
-    count,
-):
-    """Records of the pairs of planes first to last (not included), and how many each of them has."""
+def set_up(part, shapes, planes, overlaps, cut, projections, n_touching):
+    """Project the Gaussians onto the planes of a part; writes the last two, which are those of `held`."""
+    first, last = part
+    start = overlaps.start
     for k in numba.prange(first, last):
-        begin = start[k] - start[first]
-        count[k] = set_up_plane(
-            shapes,
-            order,
-            start[k],
-            start[k + 1],
-            rotation[k],
-            center[k],
-            psf[k],
-            shape[k],
-            spacing[k],
-            gain[k],
-            cut,
-            exact,
-            projections[begin : begin + start[k + 1] - start[k]],
-        )
+        begin, end = start[k] - start[first], start[k + 1] - start[first]
+        n_touching[k] = project(shapes, planes, overlaps, k, cut, True, projections[begin:end])
 
 
 @numba.njit(parallel=True, cache=True)
-def apply(first, last, amplitude, shape, offset, start, cut, projections, count, images, out):
-    """A c on planes first to last: the pixels of amplitudes."""
+def apply(part, amplitude, planes, cut, held, images, out):
+    """A c: the pixels of amplitudes on the planes of a part."""
+    first, last = part
     n_workers = len(images)
     for worker in numba.prange(n_workers):
         image = images[worker]
         for k in range(first + worker, last, n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
+            n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
             clear(image, n_x, n_y)
-            rasterise_plane(projections[start[k] - start[first] :], count[k], amplitude, cut, n_x, n_y, image)
-            unload(image, out, offset[k], n_x, n_y)
+            begin = held.start[k] - held.start[first]
+            rasterise(held.projections[begin:], held.n_touching[k], amplitude, cut, n_x, n_y, image)
+            unload(image, out, planes.offset[k], n_x, n_y)
 
 
 @numba.njit(parallel=True, cache=True)
-def apply_adjoint(first, last, pixels, shape, offset, start, cut, projections, count, images, buffers):
-    """A^T y of the pixels of planes first to last, added to buffers [n_workers, N]."""
+def apply_adjoint(part, pixels, planes, cut, held, images, buffers):
+    """A^T y of the pixels of a part, added to buffers [n_workers, N]."""
+    first, last = part
     n_workers = len(images)
     limit = f32(-0.5 * cut)
     for worker in numba.prange(n_workers):
         image, buffer = images[worker], buffers[worker]
         for k in range(first + worker, last, n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
-            load(image, pixels, offset[k], n_x, n_y)
+            n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
+            load(image, pixels, planes.offset[k], n_x, n_y)
             pitch = n_y + N_LANES
-            for i in range(count[k]):
-                record = projections[start[k] - start[first] + i]
-                begin, stop = strip_columns(record, n_y)
+            for i in range(held.n_touching[k]):
+                p = held.projections[held.start[k] - held.start[first] + i]
+                begin, stop = strip_columns(p, n_y)
                 total = f32(0.0)
                 for column in range(begin, stop + 1, N_LANES):
-                    dy = f32(column) - record.y
-                    end = f32(min(column + N_LANES - 1, stop)) - record.y
-                    row, n_rows = strip_rows(record, cut, dy, end, n_x)
-                    total += strip_sum(
-                        image,
-                        (record.row + row) * pitch + record.column + column,
-                        pitch,
-                        n_rows,
-                        record.e_0,
-                        record.q_x,
-                        record.q_u,
-                        record.slope,
-                        f32(row) - record.x,
-                        dy,
-                        limit,
-                    )
-                buffer[record.gaussian] += float(record.unit) * total
+                    at, n_rows, dx, dy = strip_at(p, cut, column, stop, n_x, pitch)
+                    total += strip_sum(image, at, pitch, n_rows, p.e_0, p.q_x, p.q_u, p.slope, dx, dy, limit)
+                buffer[p.gaussian] += float(p.unit) * total

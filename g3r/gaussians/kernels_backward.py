@@ -1,4 +1,9 @@
-"""Numba kernels of the renderer's gradients: moments to parameters, and covariance to scales and turns."""
+"""Numba kernels of the renderer's backward pass: pixel gradients to those of Gaussians, poses and gains.
+
+`backward` is the pass over all planes. With w = dL/dy and g the projected Gaussian, six moments over its ellipse
+(sums of w g, w g d, w g d d^T) give every gradient; see docs/method.md, "Gaussians". `shape_gradients` then takes
+dL/dSigma to log-scales and quaternions. Arguments as in `kernels`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from g3r.gaussians.kernels import LOOSE, load, observe, quaternion_matrix, set_up_plane, strip_columns, strip_rows
+from g3r.gaussians.kernels import LOOSE, load, observe, project, quaternion_matrix, strip_at, strip_columns
 from g3r.gaussians.simd import N_LANES, strip_moments
 
 f32 = np.float32
@@ -21,11 +26,7 @@ def pair_moments(record, cut, n_x, n_y, image):
     m0 = m1 = m2 = m3 = m4 = m5 = f32(0.0)
     start, stop = strip_columns(record, n_y)
     for column in range(start, stop + 1, N_LANES):
-        dy = f32(column) - record.y
-        last = f32(min(column + N_LANES - 1, stop)) - record.y
-        row, n_rows = strip_rows(record, cut, dy, last, n_x)
-        dx = f32(row) - record.x
-        first = (record.row + row) * pitch + record.column + column
+        first, n_rows, dx, dy = strip_at(record, cut, column, stop, n_x, pitch)
         a0, a1, a2, a3, a4, a5 = strip_moments(
             image, first, pitch, n_rows, record.e_0, record.q_x, record.q_u, record.slope, dx, dy, limit, dy
         )
@@ -34,30 +35,29 @@ def pair_moments(record, cut, n_x, n_y, image):
 
 
 @numba.njit(forceinline=True, fastmath=LOOSE)
-def gather_plane(
-    projections, n, shapes, amplitude, r, t, psf, size, spacing, cut, exact, image, buffer, plane, with_pose
-):
-    """Gradients of sum(image * pixels of the plane), added to those of its Gaussians and of the plane.
+def gather(projections, n, cloud, planes, k, cut, exact, image, buffer, plane, with_pose):
+    """Gradients of sum(image * pixels of plane k), added to those of its Gaussians and of the plane.
 
     image holds dL/dy in padded rows, buffer [N, 11] and plane [7] the gradients (columns as in `kernels`).
     The chain goes through the 2D Gaussian of centre m_xy - k m_z and covariance C = S_xy - k k^T S_zz with
     k = S_xy,z / S_zz; for the exact amplitude ln B has -ln|S| / 2 = -(ln|C| + ln S_zz) / 2.
     """
-    n_x, n_y = size[0], size[1]
-    sx, sy = spacing[0], spacing[1]
+    r, t, psf = planes.rotation[k], planes.center[k], planes.psf[k]
+    n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
+    sx, sy = planes.spacing[k, 0], planes.spacing[k, 1]
     p0 = p1 = p2 = p3 = p4 = p5 = p6 = 0.0
     for i in range(n):
         record = projections[i]
         m0, m1, m2, m3, m4, m5 = pair_moments(record, cut, n_x, n_y, image)
         j = record.gaussian
-        mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(shapes, j, r, t, psf)
+        mx, my, mz, sxx, sxy, sxz, syy, syz, szz = observe(cloud.shapes, j, r, t, psf)
         iz = 1.0 / szz
         kx, ky = sxz * iz, syz * iz
         cxx, cxy, cyy = sxx - kx * sxz, sxy - kx * syz, syy - ky * syz
         over_det = 1.0 / (cxx * cyy - cxy * cxy)
         ixx, ixy, iyy = cyy * over_det, -cxy * over_det, cxx * over_det
         g0 = float(record.unit) * m0
-        height = float(record.unit) * amplitude[j]
+        height = float(record.unit) * cloud.amplitude[j]
         whole = height * m0
         attenuation = whole if exact else 0.0
         # dL/dcentre = C^-1 M1, dL/dC = (C^-1 M2 C^-1 - M0 C^-1) / 2
@@ -102,7 +102,7 @@ def gather_plane(
         out[9] += q0 * r[2, 0] + q1 * r[2, 1] + q2 * r[2, 2]
         out[10] += attenuation
         if with_pose:
-            # body-frame turn dL/dw = dL/dm x m + 2 (A_23, A_31, A_12), A = T S' - S' T, S' = S - D
+            # body-frame rotation dL/dw = dL/dm x m + 2 (A_23, A_31, A_12), A = T S' - S' T, S' = S - D
             ux, uy, uz = sxx - psf[0], syy - psf[1], szz - psf[2]
             a12 = txx * sxy + txy * uy + txz * syz - (ux * txy + sxy * tyy + sxz * tyz)
             a13 = txx * sxz + txy * syz + txz * uz - (ux * txz + sxy * tyz + sxz * tzz)
@@ -124,68 +124,19 @@ def gather_plane(
 
 
 @numba.njit(parallel=True, cache=True)
-def backward(
-    shapes,
-    amplitude,
-    rotation,
-    center,
-    gain,
-    psf,
-    shape,
-    spacing,
-    offset,
-    start,
-    order,
-    cut,
-    exact,
-    images,
-    projections,
-    weight,
-    buffers,
-    plane_gradient,
-):
-    """Gradients of sum(weight * pixels) by the moments of each pair.
+def backward(cloud, planes, overlaps, cut, exact, work, weight, buffers, plane_gradient):
+    """The backward pass: gradients of sum(weight * pixels) by the moments of each projection.
 
-    buffers [n_workers, N, 11] and plane_gradient [K, 7] are added to; columns as in `kernels`.
+    weight [P] is dL/dy; buffers [n_workers, N, 11] and plane_gradient [K, 7] are added to (columns as in `kernels`).
     """
-    n_workers = len(images)
+    n_workers = len(work.images)
     for worker in numba.prange(n_workers):
-        image, mine = images[worker], projections[worker]
-        for k in range(worker, len(rotation), n_workers):
-            n_x, n_y = shape[k, 0], shape[k, 1]
-            load(image, weight, offset[k], n_x, n_y)
-            n = set_up_plane(
-                shapes,
-                order,
-                start[k],
-                start[k + 1],
-                rotation[k],
-                center[k],
-                psf[k],
-                shape[k],
-                spacing[k],
-                gain[k],
-                cut,
-                exact,
-                mine,
-            )
-            gather_plane(
-                mine,
-                n,
-                shapes,
-                amplitude,
-                rotation[k],
-                center[k],
-                psf[k],
-                shape[k],
-                spacing[k],
-                cut,
-                exact,
-                image,
-                buffers[worker],
-                plane_gradient[k],
-                True,
-            )
+        image, mine = work.images[worker], work.projections[worker]
+        for k in range(worker, len(planes.rotation), n_workers):
+            n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
+            load(image, weight, planes.offset[k], n_x, n_y)
+            n = project(cloud.shapes, planes, overlaps, k, cut, exact, mine)
+            gather(mine, n, cloud, planes, k, cut, exact, image, buffers[worker], plane_gradient[k], True)
 
 
 @numba.njit(forceinline=True)
@@ -207,7 +158,7 @@ def _quaternion_gradient(quaternion, j, rows, out):
 
 
 @numba.njit
-def _shape_gradient(j, log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad):
+def _shape_gradient(j, log_scale, quaternion, buffers, mean_grad, scale_grad, quaternion_grad, amplitude_grad):
     for worker in range(1, len(buffers)):
         for column in range(buffers.shape[2]):
             buffers[0, j, column] += buffers[worker, j, column]
@@ -237,11 +188,20 @@ def _along(t, r, a):
 
 
 @numba.njit(parallel=True, cache=True)
-def shape_gradients(log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad):
-    """Sum the workers' buffers (into the first) and turn dL/dSigma into gradients of log-scales and turns.
+def shape_gradients(log_scale, quaternion, buffers, mean_grad, scale_grad, quaternion_grad, amplitude_grad):
+    """Sum the workers' buffers (into the first) and take dL/dSigma to log-scales and quaternions.
 
     Sigma = M M^T with M = R diag(s): dL/dM = 2 T M, dL/dln s_a = sum_i dM_ia M_ia (+ the log-volume's),
     dL/dR = dM diag(s).
+
+    Args:
+        log_scale: [N, 3].
+        quaternion: [N, 4].
+        buffers: [n_workers, N, 11], columns as in `kernels`.
+        mean_grad: [N, 3], written.
+        scale_grad: [N, 3], written.
+        quaternion_grad: [N, 4], written.
+        amplitude_grad: [N], written.
     """
     for j in numba.prange(len(log_scale)):
-        _shape_gradient(j, log_scale, quaternion, buffers, amplitude_grad, mean_grad, scale_grad, quaternion_grad)
+        _shape_gradient(j, log_scale, quaternion, buffers, mean_grad, scale_grad, quaternion_grad, amplitude_grad)

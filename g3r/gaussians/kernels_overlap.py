@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from g3r.gaussians.kernels import LOOSE
 
 f32 = np.float32
 
 SLACK_MM = 1e-4
-"""What float32 may be wrong by in the distance of a Gaussian from a plane of the same scene."""
+"""Error of float32 in the distance of a Gaussian from a plane of the same scene."""
 
 VARIANCE_SLACK = 1e-6
-"""What float32 may be wrong by in a variance along an axis, over the trace: all of it, in a flat Gaussian."""
+"""Error of float32 in a variance along an axis, over the trace; in a flat Gaussian it is all of the variance."""
+
+
+class PlaneExtents(NamedTuple):
+    """Rectangles in space, float32: rotation [K, 3, 3], center [K, 3], psf variances [K, 3], half the sides [K, 3]."""
+
+    rotation: NDArray[np.float32]
+    center: NDArray[np.float32]
+    psf: NDArray[np.float32]
+    half: NDArray[np.float32]
 
 
 @numba.njit(parallel=True, cache=True)
 def columns_of(shapes, middle, columns):
-    """Mean from `middle` and covariance [9, N] in float32, a row each, so that the search runs in vectors."""
+    """Mean and covariance as rows [9, N] of float32, so that the search runs in vectors.
+
+    Args:
+        shapes: [N, 10] of `derive_shapes`.
+        middle: [3] mm, what means are relative to.
+        columns: [9, N], written.
+    """
     for j in numba.prange(len(shapes)):
         for n in range(3):
             columns[n, j] = shapes[j, n] - middle[n]
@@ -27,8 +45,10 @@ def columns_of(shapes, middle, columns):
 
 
 @numba.njit(fastmath=LOOSE, error_model="numpy")
-def _mark(x, y, z, xx, xy, xz, yy, yz, zz, r, t, psf, half, cut, marks):
+def _mark(columns, r, t, psf, half, cut, marks):
     """1 for each Gaussian whose ellipsoid at the cut-off may touch a plane's rectangle, else 0."""
+    x, y, z, xx, xy = columns[0], columns[1], columns[2], columns[3], columns[4]
+    xz, yy, yz, zz = columns[5], columns[6], columns[7], columns[8]
     for j in range(len(x)):
         dx, dy, dz = x[j] - t[0], y[j] - t[1], z[j] - t[2]
         slack = f32(SLACK_MM) + f32(1e-6) * (abs(dx) + abs(dy) + abs(dz))
@@ -51,34 +71,25 @@ def _mark(x, y, z, xx, xy, xz, yy, yz, zz, r, t, psf, half, cut, marks):
 
 
 @numba.njit(parallel=True, cache=True)
-def find(columns, rotation, center, psf, half, cut, marks, start, order):
+def find(columns, planes, cut, marks, start, order):
     """Numbers of the Gaussians of each plane, ascending, into `order`; of none into an empty `order`.
 
     Called twice: first start [K + 1] is made, then order [start[K]] is filled.
-    marks [n_workers, N] is scratch space. All but start and order are float32.
+
+    Args:
+        columns: [9, N] float32 of `columns_of`.
+        planes: `PlaneExtents`.
+        cut: square of the cut-off in sigma.
+        marks: [n_workers, N] scratch space.
+        start: [K + 1] where each plane's Gaussians begin.
+        order: the numbers of the Gaussians.
     """
-    n_workers, n_planes = len(marks), len(rotation)
+    n_workers, n_planes = len(marks), len(planes.rotation)
     counting = len(order) == 0
     for worker in numba.prange(n_workers):
         mark = marks[worker]
         for k in range(worker, n_planes, n_workers):
-            _mark(
-                columns[0],
-                columns[1],
-                columns[2],
-                columns[3],
-                columns[4],
-                columns[5],
-                columns[6],
-                columns[7],
-                columns[8],
-                rotation[k],
-                center[k],
-                psf[k],
-                half[k],
-                cut,
-                mark,
-            )
+            _mark(columns, planes.rotation[k], planes.center[k], planes.psf[k], planes.half[k], cut, mark)
             if counting:
                 n = 0
                 for j in range(len(mark)):

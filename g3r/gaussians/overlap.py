@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes
-from g3r.gaussians import kernels
-from g3r.gaussians import kernels_overlap as kernels_pairs
+from g3r.gaussians.arrays import CloudArrays, OverlapArrays
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.simd import N_LANES
+from g3r.gaussians.kernels_overlap import PlaneExtents, columns_of, find
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,22 @@ class OverlapList:
         """Largest number of Gaussians of one plane."""
         return int(np.diff(self.start).max(initial=0))
 
+    @property
+    def arrays(self) -> OverlapArrays:
+        """What the kernels take."""
+        return OverlapArrays(self.start, self.gaussian)
+
 
 def find_overlaps(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> OverlapList:
-    """All pairs whose ellipsoid at the cut-off may meet the plane's rectangle.
+    """The Gaussians whose ellipsoid at the cut-off may meet each plane's rectangle.
 
     Pass a larger cut-off than the renderer's to keep the list valid while Gaussians and poses move a little:
-    pairs that no longer touch cost a set-up and no pixels.
+    a Gaussian that does not touch the plane costs a projection and no pixels.
+
+    Args:
+        cloud: N Gaussians.
+        planes: K planes.
+        cutoff_sigma: where a Gaussian ends.
     """
     shapes = CloudArrays.of(cloud).shapes
     finder = OverlapFinder(len(cloud))
@@ -43,7 +52,7 @@ def find_overlaps(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> 
 
 
 class OverlapFinder:
-    """Finds pairs again and again, in memory taken once."""
+    """Makes overlap lists again and again, in memory taken once."""
 
     def __init__(self, n_gaussians: int) -> None:
         self.columns = np.empty((9, n_gaussians), np.float32)
@@ -58,13 +67,13 @@ class OverlapFinder:
         center_mm: NDArray[np.float64],
         cutoff_sigma: float,
     ) -> OverlapList:
-        """The pairs of derived shapes [N, 10] with planes; the list is valid until the next call.
+        """The overlap list of Gaussians and planes; it is valid until the next call.
 
         Args:
-            shapes: of the Gaussians.
-            planes: for their sizes and PSFs.
-            rotation: [K, 3, 3] of the planes at present.
-            center_mm: [K, 3] of the planes at present, from the cloud's origin.
+            shapes: [N, 10] of `derive_shapes`.
+            planes: K planes; their sizes and PSFs are read.
+            rotation: [K, 3, 3] of the planes at the moment.
+            center_mm: [K, 3] of the planes at the moment, mm from the cloud's origin.
             cutoff_sigma: where a Gaussian ends.
         """
         half = np.zeros((len(planes), 3), np.float32)
@@ -72,50 +81,14 @@ class OverlapFinder:
         # float32 is enough from the middle of the planes, wherever the cloud's origin is
         middle = center_mm.mean(0) if len(center_mm) else np.zeros(3)
         single = [array.astype(np.float32) for array in (rotation, center_mm - middle, planes.psf_var_mm2)]
+        extents = PlaneExtents(single[0], single[1], single[2], half)
         start = np.zeros(len(planes) + 1, np.int64)
         cut = np.float32(cutoff_sigma**2 * (1 + 1e-5))
-        kernels_pairs.columns_of(shapes, middle, self.columns)
-        arguments = (self.columns, *single, half, cut, self.marks, start)
-        kernels_pairs.find(*arguments, self.order[:0])  # type: ignore[call-arg]
+        columns_of(shapes, middle, self.columns)
+        find(self.columns, extents, cut, self.marks, start, self.order[:0])
         n_pairs = int(start[-1])
         if n_pairs > len(self.order):
             self.order = np.empty(n_pairs + n_pairs // 8, np.int32)
         if n_pairs:
-            kernels_pairs.find(*arguments, self.order[:n_pairs])  # type: ignore[call-arg]
+            find(self.columns, extents, cut, self.marks, start, self.order[:n_pairs])
         return OverlapList(start, self.order[:n_pairs])
-
-
-@dataclass(frozen=True)
-class CloudArrays:
-    """What the kernels read of a cloud: derived shapes [N, 10] float64, amplitudes, and what they come from."""
-
-    shapes: NDArray[np.float64]
-    amplitude: NDArray[np.float32]
-    log_scale: NDArray[np.floating]
-    quaternion: NDArray[np.floating]
-
-    @classmethod
-    def of(cls, cloud: GaussianCloud) -> CloudArrays:
-        """Views and derived arrays of a cloud on the CPU."""
-        mean, log_scale, quaternion, amplitude = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters)
-        shapes = np.empty((len(mean), kernels.SHAPE_COLUMNS))
-        kernels.derive_shapes(mean, log_scale, quaternion, shapes)
-        return cls(shapes, amplitude.astype(np.float32), log_scale, quaternion)
-
-
-@dataclass(frozen=True)
-class Workspace:
-    """Scratch space of the kernels, a row for each worker: a padded image, and the records of a plane."""
-
-    images: NDArray[np.float32]
-    projections: NDArray[np.void]
-
-    @classmethod
-    def of(cls, planes: Planes, max_pairs: int) -> Workspace:
-        """Room for the largest plane and the longest list of pairs of one plane."""
-        n_workers = numba.get_num_threads()
-        padded = planes.shape[:, 0] * (planes.shape[:, 1] + N_LANES) + N_LANES
-        return cls(
-            np.zeros((n_workers, int(padded.max(initial=1))), np.float32),
-            np.zeros((n_workers, max_pairs), kernels.PAIR),
-        )

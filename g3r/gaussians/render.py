@@ -12,8 +12,9 @@ from torch import Tensor
 
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import kernels, kernels_backward
+from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
 from g3r.gaussians.cloud import GaussianCloud
-from g3r.gaussians.overlap import CloudArrays, OverlapList, Workspace, find_overlaps
+from g3r.gaussians.overlap import OverlapList, find_overlaps
 from g3r.gaussians.reference import render_reference
 from g3r.geometry import RigidPose
 
@@ -40,7 +41,7 @@ def render(
     """Pixels of planes through their PSF, differentiable in cloud, poses and gains.
 
     y(u) = g sum_j c_j B_j exp(-d^T S_j^-1 d / 2), d = u - R^T (mu_j - t), S = R^T Sigma R + D_psf,
-    B = sqrt(|Sigma| / |S|). A plane whose PSF is zero samples the volume V(x).
+    B = sqrt(|Sigma| / |S|) (G3R Eq. 4 and 5). A plane whose PSF is zero samples the volume V(x) (G3R Eq. 3).
 
     Args:
         cloud: N Gaussians.
@@ -49,7 +50,7 @@ def render(
         log_gain: [K] logarithm of the intensity factor of each plane.
         backend: "numba" (CPU, gradients by moments), or "reference" (plain torch, dense, any dtype, no
             cut-off).
-        attenuation: "exact", or "printed" for B = 1 as G3R Eq. 5 stands in print (for comparison).
+        attenuation: "exact", or "printed" for B = 1 as in the printed G3R Eq. 5 (for comparison).
         cutoff_sigma: where a Gaussian ends, up to 6 (numba only).
         pairs: list from `find_overlaps`, to be used again while nothing moves far (numba only).
 
@@ -57,13 +58,14 @@ def render(
         [P] pixels, plane after plane, in C order inside a plane.
 
     Raises:
-        ValueError: an unknown backend or amplitude, parameters in half precision, a cut-off outside (0, 6], a
+        ValueError: an unknown backend or attenuation, parameters in half precision, a cut-off outside (0, 6], a
             twist or gain that is not finite, or a sigma of more than 1e8 pixels (numba only).
 
-    Source: G3R Eq. 3 and 5 with the amplitude factor (docs/method.md); gradients derived there.
+    Source: G3R Eq. 3-5 with the attenuation B (docs/method.md, "Gaussians"). The backward pass is
+        `kernels_backward.backward`.
     """
     if attenuation not in ATTENUATIONS:
-        raise ValueError(f"amplitude {attenuation!r}; expected one of {ATTENUATIONS}")
+        raise ValueError(f"attenuation {attenuation!r}; expected one of {ATTENUATIONS}")
     if cloud.mean_mm.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"Gaussians in {cloud.mean_mm.dtype}; expected float32 or float64: no geometry in less")
     for name, change in (("twist", twist), ("log_gain", log_gain)):
@@ -81,8 +83,9 @@ def render(
             raise ValueError(f"a sigma is {widest:.2g} pixels wide; expected at most {kernels.MAX_PIXELS / 10:g}")
     if pairs is None:
         pairs = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
-    pixels = _Render.apply(
-        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, attenuation == "exact"
+    exact = attenuation == "exact"
+    pixels: Tensor = _Render.apply(
+        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, exact
     )
     return pixels
 
@@ -94,23 +97,6 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
     change = twist.detach().double().numpy()
     rotation = planes.rotation @ Rotation.from_rotvec(change[:, :3]).as_matrix()
     return planes.with_pose(RigidPose(rotation, planes.center_mm + change[:, 3:]))
-
-
-def plane_arguments(
-    planes: Planes, center: NDArray[np.float64], gain: NDArray[np.float64], pairs: OverlapList
-) -> tuple[Any, ...]:
-    """Arguments of the kernels that describe planes and pairs."""
-    return (
-        planes.rotation,
-        center,
-        gain,
-        planes.psf_var_mm2,
-        planes.shape,
-        planes.spacing_mm,
-        planes.offset,
-        pairs.start,
-        pairs.gaussian,
-    )
 
 
 class _Render(torch.autograd.Function):
@@ -131,50 +117,35 @@ class _Render(torch.autograd.Function):
     ) -> Tensor:
         moved = moved_planes(planes, twist)
         gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
-        arrays = CloudArrays.of(GaussianCloud(mean, log_scale, quaternion, amplitude, origin_mm))
-        described = plane_arguments(moved, moved.center_mm - origin_mm, gain, pairs)
+        cloud = GaussianCloud.of((mean, log_scale, quaternion, amplitude), origin_mm)
         work = Workspace.of(planes, pairs.most)
+        given = (CloudArrays.of(cloud), PlaneArrays.of(moved, origin_mm, gain), pairs.arrays, cutoff_sigma**2, exact)
         out = np.zeros(planes.n_pixels, np.float32)
-        kernels.forward(  # type: ignore[call-arg]
-            arrays.shapes, arrays.amplitude, *described, cutoff_sigma**2, exact, work.images, work.projections, out
-        )
-        ctx.saved = (arrays, described, work, cutoff_sigma, exact, twist)
+        kernels.forward(*given, work, out)
+        ctx.saved = (given, work, cloud, twist)
         ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, amplitude, twist, log_gain)]
         return torch.from_numpy(out).to(mean.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        arrays, described, work, cutoff_sigma, exact, twist = ctx.saved
-        n, n_planes = len(arrays.amplitude), len(described[0])
+        given, work, cloud, twist = ctx.saved
+        n, n_planes = len(cloud), len(given[1].rotation)
         buffers = np.zeros((len(work.images), n, kernels.N_GRADIENTS))
         plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
         weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
-        kernels_backward.backward(  # type: ignore[call-arg]
-            arrays.shapes,
-            arrays.amplitude,
-            *described,
-            cutoff_sigma**2,
-            exact,
-            work.images,
-            work.projections,
-            weight,
-            buffers,
-            plane_gradient,
-        )
-        amplitude, mean = np.empty(n), np.empty((n, 3))
-        scale, quaternion = np.empty((n, 3)), np.empty((n, 4))
-        kernels_backward.shape_gradients(
-            arrays.log_scale, arrays.quaternion, buffers, amplitude, mean, scale, quaternion
-        )
+        kernels_backward.backward(*given, work, weight, buffers, plane_gradient)  # type: ignore[call-arg]
+        found = [np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)]
+        log_scale, quaternion = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters[1:3])
+        kernels_backward.shape_gradients(log_scale, quaternion, buffers, *found)
         pose = plane_gradient[:, :6]
         if twist is not None:
-            # the kernels differentiate in a turn on top of the present one: exp(w + dw) = exp(w) exp(J_r dw)
+            # the kernels differentiate in a rotation after the present one: exp(w + dw) = exp(w) exp(J_r dw)
             jacobian = right_jacobian(twist.detach().double().numpy()[:, :3])
             pose = np.concatenate([np.einsum("kji,kj->ki", jacobian, pose[:, :3]), pose[:, 3:]], axis=1)
-        arrays_out = (mean, scale, quaternion, amplitude, pose, plane_gradient[:, 6])
+        arrays = (*found, pose, plane_gradient[:, 6])
         gradients = [
             None if dtype is None else torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
-            for array, dtype in zip(arrays_out, ctx.like, strict=True)
+            for array, dtype in zip(arrays, ctx.like, strict=True)
         ]
         return (*gradients, None, None, None, None, None)
 

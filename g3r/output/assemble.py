@@ -31,7 +31,7 @@ from g3r.registration.quality import StackQuality, pose_warnings, registration_r
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
-from g3r.uncertainty import estimate_uncertainty
+from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
 from g3r.uncertainty.prior_share import estimate_prior_share
 
 logger = logging.getLogger(__name__)
@@ -91,25 +91,29 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             with run.clock(Stage.PRIOR_SHARE):
                 prior_share = estimate_prior_share(
                     fit,
-                    volumes.density,
-                    volumes.grid,
-                    mask,
-                    grid,
-                    stage_rng(settings.seed, Stage.PRIOR_SHARE),
-                    settings.share_probes,
+                    density=volumes.density,
+                    density_grid=volumes.grid,
+                    mask=mask,
+                    grid=grid,
+                    rng=stage_rng(settings.seed, Stage.PRIOR_SHARE),
+                    n_probes=settings.share_probes,
+                    cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
                 release_memory()
         with run.clock(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
-                volume,
-                mask,
-                grid,
-                fit,
-                prior=found.prior.values,
-                density=volumes.density,
-                prior_grid=volumes.grid,
-                prior_share=prior_share,
+                UncertaintyInputs(
+                    volume=volume,
+                    mask=mask,
+                    grid=grid,
+                    fit=fit,
+                    prior=found.prior.values,
+                    density=volumes.density,
+                    prior_grid=volumes.grid,
+                    prior_share=prior_share,
+                    cutoff_sigma=settings.slice_stage.cutoff_sigma,
+                ),
                 with_prior=settings.use_prior,
                 intensity=found.intensity,
                 reliable=registration_reliable(qualities),

@@ -1,5 +1,5 @@
-"""How far a result can be trusted: the expected size of each voxel's error, calibrated on simulations."""
+"""The expected error of each voxel, calibrated on simulations, and its prior share."""
 
-from g3r.uncertainty.estimate import Uncertainty, estimate_uncertainty
+from g3r.uncertainty.estimate import Uncertainty, UncertaintyInputs, estimate_uncertainty
 
-__all__ = ["Uncertainty", "estimate_uncertainty"]
+__all__ = ["Uncertainty", "UncertaintyInputs", "estimate_uncertainty"]

@@ -1,4 +1,4 @@
-"""The expected absolute error as a product of powers of the evidence, fitted by maximum likelihood."""
+"""The expected absolute error as a product of powers of predictors, fitted by maximum likelihood."""
 
 from __future__ import annotations
 
@@ -13,26 +13,24 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 DEPTH_MM = 3.0
-"""How far the rim of the mask is felt."""
+"""Depth below the rim of the mask at which its influence has fallen to 1/e."""
 
 FLOORS = {"residual": 0.005, "edge": 0.01, "texture": 0.005, "from_prior": 0.003, "unmeasured": 0.02}
-"""Added before the logarithm: below them, differences in normalised intensities (or of 1 - c) say nothing."""
+"""Added before the logarithm: smaller differences of normalised intensities (or of 1 - c) carry no information."""
 
-SMALLEST, LARGEST = 1e-4, 1.0
-"""Bounds of the answer, in normalised intensities: nothing is known better than a ten-thousandth of the
-brightest tissue, or worse than by all of it."""
+MIN_ERROR, MAX_ERROR = 1e-4, 1.0
+"""Bounds of the expected error, in normalised intensities: a ten-thousandth of the brightest tissue, and all of it."""
 
 RIDGE = 1e-4
 """Keeps coefficients finite that a small sample does not determine."""
 
-
-LEAST = {"log residual": 0.3}
+MIN_COEFFICIENT = {"log residual": 0.3}
 """Coefficients are held at zero or above, this one at more: slices lie wrongly in few of the subjects of a
-calibration, and a model that learnt from the others to overlook misfit would not see a bad registration."""
+calibration, and a model that learnt from the others to ignore misfit would not see a bad registration."""
 
 
 def terms(predictors: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """What the logarithm of the answer is linear in, by name: each [n], larger where more is in doubt."""
+    """Terms [n] of the logarithm of the expected error, by name; larger where the voxel is less certain."""
     found = {f"log {name}": np.log(predictors[name] + floor) for name, floor in FLOORS.items()}
     found["rim"] = np.exp(-predictors["depth_mm"] / DEPTH_MM)
     if "prior_share" in predictors:
@@ -46,7 +44,7 @@ class ErrorModel:
 
     Args:
         intercept: in the logarithm of normalised intensities.
-        coefficients: of the terms by name; none is negative, so that more evidence of doubt never means less.
+        coefficients: of the terms by name; none is negative, so that a larger predictor never means a smaller error.
     """
 
     intercept: float
@@ -56,14 +54,14 @@ class ErrorModel:
         """Expected absolute error u [n], in normalised intensities.
 
         Raises:
-            ValueError: evidence that the model was fitted with is missing.
+            ValueError: a predictor that the model was fitted with is missing.
         """
         found = terms(predictors)
         missing = sorted(set(self.coefficients) - set(found))
         if missing:
-            raise ValueError(f"no evidence for {', '.join(missing)}")
+            raise ValueError(f"no predictor for {', '.join(missing)}")
         log_u = self.intercept + sum(b * found[name] for name, b in self.coefficients.items())
-        return np.clip(np.exp(np.asarray(log_u, dtype=np.float64)), SMALLEST, LARGEST)
+        return np.clip(np.exp(np.asarray(log_u, dtype=np.float64)), MIN_ERROR, MAX_ERROR)
 
 
 def fit_model(
@@ -73,7 +71,7 @@ def fit_model(
 
     Minimises the mean of ln u + |error| / u, which is convex in the coefficients and lowest where u is the
     mean absolute error, whatever the true distribution (a proper score of the mean). Coefficients are held
-    at zero or above, or at what `LEAST` says.
+    at zero or above, or at what `MIN_COEFFICIENT` says.
 
     Args:
         samples: `terms` of n voxels.
@@ -99,7 +97,7 @@ def fit_model(
         return float(value), design.T @ (share * (1 - ratio)) + 2 * RIDGE * np.r_[0, b[1:]]
 
     start = np.r_[np.log(max(float(share @ size), 1e-30)), np.zeros(len(names))]
-    least = np.array([LEAST.get(name, 0.0) for name in names]) * spread
+    least = np.array([MIN_COEFFICIENT.get(name, 0.0) for name in names]) * spread
     start[1:] = least
     bounds = [(None, None), *[(float(bound), None) for bound in least]]
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
@@ -108,7 +106,13 @@ def fit_model(
 
 
 def save_calibration(path: Path, models: Mapping[str, ErrorModel], fitted_on: Mapping[str, Any]) -> None:
-    """Write models by name, with what each was fitted on."""
+    """Write models with what each was fitted on.
+
+    Args:
+        path: JSON file.
+        models: by name.
+        fitted_on: by the same names.
+    """
     record = {
         name: {"intercept": m.intercept, "coefficients": m.coefficients, "fitted_on": fitted_on.get(name)}
         for name, m in models.items()

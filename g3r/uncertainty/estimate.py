@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.fitting.slice_stage import SliceFit
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
 from g3r.uncertainty.error_model import ErrorModel, load_calibration
@@ -36,88 +37,71 @@ class Uncertainty:
 
     Attributes:
         expected_error: [I, J, K] in the volume's intensities; zero outside the mask.
-        record: median and 90th percentile in the mask, units, calibration, doubts.
+        record: median and 90th percentile in the mask, units, calibration, whether the registration is reliable.
     """
 
     expected_error: NDArray[np.float32]
     record: dict[str, Any]
 
 
+@dataclass(frozen=True, kw_only=True)
+class UncertaintyInputs:
+    """What is known of a result without the truth, in normalised intensities.
+
+    Attributes:
+        volume: [I, J, K].
+        mask: [I, J, K].
+        grid: of both.
+        fit: Gaussians and slices as the fit left them.
+        prior: on `prior_grid`; what the fit started from where no network was used.
+        density: M_rho on `prior_grid`.
+        prior_grid: of these two.
+        prior_share: [I, J, K] on `grid`; None where no network was used.
+        cutoff_sigma: where the fit's Gaussians end.
+    """
+
+    volume: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    grid: VolumeGrid
+    fit: SliceFit
+    prior: NDArray[np.float32]
+    density: NDArray[np.float32]
+    prior_grid: VolumeGrid
+    prior_share: NDArray[np.float32] | None = None
+    cutoff_sigma: float = CUTOFF_SIGMA
+
+    def predictors(self) -> dict[str, NDArray[np.float64]]:
+        """The predictors on the voxels of the mask; see `gather_predictors`."""
+        return gather_predictors(
+            self.volume,
+            self.mask,
+            self.grid,
+            residual=mean_residual(self.fit, self.grid, self.cutoff_sigma),
+            density=on_grid(self.density, self.prior_grid, self.grid, outside=0.0),
+            prior=on_grid(self.prior, self.prior_grid, self.grid, outside=0.0),
+            prior_share=self.prior_share,
+        )
+
+
 def estimate_uncertainty(
-    volume: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    grid: VolumeGrid,
-    fit: SliceFit,
-    *,
-    prior: NDArray[np.float32],
-    density: NDArray[np.float32],
-    prior_grid: VolumeGrid,
-    prior_share: NDArray[np.float32] | None = None,
-    with_prior: bool = True,
-    intensity: float = 1.0,
-    reliable: bool | None = True,
+    given: UncertaintyInputs, *, with_prior: bool = True, intensity: float = 1.0, reliable: bool | None = True
 ) -> Uncertainty:
     """The expected absolute error of every voxel of the mask.
 
-    A product of powers of what is known without the truth, with coefficients fitted to simulated subjects
+    A product of powers of predictors, with coefficients fitted to simulated subjects
     (`python -m studies.uncertainty.calibration fit`). It is a mean over voxels that look alike to the pipeline, not a
     bound: errors of single voxels scatter around it about as an exponential distribution does.
 
     Args:
-        volume: [I, J, K] normalised intensities.
-        mask: [I, J, K].
-        grid: of both.
-        fit: Gaussians and slices as the fit left them, in the volume's intensities.
-        prior: on `prior_grid`, normalised intensities; what the fit started from where no network was used.
-        density: M_rho on `prior_grid`.
-        prior_grid: of these two.
-        prior_share: [I, J, K] on `grid`; None where no network was used.
-        with_prior: whether one was used: there is a calibration for each.
+        given: the result.
+        with_prior: whether a prior network was used: there is a calibration for each.
         intensity: what 1 stands for; the map is multiplied by it.
         reliable: whether the registration is; None where nothing checks it.
     """
-    predictors = collect(volume, mask, grid, fit, prior, density, prior_grid, prior_share)
     name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
-    found = uncertainty_of(predictors, calibration()[name], name, mask, intensity, reliable)
-    if prior_share is not None:
-        found.record["prior_share"] = prior_share_summary(prior_share[mask])
-    return found
-
-
-def collect(
-    volume: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    grid: VolumeGrid,
-    fit: SliceFit,
-    prior: NDArray[np.float32],
-    density: NDArray[np.float32],
-    prior_grid: VolumeGrid,
-    prior_share: NDArray[np.float32] | None,
-) -> dict[str, NDArray[np.float64]]:
-    """The evidence on the voxels of the mask; see `estimate_uncertainty` for the arguments."""
-    return gather_predictors(
-        volume,
-        mask,
-        grid,
-        residual=mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.bias_field, grid),
-        density=on_grid(density, prior_grid, grid, outside=0.0),
-        prior=on_grid(prior, prior_grid, grid, outside=0.0),
-        prior_share=prior_share,
-    )
-
-
-def uncertainty_of(
-    predictors: dict[str, NDArray[np.float64]],
-    model: ErrorModel,
-    name: str,
-    mask: NDArray[np.bool_],
-    intensity: float,
-    reliable: bool | None,
-) -> Uncertainty:
-    """The map of one model, and its record."""
-    error = model.expected(predictors)
-    expected = np.zeros(mask.shape, np.float32)
-    expected[mask] = error * intensity
+    error = calibration()[name].expected(given.predictors())
+    expected = np.zeros(given.mask.shape, np.float32)
+    expected[given.mask] = error * intensity
     record: dict[str, Any] = {
         "meaning": MEANING,
         "median_in_mask": float(np.median(error)) * intensity,
@@ -128,11 +112,13 @@ def uncertainty_of(
     }
     if reliable is not True:
         record["note"] = UNCHECKED_NOTE if reliable is None else UNRELIABLE_NOTE
+    if given.prior_share is not None:
+        record["prior_share"] = prior_share_summary(given.prior_share[given.mask])
     return Uncertainty(expected, record)
 
 
 def prior_share_summary(share: NDArray[np.float32]) -> dict[str, float]:
-    """What run.json says of prior_share.nii.gz: its mean over the mask's voxels, and how many rest on it."""
+    """Mean prior share of the voxels in the mask [n], and the share of voxels that show mostly the prior."""
     if not share.size:
         return {"mean_in_mask": 0.0, "mask_mostly_prior": 0.0}
     return {"mean_in_mask": float(share.mean()), "mask_mostly_prior": float((share > MOSTLY_PRIOR).mean())}

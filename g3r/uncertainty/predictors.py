@@ -1,7 +1,7 @@
-"""What the pipeline knows of each voxel without the truth, in intensities and lengths that have no scale.
+"""Predictors of each voxel's error: what the pipeline knows without the truth, free of intensity scale.
 
-Intensities are normalised (the 99th percentile of V_coarse is 1), so that the same head with brighter pixels
-gives the same evidence.
+Intensities are normalised (the 99th percentile of V_coarse is 1), so that the same head with brighter pixels gives the
+same predictors.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_gradient_magnitude
 
 from g3r.acquisition.coarse_volume import confidence
-from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
-from g3r.gaussians import GaussianCloud, render
+from g3r.fitting.slice_stage import SliceFit
+from g3r.gaussians import render
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
-from g3r.geometry.grid import on_grid
+from g3r.geometry.grid import bounding_box, on_grid
 
 RESIDUAL_VOXEL_MM = 1.6
 RESIDUAL_SMOOTHING_MM = 1.6
-"""A mean of few noisy residuals says little: they are gathered on coarse voxels and smoothed."""
+"""Few noisy residuals have an unreliable mean: they are gathered on coarse voxels and smoothed."""
 
 RESIDUAL_SUPPORT = 0.1
 """Density (1 is one gapless stack) at which the local residual and that of the whole head count the same."""
@@ -31,31 +32,22 @@ TEXTURE_SIGMA_MM = 2.0
 """Widths at which edges and fine detail of the volume are measured."""
 
 
-def mean_residual(
-    cloud: GaussianCloud,
-    slices: Slices,
-    gain: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    bias_field: list[list[float]],
-    grid: VolumeGrid,
-) -> NDArray[np.float32]:
+def mean_residual(fit: SliceFit, grid: VolumeGrid, cutoff_sigma: float = CUTOFF_SIGMA) -> NDArray[np.float32]:
     """Mean absolute difference [I, J, K] of pixels and rendered slices around each voxel.
 
-    Residuals are spread through the slices' PSF, weighted by trust (the adjoint of the voxel operator), over
-    the same with ones. Where few pixels reach, the value goes to the mean of the head.
+    Residuals are spread through the slices' PSF with the slice weights (the adjoint of the voxel operator), over the
+    same with ones. Where few pixels reach, the value goes to the mean of the head.
 
     Args:
-        cloud: the Gaussians.
-        slices: K slices in their last poses, intensities as the cloud's.
-        gain: [K] intensity factor of each slice.
-        weight: [K] trust in each slice.
-        bias_field: coefficients of the stacks' fields; empty where there are none.
+        fit: Gaussians and slices.
         grid: of the result.
+        cutoff_sigma: where the Gaussians end.
     """
+    slices, gain, weight = fit.slices, fit.gain, fit.weight
     log_gain = torch.from_numpy(np.log(gain).astype(np.float32))
-    rendered = render(cloud, slices.planes, log_gain=log_gain).numpy()
-    if bias_field:
-        rendered = rendered * np.exp(StackBiasField(slices).log_field(np.array(bias_field)))
+    rendered = render(fit.cloud, slices.planes, log_gain=log_gain, cutoff_sigma=cutoff_sigma).numpy()
+    if fit.bias_field:
+        rendered = rendered * np.exp(StackBiasField(slices).log_field(np.array(fit.bias_field)))
     size = np.abs(slices.value - rendered)[slices.pixel_index] / gain[slices.pixel_plane]
     low, high = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
     coarse = VolumeGrid.isotropic(np.minimum(low, high), np.maximum(low, high), RESIDUAL_VOXEL_MM)
@@ -80,13 +72,13 @@ def gather_predictors(
     prior: NDArray[np.float32],
     prior_share: NDArray[np.float32] | None,
 ) -> dict[str, NDArray[np.float64]]:
-    """The evidence [n] on each of the n voxels of the mask, by name.
+    """The predictors [n] of the n voxels of the mask, by name.
 
     Args:
         volume: [I, J, K] normalised intensities, as all intensities here.
-        mask: [I, J, K] where an answer is wanted.
+        mask: [I, J, K] where predictors are wanted.
         grid: of all arrays.
-        residual: [I, J, K] of `mean_residual`.
+        residual: [I, J, K] from `mean_residual`.
         density: [I, J, K] M_rho.
         prior: [I, J, K] the prior volume, or what the fit started from.
         prior_share: [I, J, K] in [0, 1]; None where no prior was used.
@@ -97,9 +89,9 @@ def gather_predictors(
         of the mask.
     """
     spacing = grid.spacing_mm
-    box = _box_around(mask, margin=int(np.ceil(4 * TEXTURE_SIGMA_MM / spacing.min())))
+    box = bounding_box(mask, margin=int(np.ceil(4 * TEXTURE_SIGMA_MM / spacing.min())))
     inside = mask[box]
-    # what lies outside of the head is zero: its edge is no edge of the brain, so continue the head outwards
+    # outside of the head the volume is zero; that edge is no edge of the brain, so continue the head outwards
     image = _continued(np.asarray(volume[box], np.float32), inside)
     predictors: dict[str, NDArray[np.float64]] = {}
 
@@ -137,12 +129,6 @@ def _depth_mm(inside: NDArray[np.bool_], spacing_mm: NDArray[np.float64]) -> NDA
         there = nearest[axis, 1:-1, 1:-1, 1:-1][inside] - 1
         square += ((there - here) * spacing_mm[axis]) ** 2
     return np.sqrt(square)
-
-
-def _box_around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, ...]:
-    index = np.argwhere(mask)
-    low, high = np.maximum(index.min(0) - margin, 0), np.minimum(index.max(0) + 1 + margin, mask.shape)
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
 
 def _continued(image: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:

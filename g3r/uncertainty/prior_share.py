@@ -1,7 +1,7 @@
-"""How far each voxel of a result rests on the prior: the fit's answer to a change of the prior.
+"""Prior share: how far each voxel of a result depends on the prior, from the fit's answer to a change of the prior.
 
-If the prior had been wrong by some amount, how much of that would still be in the volume after the slices
-have had their say? Rendered pixels are linear in the amplitudes, so this can be asked of the finished fit: the
+If the prior had been wrong by some amount, how much of that would still be in the volume after the fit to the slices?
+Rendered pixels are linear in the amplitudes, so this can be asked of the finished fit: the
 amplitudes are changed at random, as another prior would have changed them, the slices stay as they are, and
 conjugate gradients take back what the slices contradict. What is left, as a share of what was put in, is the
 prior's share.
@@ -19,6 +19,7 @@ from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
+from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
 
@@ -30,17 +31,19 @@ SMOOTHING_MM = 3.2
 ANSWER_ITERATIONS = 20
 ANSWER_DAMPING = 0.01
 """Conjugate-gradient steps and pull towards the changed amplitudes that answer as the whole fit does: checked by
-changing the prior volume itself and fitting again (tests/fitting/test_prior_share.py)."""
+changing the prior volume itself and fitting again (tests/uncertainty/test_prior_share.py)."""
 
 
 def estimate_prior_share(
     fit: SliceFit,
+    *,
     density: NDArray[np.float32],
     density_grid: VolumeGrid,
     mask: NDArray[np.bool_],
     grid: VolumeGrid,
     rng: np.random.Generator,
     n_probes: int = N_PROBES,
+    cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
     """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
@@ -48,7 +51,7 @@ def estimate_prior_share(
     With r the share of a change of the prior that the slices leave standing, and c = 1 - exp(-M_rho) the
     confidence, the answer is the larger of r and (1 - c)^2: Gaussians carry what slices say a little beyond
     where they are, but a voxel that nothing measured rests on the prior all the same. The square is how r
-    falls with coverage where slices lie evenly. Shapes, poses, gains and trust are those of the finished fit.
+    falls with coverage where slices lie evenly. Shapes, poses, gains and slice weights are those of the finished fit.
 
     Args:
         fit: of stage 2.
@@ -58,13 +61,17 @@ def estimate_prior_share(
         grid: of the answer.
         rng: draws the changes.
         n_probes: number of random changes; their answers are averaged.
+        cutoff_sigma: where the fit's Gaussians end.
         projection_bytes: see `solve_amplitudes`.
 
     Returns:
         [I, J, K] float32 in [0, 1].
     """
     unseen = 1 - on_grid(confidence(density), density_grid, grid, outside=0.0)
-    left = on_grid(remaining_share(fit, grid, rng, n_probes, projection_bytes), _coarse(grid), grid, outside=1.0)
+    remaining = remaining_share(
+        fit, grid, rng=rng, n_probes=n_probes, cutoff_sigma=cutoff_sigma, projection_bytes=projection_bytes
+    )
+    left = on_grid(remaining, _coarse(grid), grid, outside=1.0)
     share = np.maximum(np.clip(left, 0, 1), np.clip(unseen, 0, 1) ** 2)
     return np.where(mask, share, 1.0).astype(np.float32)
 
@@ -72,14 +79,24 @@ def estimate_prior_share(
 def remaining_share(
     fit: SliceFit,
     grid: VolumeGrid,
+    *,
     rng: np.random.Generator,
     n_probes: int = N_PROBES,
+    cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
     """r: how much of a random change of the amplitudes the slices leave standing, on a coarse grid over `grid`.
 
     The local regression of what is left on what was put in, <left, put in> / <put in, put in>, with means
     over a Gaussian neighbourhood and all probes; 1 where no Gaussian reaches.
+
+    Args:
+        fit: of stage 2.
+        grid: of the result.
+        rng: draws the changes.
+        n_probes: number of random changes.
+        cutoff_sigma: where the fit's Gaussians end.
+        projection_bytes: see `solve_amplitudes`.
     """
     slices, coarse = fit.slices, _coarse(grid)
     planes, sampling = slices.planes, volume_planes(coarse)
@@ -89,7 +106,7 @@ def remaining_share(
     together, square = np.zeros(coarse.shape), np.zeros(coarse.shape)
 
     def volume(cloud: GaussianCloud) -> NDArray[np.float32]:
-        return volume_from_pixels(render(cloud, sampling).numpy(), coarse)
+        return volume_from_pixels(render(cloud, sampling, cutoff_sigma=cutoff_sigma).numpy(), coarse)
 
     for _ in range(n_probes):
         change = torch.from_numpy(rng.standard_normal(len(fit.cloud)).astype(np.float32))
@@ -102,6 +119,7 @@ def remaining_share(
             gain=fit.gain,
             n_iterations=ANSWER_ITERATIONS,
             damping=ANSWER_DAMPING,
+            cutoff_sigma=cutoff_sigma,
             projection_bytes=projection_bytes,
         )
         put_in, left = volume(probe), volume(answer)

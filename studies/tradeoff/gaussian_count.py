@@ -130,7 +130,15 @@ def _curves(subject: Subject, name: str, voxel_mm: float, seed: int = 0) -> dict
     for bound in BOUNDS.get(name, USUAL_BOUNDS):
         start = time.process_time()
         settings = replace(adaptive, bound=bound)
-        cloud, done = fit_adaptive(volume, mask, grid, finest, settings, STAGE, np.random.default_rng(seed))
+        cloud, done = fit_adaptive(
+            volume,
+            mask,
+            grid,
+            finest_spacing_mm=finest,
+            settings=settings,
+            stage=STAGE,
+            rng=np.random.default_rng(seed),
+        )
         keep("adaptive", cloud, start, done.record())
         max_steps = max(max_steps, done.steps)
     iterations = ADAPTIVE.amplitude_iterations * (max_steps // adaptive.round_steps)

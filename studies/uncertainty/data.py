@@ -18,7 +18,7 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
-from g3r.uncertainty.estimate import collect
+from g3r.uncertainty.estimate import UncertaintyInputs
 from studies.runs import aligned
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import stacks
@@ -172,17 +172,25 @@ def relative_error(
 def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
     """What the map of a result was made of."""
     scale = np.float32(result.intensity_scale)
-    fit = SliceFit(result.cloud, result.slices, result.gain, result.weight, [], result.record.bias_field)
-    return collect(
-        result.volume / scale,
-        result.mask,
-        result.grid,
-        fit,
-        result.prior / scale,
-        result.density,
-        result.prior_grid,
-        result.prior_share,
+    fit = SliceFit(
+        cloud=result.cloud,
+        slices=result.slices,
+        gain=result.gain,
+        weight=result.weight,
+        history=[],
+        bias_field=result.record.bias_field,
     )
+    given = UncertaintyInputs(
+        volume=result.volume / scale,
+        mask=result.mask,
+        grid=result.grid,
+        fit=fit,
+        prior=result.prior / scale,
+        density=result.density,
+        prior_grid=result.prior_grid,
+        prior_share=result.prior_share,
+    )
+    return given.predictors()
 
 
 def _cached_registration(

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from g3r.bench import kernels
-from g3r.bench.kernel_rates import copy_bytes_per_second, fused_per_second
-from g3r.bench.kernel_scene import count_pixels, head_scene, record_space
+from g3r.bench.kernel_timing import copy_bytes_per_second, fused_per_second
+from g3r.bench.scenes import evaluations, head_scene
 from g3r.gaussians import find_overlaps
-from g3r.gaussians.overlap import CloudArrays
-from g3r.gaussians.render import CUTOFF_SIGMA, plane_arguments
+from g3r.gaussians.arrays import CloudArrays
+from g3r.gaussians.render import CUTOFF_SIGMA
 
 
 def options(*arguments: str) -> argparse.Namespace:
@@ -45,9 +45,7 @@ def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_pixels_are_counted_as_the_dense_formula_counts_them() -> None:
     scene = head_scene(20, n_slices=2)
     planes, arrays = scene.slices.planes, CloudArrays.of(scene.cloud)
-    pairs = find_overlaps(scene.cloud, planes, CUTOFF_SIGMA)
-    described = plane_arguments(planes, planes.center_mm, np.ones(len(planes)), pairs)
-    found, _ = count_pixels(arrays.shapes, *described, CUTOFF_SIGMA**2, record_space(pairs.most))
+    found, _ = evaluations(scene.cloud, planes, CUTOFF_SIGMA)
     covariance = np.zeros((20, 3, 3))
     for n, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
         covariance[:, a, b] = covariance[:, b, a] = arrays.shapes[:, 3 + n]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.bench.exponents import fitted_exponent
-from g3r.bench.pareto import pareto_front
+from g3r.bench.scaling_tables import fitted_exponent
+from g3r.bench.trade_tables import pareto_front
 
 
 def test_front_has_what_no_other_point_beats():

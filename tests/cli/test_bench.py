@@ -34,6 +34,13 @@ def test_names_its_commands(capsys):
         bench.main(["nothing"])
 
 
+def test_presets_are_named_once():
+    from g3r.planning import PRESET_NAMES
+    from g3r.planning.presets import PRESETS
+
+    assert tuple(PRESETS) == PRESET_NAMES
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -41,6 +48,7 @@ def test_names_its_commands(capsys):
         ["trade", "nowhere"],
         ["trade", "nowhere", "--repeats", "0"],
         ["trade", "--redraw", "--output", "nowhere"],
+        ["kernels", "--redraw", "--output", "nowhere"],
         ["scaling", "--sizes", "1"],
     ],
 )
@@ -116,8 +124,7 @@ def test_scaling_measures_what_grows(tmp_path):
 def test_work_is_proportional_to_what_grows():
     from dataclasses import replace
 
-    from g3r.bench.scenes import SceneSize, made_cloud, made_slices, pixel_evaluations
-    from g3r.gaussians import find_overlaps
+    from g3r.bench.scenes import SceneSize, evaluations, made_cloud, made_slices
 
     base = SceneSize(n_gaussians=400, n_slices=12, n_pixels=256)
     for field in ("n_gaussians", "n_slices", "n_pixels"):
@@ -126,7 +133,7 @@ def test_work_is_proportional_to_what_grows():
             size = replace(base, **{field: factor * getattr(base, field)})
             cloud = made_cloud(size)
             planes = made_slices(size, cloud).planes
-            work.append(pixel_evaluations(cloud, planes, find_overlaps(cloud, planes, 3.2), 3.2))
+            work.append(evaluations(cloud, planes, 3.2)[0])
         assert work[1] / work[0] == pytest.approx(4, rel=0.1), field
     assert {field for field, *_ in GROWING.values()} == {"n_gaussians", "n_slices", "n_pixels", "n_voxels"}
 

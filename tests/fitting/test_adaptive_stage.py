@@ -19,7 +19,10 @@ QUICK = AdaptiveSettings(bound=0.08, round_steps=15, n_rounds=5)
 
 
 def fitted(bound: float = 0.08, volume=SHEETS, mask=BALL, finest_mm: float = 2.0):
-    return fit_adaptive(volume, mask, GRID, finest_mm, replace(QUICK, bound=bound), STAGE, np.random.default_rng(3))
+    settings = replace(QUICK, bound=bound)
+    return fit_adaptive(
+        volume, mask, GRID, finest_spacing_mm=finest_mm, settings=settings, stage=STAGE, rng=np.random.default_rng(3)
+    )
 
 
 def test_tighter_bounds_need_more_gaussians_and_leave_less():

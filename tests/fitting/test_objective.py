@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.acquisition.planes import volume_planes
 from g3r.errors import NumericalError
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.prior_stage import VolumeTarget
-from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
-from g3r.fitting.slice_term import SliceTerm
+from g3r.fitting.slice_parameters import SliceParameters
+from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.overlap import OverlapFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
-from tests.fitting.test_stages import BALL, GRID, make_slices, seeded, true_cloud
+from tests.fitting.scene import BALL, GRID, fit, make_slices, seeded, true_volume
+from tests.gaussians.scenes import cloud_of
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, bias_field_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4
@@ -26,7 +27,7 @@ STRENGTH = 0.4
 
 @pytest.fixture(scope="module")
 def volume() -> np.ndarray:
-    return volume_from_pixels(render(true_cloud(), volume_planes(GRID), cutoff_sigma=6.0).numpy(), GRID)
+    return true_volume()
 
 
 class Scene:
@@ -35,35 +36,35 @@ class Scene:
     At a cut-off of 6 sigma the dense reference sees the same image.
     """
 
-    def __init__(
-        self, volume: np.ndarray, seed: int, attenuation: str = "exact", cutoff_sigma: float = CUTOFF_SIGMA
-    ) -> None:
+    def __init__(self, volume: np.ndarray, seed: int, cutoff_sigma: float = CUTOFF_SIGMA) -> None:
         rng = np.random.default_rng(seed)
         self.slices = make_slices()
-        n, self.attenuation = len(self.slices), attenuation
+        n = len(self.slices)
         self.slice_weight = rng.uniform(0.2, 1, n).astype(np.float32).astype(float)
         cloud = seeded(volume)
         cloud = cloud.take(torch.arange(0, len(cloud), 3))
         self.bias_field = StackBiasField(self.slices)
         blocks = {
-            "turn": (rng.normal(0, 0.05, (n, 3)), 1e-3),
-            "shift": (rng.normal(0, 0.3, (n, 3)), 0.03),
+            "rotation": (rng.normal(0, 0.05, (n, 3)), 1e-3),
+            "translation": (rng.normal(0, 0.3, (n, 3)), 0.03),
             "log_gain": (rng.normal(0, 0.2, n), 2e-3),
-            "shading": (rng.normal(0, 0.2, (3, 5)), 8e-3),
+            "bias_field": (rng.normal(0, 0.2, (3, 5)), 8e-3),
         }
         self.parameters = FitParameters(cloud, LearningRates(), blocks)
         self.prior = VolumeTarget.of(0.9 * volume, (BALL * 0.7).astype(np.float32), GRID)
         self.chosen = np.array([1, 5, 9, 14])
-        exact = attenuation == "exact"
-        ones = np.ones(n)
-        self.term = SliceTerm(
-            self.slices, ones, self.slice_weight, self.parameters, self.bias_field, exact, cutoff_sigma
+        self.unknowns = SliceParameters(self.slices, np.ones(n), self.parameters)
+        self.term = ImageTerm.of(
+            self.slices.planes,
+            self.slices.value,
+            self.slices.mask.astype(np.float32),
+            basis=self.bias_field.basis,
+            with_pose=True,
+            cutoff_sigma=cutoff_sigma,
         )
-        self.distilled = ImageTerm(
-            self.prior.planes, self.prior.value, self.prior.weight, cloud.origin_mm, cutoff_sigma=cutoff_sigma
-        )
-        self.distilled.choose(self.chosen)
-        self.objective = CloudObjective(self.parameters, [self.term, self.distilled], SETTINGS.scale_weight)
+        prior = ImageTerm.of(self.prior.planes, self.prior.value, self.prior.weight, cutoff_sigma=cutoff_sigma)
+        self.distilled = prior.take(self.chosen)
+        self.objective = CloudObjective(self.parameters, SETTINGS.scale_weight)
         self.seed = self.objective.seed_log_scale
         for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude"):
             value = self.parameters.value[name]
@@ -71,14 +72,17 @@ class Scene:
 
     def evaluate(self) -> float:
         """The explicit loss; its gradient is in the parameters."""
-        self.term.update()
-        self.objective.begin()
-        image = self.objective.add(self.term, 1.0)
-        distance = self.objective.add(self.distilled, STRENGTH)
-        self.image = image
-        regulariser = self.objective.finish()
-        others = self.term.finish(image, SETTINGS.pose_prior_mm, SETTINGS.bias_field_ridge)
-        return image + STRENGTH * distance + regulariser + others
+        step = self.objective.begin(
+            {
+                "slices": (self.term, self.unknowns.state(self.slice_weight)),
+                "prior": (self.distilled, PlaneState.of(self.distilled.planes, self.parameters.origin_mm)),
+            }
+        )
+        self.image = step.add("slices", 1.0)
+        distance = step.add("prior", STRENGTH).mean
+        regulariser = step.finish()
+        others = self.unknowns.finish(self.image, SETTINGS.pose_prior_mm, SETTINGS.bias_field_ridge)
+        return self.image.mean + STRENGTH * distance + regulariser + others
 
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
         """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
@@ -87,13 +91,11 @@ class Scene:
             *[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
         )
         log_gain = leaves["log_gain"] - leaves["log_gain"].mean()
-        twist = torch.cat([leaves["turn"], leaves["shift"]], 1)
-        pixels = render(
-            cloud, self.slices.planes, twist=twist, log_gain=log_gain, backend="reference", attenuation=self.attenuation
-        )
+        twist = torch.cat([leaves["rotation"], leaves["translation"]], 1)
+        pixels = render(cloud, self.slices.planes, twist=twist, log_gain=log_gain, backend="reference")
         basis = torch.tensor(self.bias_field.basis).double()
         of_pixel = self.slices.stack_id[self.slices.planes.plane_id()]
-        pixels = pixels * (leaves["shading"][of_pixel] * basis.T).sum(1).exp()
+        pixels = pixels * (leaves["bias_field"][of_pixel] * basis.T).sum(1).exp()
         weight = torch.tensor(self.slices.mask * self.slice_weight[self.slices.planes.plane_id()])
         image = (weight * (pixels - torch.tensor(self.slices.value)).abs()).sum() / weight.sum()
         part = self.prior.take(self.chosen)
@@ -102,9 +104,9 @@ class Scene:
         loss = image + STRENGTH * (weight * near.abs()).sum() / weight.sum()
         away = leaves["log_scale"] - torch.tensor(self.seed)
         loss = loss + SETTINGS.scale_weight * away.square().mean()
-        loss = loss + SETTINGS.bias_field_ridge * leaves["shading"].square().mean()
+        loss = loss + SETTINGS.bias_field_ridge * leaves["bias_field"].square().mean()
         radius = np.sqrt(((self.slices.planes.shape * self.slices.planes.spacing_mm / 2) ** 2).sum(1)).mean() / 2
-        moved = leaves["shift"].square().sum(1) + (radius * leaves["turn"]).square().sum(1)
+        moved = leaves["translation"].square().sum(1) + (radius * leaves["rotation"]).square().sum(1)
         loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
         loss.backward()
         return loss.item(), {name: leaf.grad.numpy() for name, leaf in leaves.items()}
@@ -124,7 +126,7 @@ def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume:
 def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
     scene = Scene(volume, 2, cutoff_sigma=6.0)
     scene.evaluate()
-    image = scene.image
+    image = scene.image.mean
     gradient = {name: g.astype(float) for name, g in scene.parameters.gradient.items()}
     rng = np.random.default_rng(3)
     for name, g in gradient.items():
@@ -136,7 +138,8 @@ def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
             value[...] = start + sign * direction
             values.append(scene.evaluate())
             # the image's value scales the pose prior as a constant
-            values[-1] += (image - scene.image) * scene.term.finish(1.0, SETTINGS.pose_prior_mm, 0.0)
+            one = replace(scene.image, mean=1.0)
+            values[-1] += (image - scene.image.mean) * scene.unknowns.finish(one, SETTINGS.pose_prior_mm, 0.0)
         value[...] = start
         slope = float((g * direction).sum())
         assert (values[0] - values[1]) / 2 == pytest.approx(slope, rel=0.03), name
@@ -147,22 +150,23 @@ def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray):
     cloud = scene.parameters.cloud()
     value = render(cloud, scene.prior.planes).numpy()
     parameters = FitParameters(cloud, LearningRates())
-    term = ImageTerm(scene.prior.planes, value, np.ones_like(value), cloud.origin_mm)
-    objective = CloudObjective(parameters, [term], 0.0)
-    objective.begin()
-    assert objective.add(term, 1.0) == 0
-    objective.finish()
+    assert alone(parameters, ImageTerm.of(scene.prior.planes, value, np.ones_like(value))) == 0
     assert all((g == 0).all() for g in parameters.gradient.values())
 
 
 def test_where_nothing_counts_the_term_is_zero(volume: np.ndarray):
     scene = Scene(volume, 5)
-    term = ImageTerm(scene.prior.planes, scene.prior.value, 0 * scene.prior.weight, scene.parameters.origin_mm)
-    objective = CloudObjective(scene.parameters, [term], 0.0)
-    objective.begin()
-    assert objective.add(term, 1.0) == 0
-    objective.finish()
+    term = ImageTerm.of(scene.prior.planes, scene.prior.value, 0 * scene.prior.weight)
+    assert alone(scene.parameters, term) == 0
     assert (scene.parameters.gradient["mean_mm"] == 0).all()
+
+
+def alone(parameters: FitParameters, term: ImageTerm) -> float:
+    """The loss of one term; its gradient is in the parameters."""
+    step = CloudObjective(parameters, 0.0).begin({"one": (term, PlaneState.of(term.planes, parameters.origin_mm))})
+    image = step.add("one", 1.0).mean
+    step.finish()
+    return image
 
 
 def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
@@ -170,14 +174,15 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
     scene = Scene(volume, 6)
     for _ in range(12):
         loss = scene.evaluate()
-        for term in scene.objective.terms:
-            shapes, cutoff = scene.objective.shapes, CUTOFF_SIGMA
+        states = {"slices": scene.unknowns.state(scene.slice_weight), "prior": None}
+        for name, held in scene.objective.overlaps.items():
+            shapes, planes, state = scene.objective.shapes, held.term.planes, states[name] or held.state
             finder = OverlapFinder(len(shapes))
-            needed = finder.find(shapes, term.planes, term.rotation, term.center_mm, cutoff)
-            for k in range(len(term.planes)):
-                held = term.pairs.gaussian[term.pairs.start[k] : term.pairs.start[k + 1]]
+            needed = finder.find(shapes, planes, state.rotation, state.center_mm, CUTOFF_SIGMA)
+            for k in range(len(planes)):
+                kept = held.pairs.gaussian[held.pairs.start[k] : held.pairs.start[k + 1]]
                 now = needed.gaussian[needed.start[k] : needed.start[k + 1]]
-                assert np.isin(now, held).all()
+                assert np.isin(now, kept).all()
         scene.parameters.step(loss, 0.1)
     assert scene.objective.n_searches < 6
 
@@ -203,25 +208,20 @@ def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray):
 def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: np.ndarray):
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("numba was started with one thread")
-    slices, ones = make_slices(), np.ones(24)
+    slices = make_slices()
     prior = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     before, images = numba.get_num_threads(), []
     try:
         for n_threads in (1, 2):
             numba.set_num_threads(n_threads)
-            fit = fit_slices(
-                seeded(volume), slices, ones, ones, prior, SliceStageSettings(n_steps=8), np.random.default_rng(0)
-            )
-            images.append(render(fit.cloud, volume_planes(GRID)).numpy())
+            images.append(render(fit(volume, slices, prior, n_steps=8).cloud, volume_planes(GRID)).numpy())
     finally:
         numba.set_num_threads(before)
     assert np.abs(images[0] - images[1]).max() <= 1e-5 * np.abs(images[0]).max()
 
 
 def one_gaussian() -> GaussianCloud:
-    return GaussianCloud(
-        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0), np.zeros(3)
-    )
+    return cloud_of(np.zeros((1, 3)), np.zeros((1, 3)), [[1.0, 0, 0, 0]], [2.0])
 
 
 def test_a_step_is_that_of_torch_adam():
@@ -275,9 +275,8 @@ def test_a_gradient_that_is_not_finite_stops_the_fit():
 
 
 def test_pixels_that_are_not_finite_stop_the_fit(volume: np.ndarray):
-    slices, ones = make_slices(), np.ones(24)
+    slices = make_slices()
     value = slices.value.copy()
     value[np.flatnonzero(slices.mask)[5]] = np.nan
-    settings = SliceStageSettings(n_steps=2, amplitude_iterations=0)
     with pytest.raises(NumericalError, match="not finite"):
-        fit_slices(seeded(volume), replace(slices, value=value), ones, ones, None, settings, np.random.default_rng(0))
+        fit(volume, replace(slices, value=value), n_steps=2, amplitude_iterations=0)

@@ -5,75 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from g3r.acquisition.planes import Planes, Slices, volume_from_pixels, volume_planes
-from g3r.acquisition.psf import psf_variance_mm2
+from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
 from g3r.fitting.schedules import AnnealedWeight
-from g3r.fitting.slice_stage import SliceStageSettings, fit_slices, prior_strength
+from g3r.fitting.slice_stage import SliceStageSettings, prior_strength
 from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.seeding import seed_cloud
-from g3r.geometry import VolumeGrid
-
-GRID = VolumeGrid.isotropic([-11] * 3, [11] * 3, 1.0)
-INDEX = np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1)
-BALL = (GRID.world(INDEX) ** 2).sum(-1) < 9.5**2
-
-
-def true_cloud() -> GaussianCloud:
-    rng = np.random.default_rng(0)
-    n = 40
-    points = rng.normal(size=(n, 3))
-    points *= (8 * rng.random(n) ** (1 / 3) / np.linalg.norm(points, axis=1))[:, None]
-    return GaussianCloud(
-        torch.tensor(points).float(),
-        torch.tensor(np.log(rng.uniform(1.3, 2.6, (n, 3)))).float(),
-        torch.tensor(rng.normal(size=(n, 4))).float(),
-        torch.tensor(rng.uniform(0.2, 0.6, n)).float(),
-        np.zeros(3),
-    )
+from tests.fitting.scene import BALL, GRID, fit, make_slices, seeded, true_volume
 
 
 @pytest.fixture(scope="module")
 def volume() -> np.ndarray:
-    return volume_from_pixels(render(true_cloud(), volume_planes(GRID), cutoff_sigma=6.0).numpy(), GRID)
-
-
-def make_slices(gain: np.ndarray | None = None) -> Slices:
-    """Three stacks of eight slices of the true cloud, with its PSF."""
-    turns = [
-        Rotation.identity(),
-        Rotation.from_euler("x", 90, degrees=True),
-        Rotation.from_euler("y", 90, degrees=True),
-    ]
-    rotation = np.repeat([turn.as_matrix() for turn in turns], 8, axis=0)
-    center = rotation[:, :, 2] * np.tile((np.arange(8) - 3.5) * 2.4, 3)[:, None]
-    spacing = np.full((24, 2), 1.0)
-    planes = Planes(
-        rotation=rotation,
-        center_mm=center,
-        spacing_mm=spacing,
-        shape=np.full((24, 2), 20),
-        psf_var_mm2=psf_variance_mm2(spacing, np.full(24, 2.4)),
-    )
-    value = render(true_cloud(), planes, cutoff_sigma=6.0).numpy()
-    if gain is not None:
-        value = value * gain[planes.plane_id()].astype(np.float32)
-    mask = np.linalg.norm(planes.pixel_world_mm(), axis=1) < 10
-    return Slices(
-        planes=planes,
-        value=value,
-        mask=mask,
-        stack_id=np.repeat(np.arange(3), 8),
-        slice_index=np.tile(np.arange(8), 3),
-        thickness_mm=np.full(24, 2.4),
-        header_pose=planes.pose,
-    )
-
-
-def seeded(volume: np.ndarray) -> GaussianCloud:
-    return seed_cloud(volume, BALL, GRID, 2.4)
+    return true_volume()
 
 
 def volume_error(cloud: GaussianCloud, volume: np.ndarray) -> float:
@@ -81,22 +24,12 @@ def volume_error(cloud: GaussianCloud, volume: np.ndarray) -> float:
     return float(np.abs(found - volume)[BALL].mean())
 
 
-def fit(
-    volume: np.ndarray, slices: Slices, prior: VolumeTarget | None = None, gain: np.ndarray | None = None, **options
-):
-    ones = np.ones(len(slices))
-    settings = SliceStageSettings(**({"n_steps": 40} | options))
-    rng = np.random.default_rng(0)
-    return fit_slices(seeded(volume), slices, ones if gain is None else gain, ones, prior, settings, rng)
-
-
 def test_stage_1_comes_close_to_the_volume(volume: np.ndarray):
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     calls: list[tuple[int, int]] = []
     settings = PriorStageSettings(n_steps=30)
-    cloud, history = fit_prior(
-        seeded(volume), target, settings, np.random.default_rng(0), lambda done, total: calls.append((done, total))
-    )
+    progress = lambda done, total: calls.append((done, total))  # noqa: E731
+    cloud, history = fit_prior(seeded(volume), target, settings, np.random.default_rng(0), progress=progress)
     assert len(history) == 30
     assert np.mean(history[-5:]) < 0.75 * np.mean(history[:5])
     assert volume_error(cloud, volume) < 0.35 * volume_error(seeded(volume), volume)
@@ -175,15 +108,7 @@ def test_gains_are_recovered(volume: np.ndarray):
 
 def test_a_single_slice_keeps_its_gain(volume: np.ndarray):
     slices = make_slices().take([3])
-    result = fit_slices(
-        seeded(volume),
-        slices,
-        np.array([1.3]),
-        np.ones(1),
-        None,
-        SliceStageSettings(n_steps=5),
-        np.random.default_rng(0),
-    )
+    result = fit(volume, slices, gain=np.array([1.3]), n_steps=5)
     assert result.gain[0] == pytest.approx(1.3, rel=1e-6)
 
 
@@ -202,7 +127,7 @@ def test_distillation_fades_and_holds_what_no_slice_sees(volume: np.ndarray):
     torch.testing.assert_close(off.cloud.amplitude, free.cloud.amplitude)
 
 
-def test_a_spoilt_slice_is_trusted_less(volume: np.ndarray):
+def test_a_spoilt_slice_is_down_weighted(volume: np.ndarray):
     slices = make_slices()
     bad = slices.planes.plane_id() == 4
     value = slices.value.copy()

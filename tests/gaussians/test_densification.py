@@ -1,4 +1,4 @@
-"""ResidualExtrema of a residual, and Gaussians that nobody would miss."""
+"""Extrema of a residual as Gaussians; pruning and merging."""
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from g3r.gaussians.densification import (
     with_duplicates_merged,
 )
 from g3r.geometry import VolumeGrid
+from tests.gaussians.scenes import cloud_of
 
 AFFINE = np.eye(4)
 AFFINE[:3, :3] = Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix() * [-0.8, 0.8, 0.8]
@@ -28,12 +29,12 @@ GRID = VolumeGrid((40, 42, 38), AFFINE)
 ALL = np.ones(GRID.shape, bool)
 
 
-def cloud_of(mean, sigma, amplitude, rotation=None) -> GaussianCloud:
+def gaussians(mean, sigma, amplitude, rotation=None) -> GaussianCloud:
     mean = np.atleast_2d(np.asarray(mean, float))
     n = len(mean)
-    turn = Rotation.identity(n) if rotation is None else rotation
-    arrays = (mean, np.log(np.broadcast_to(sigma, (n, 3))), turn.as_quat()[:, [3, 0, 1, 2]], np.array(amplitude, float))
-    return GaussianCloud.of([torch.from_numpy(np.array(a, np.float32)) for a in arrays], GRID.center_mm)
+    rotation = Rotation.identity(n) if rotation is None else rotation
+    log_scale = np.log(np.broadcast_to(sigma, (n, 3)))
+    return cloud_of(mean, log_scale, rotation.as_quat()[:, [3, 0, 1, 2]], amplitude, GRID.center_mm)
 
 
 def shown(cloud: GaussianCloud) -> np.ndarray:
@@ -41,11 +42,11 @@ def shown(cloud: GaussianCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("amplitude", [0.6, -0.3])
-def test_a_blob_is_found_with_its_place_shape_and_height(amplitude: float):
+def test_an_extremum_is_found_with_its_place_shape_and_height(amplitude: float):
     turn = Rotation.from_rotvec([[0.4, -0.7, 0.2]])
-    true = cloud_of([[1.1, -2.0, 0.5]], [2.6, 1.8, 1.1], [amplitude], turn)
-    blobs = find_extrema(shown(true), ALL, GRID, 1.2, 0.5)
-    best = blobs.take(np.array([np.argmax(blobs.gain)]))
+    true = gaussians([[1.1, -2.0, 0.5]], [2.6, 1.8, 1.1], [amplitude], turn)
+    extrema = find_extrema(shown(true), ALL, GRID, 1.2, 0.5)
+    best = extrema.take(np.array([np.argmax(extrema.gain)]))
     found = best.cloud(GRID, GRID.center_mm)
     assert np.linalg.norm((found.mean_mm - true.mean_mm).numpy()) < 0.8
     np.testing.assert_allclose(np.sort(best.sigma_mm[0]), [1.1, 1.8, 2.6], rtol=0.2)
@@ -54,10 +55,10 @@ def test_a_blob_is_found_with_its_place_shape_and_height(amplitude: float):
     assert abs(float(thin @ torch.from_numpy(turn.as_matrix()[0][:, 2]).float())) > 0.95
 
 
-def test_a_residual_of_zero_has_no_blobs():
-    blobs = find_extrema(np.zeros(GRID.shape, np.float32), ALL, GRID, 1.2, 0.5)
-    assert len(blobs) == 0
-    assert len(blobs.cloud(GRID, GRID.center_mm)) == 0
+def test_a_residual_of_zero_has_no_extrema():
+    extrema = find_extrema(np.zeros(GRID.shape, np.float32), ALL, GRID, 1.2, 0.5)
+    assert len(extrema) == 0
+    assert len(extrema.cloud(GRID, GRID.center_mm)) == 0
 
 
 def test_local_rms_of_a_constant_is_the_constant_and_zero_outside():
@@ -68,10 +69,10 @@ def test_local_rms_of_a_constant_is_the_constant_and_zero_outside():
     assert not rms[~mask].any()
 
 
-def test_lattices_are_crowded_at_their_own_spacing_and_not_at_half_of_it():
+def test_density_is_exceeded_at_their_own_spacing_and_not_at_half_of_it():
     axis = np.arange(-12, 12.1, 2.0)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    lattice = cloud_of(points, 1.2, np.ones(len(points)))
+    lattice = gaussians(points, 1.2, np.ones(len(points)))
     asked = GRID.center_mm + np.random.default_rng(0).uniform(-6, 6, (50, 3))
     assert exceeds_density(lattice, asked, 2.4).all()
     assert not exceeds_density(lattice, asked, 1.0).any()
@@ -82,8 +83,8 @@ def test_lattices_are_crowded_at_their_own_spacing_and_not_at_half_of_it():
 def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolerance(seed, tolerance):
     """The integral of the squared change, as the voxels see it, for one Gaussian and for one pair."""
     rng = np.random.default_rng(seed)
-    one = cloud_of(rng.uniform(-3, 3, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1))
-    near = cloud_of(
+    one = gaussians(rng.uniform(-3, 3, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1))
+    near = gaussians(
         one.mean_mm.numpy() + rng.uniform(-1, 1, (1, 3)),
         rng.uniform(1.0, 2.2, (1, 3)),
         rng.uniform(0.02, 0.5, 1),
@@ -97,18 +98,18 @@ def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolera
             torch.testing.assert_close(fewer.amplitude, cloud.amplitude)
 
 
-def test_twins_become_one_and_opposites_stay():
-    twins = cloud_of([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
-    merged = with_duplicates_merged(twins, 0.05)
+def test_duplicates_become_one_and_opposites_stay():
+    duplicates = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
+    merged = with_duplicates_merged(duplicates, 0.05)
     assert len(merged) == 1
     assert float(merged.mean_mm[0, 0]) == pytest.approx(0.1, abs=1e-5)
-    assert np.abs(shown(twins) - shown(merged)).max() < 0.01
-    opposite = cloud_of([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
+    assert np.abs(shown(duplicates) - shown(merged)).max() < 0.01
+    opposite = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
     assert len(with_duplicates_merged(opposite, 0.05)) == 2
 
 
 def test_clouds_of_none_or_one_pass_through():
-    one = cloud_of([[0, 0, 0]], 1.5, [1.0])
+    one = gaussians([[0, 0, 0]], 1.5, [1.0])
     none = one.take(torch.zeros(1, dtype=torch.bool))
     assert len(with_duplicates_merged(one, 1.0)) == 1
     assert len(with_duplicates_merged(none, 1.0)) == len(pruned(none, 1.0)) == 0

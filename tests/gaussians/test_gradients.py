@@ -34,7 +34,7 @@ def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0):
 
 
 def image(leaves, planes, **options):
-    cloud = GaussianCloud(*leaves[:4], np.full(3, 50.0))
+    cloud = GaussianCloud.of(leaves[:4], np.full(3, 50.0))
     return render(cloud, planes, twist=leaves[4], log_gain=leaves[5], **options)
 
 

@@ -1,4 +1,4 @@
-"""Where the first Gaussians stand, how many, and how flat a constant comes out."""
+"""Where the first Gaussians are, how many, and how flat a constant comes out."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_a_constant_comes_out_flat(spacing: float):
     assert np.abs(found[middle] - 0.7).max() < 0.03 * 0.7
 
 
-def test_seeds_are_flattened_across_an_edge():
+def test_seeds_are_flat_across_an_edge():
     """At a step along the grid's third axis the smallest sigma points across it, in world axes."""
     volume = (INDEX[..., 2] > 18.5).astype(np.float32)
     cloud = seed_cloud(volume, BALL, GRID, 2.0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from g3r.acquisition.planes import Planes
-from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.amplitudes import AmplitudeSystem
@@ -36,22 +36,16 @@ def objective(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated
     sign, size = weight.sign().numpy(), weight.abs().numpy()
     far = 10 * float(cloud.amplitude.abs().sum()) + 1
     parameters = FitParameters(single(cloud), LearningRates())
-    term = ImageTerm(
-        planes,
-        (-far * sign).astype(np.float32),
-        size.astype(np.float32),
-        cloud.origin_mm,
-        with_pose=True,
-        cutoff_sigma=FULL_CUTOFF,
+    term = ImageTerm.of(
+        planes, (-far * sign).astype(np.float32), size.astype(np.float32), with_pose=True, cutoff_sigma=FULL_CUTOFF
     )
-    made = CloudObjective(parameters, [term], 0.0)
-    made.begin()
-    mean = made.add(term, 1.0)
-    made.finish()
+    step = CloudObjective(parameters, 0.0).begin({"image": (term, PlaneState.of(planes, cloud.origin_mm))})
+    image = step.add("image", 1.0)
+    step.finish()
     total = float(size.astype(np.float32).astype(float).sum())
     one = {name: torch.from_numpy(g.astype(float)) * total for name, g in parameters.gradient.items()}
-    plane = torch.from_numpy(term.plane_gradient) * total
-    assert np.isfinite(mean)
+    plane = torch.from_numpy(image.plane_gradient) * total
+    assert np.isfinite(image.mean)
     return torch.zeros(0), {
         "centre": one["mean_mm"],
         "shape": torch.cat([one["log_scale"], one["quaternion_wxyz"]], 1),
@@ -64,7 +58,7 @@ def objective(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated
 
 def amplitudes(cloud: GaussianCloud, planes: Planes, weight: Tensor) -> Evaluated:
     """The linear system of the amplitudes and its adjoint."""
-    system = AmplitudeSystem.of(single(cloud), planes, cutoff_sigma=FULL_CUTOFF)
+    system = AmplitudeSystem(single(cloud), planes, cutoff_sigma=FULL_CUTOFF)
     pixels = torch.from_numpy(system.forward(cloud.amplitude.numpy())).double()
     return pixels, {"amplitude": torch.from_numpy(system.adjoint(weight.numpy().astype(np.float32)))}
 

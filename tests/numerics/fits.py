@@ -173,7 +173,13 @@ def fit_at(factor: float, guarded: bool = True, n_steps: int = 60) -> SliceFit:
         if not guarded:
             divergence_guard.RISE = math.inf
         return fit_slices(
-            seed_cloud(guess, mask, grid, 2.5), slices, ones, ones, None, settings, np.random.default_rng(0)
+            seed_cloud(guess, mask, grid, 2.5),
+            slices,
+            gain=ones,
+            weight=ones,
+            prior=None,
+            settings=settings,
+            rng=np.random.default_rng(0),
         )
     finally:
         divergence_guard.RISE = before

@@ -93,7 +93,7 @@ def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit():
         head_scene().cloud.origin_mm,
     )
     planes = head_scene().planes.take([4, 5])
-    shown = AmplitudeSystem.of(cloud, planes).forward(np.ones(1, np.float32))
+    shown = AmplitudeSystem(cloud, planes).forward(np.ones(1, np.float32))
     matrix = shown[:, None].astype(np.float32)
     assert 0 < matrix.sum() < 1e-4
     target = np.full(planes.n_pixels, 1.0, np.float32)

@@ -27,7 +27,9 @@ from tests.numerics.scenes import head_scene, single
 def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options) -> SliceFit:
     ones = np.ones(len(slices))
     settings = SliceStageSettings(**({"n_steps": 25, "reweight_every": 10} | options))
-    return fit_slices(cloud, slices, ones, ones, prior, settings, np.random.default_rng(0))
+    return fit_slices(
+        cloud, slices, gain=ones, weight=ones, prior=prior, settings=settings, rng=np.random.default_rng(0)
+    )
 
 
 def seeded() -> GaussianCloud:

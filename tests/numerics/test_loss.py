@@ -19,7 +19,8 @@ from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.parameters import FitParameters
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight
-from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings, _blocks
+from g3r.fitting.slice_parameters import slice_blocks
+from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
 from tests.numerics.scenes import head_scene, single
 
@@ -58,16 +59,17 @@ class CompleteLoss:
         )
         self.gain, self.slice_weight = np.exp(rng.normal(0, 0.1, 6)), rng.uniform(0.2, 1, 6)
         self.bias_field = StackBiasField(slices)
-        self.parameters = FitParameters(cloud, SETTINGS.rates, _blocks(slices, self.gain, self.bias_field, SETTINGS))
+        blocks = slice_blocks(slices, self.gain, self.bias_field, SETTINGS.rates, optimise_poses=True)
+        self.parameters = FitParameters(cloud, SETTINGS.rates, blocks)
         self.seed = self.parameters.value["log_scale"].astype(float).copy()
         for name, size in {
             "mean_mm": 0.3,
             "log_scale": 0.2,
             "quaternion_wxyz": 0.2,
-            "turn": 0.1,
-            "shift": 0.4,
+            "rotation": 0.1,
+            "translation": 0.4,
             "log_gain": 0.2,
-            "shading": 0.2,
+            "bias_field": 0.2,
         }.items():
             value = self.parameters.value[name]
             value += rng.normal(0, size, value.shape).astype(np.float32)
@@ -75,11 +77,23 @@ class CompleteLoss:
         self.slices = slices
         away = rng.choice([-1, 1], planes.n_pixels) * rng.uniform(0.1, 0.4, planes.n_pixels)
         self.slices = replace(slices, value=(self._shown(self._values()) + away).astype(np.float32))
-        self.loss = SliceLoss(
-            self.parameters, self.slices, self.gain, self.slice_weight, self.bias_field, self.prior, SETTINGS
+        self.draw_seed = seed
+        self.loss = self.loss_with(SETTINGS)
+
+    def loss_with(self, settings: SliceStageSettings) -> SliceLoss:
+        """The loss at the present parameters under some settings."""
+        loss = SliceLoss(
+            self.parameters,
+            self.slices,
+            gain=self.gain,
+            slice_weight=self.slice_weight,
+            bias_field=self.bias_field,
+            prior=self.prior,
+            settings=settings,
         )
-        self.loss.objective.seed_log_scale[...] = self.seed  # the fit is under way
-        self.loss.draw(np.random.default_rng(seed))
+        loss.objective.seed_log_scale[...] = self.seed  # the fit is under way
+        loss.draw(np.random.default_rng(self.draw_seed))
+        return loss
 
     def _values(self) -> dict[str, np.ndarray]:
         return {name: value.astype(float) for name, value in self.parameters.value.items()}
@@ -104,12 +118,12 @@ class CompleteLoss:
 
     def _shown(self, value: dict[str, np.ndarray]) -> np.ndarray:
         planes = self.slices.planes
-        turn = planes.rotation @ Rotation.from_rotvec(value["turn"]).as_matrix()
-        moved = replace(planes, rotation=turn, center_mm=planes.center_mm + value["shift"])
+        turn = planes.rotation @ Rotation.from_rotvec(value["rotation"]).as_matrix()
+        moved = replace(planes, rotation=turn, center_mm=planes.center_mm + value["translation"])
         pixels = render(self._cloud(value), moved, backend="reference").numpy()
         plane = planes.plane_id()
         gain = np.exp(value["log_gain"] - value["log_gain"].mean())[plane]
-        field = (value["shading"][self.slices.stack_id[plane]] * self.bias_field.basis.T.astype(float)).sum(1)
+        field = (value["bias_field"][self.slices.stack_id[plane]] * self.bias_field.basis.T.astype(float)).sum(1)
         return pixels * gain * np.exp(field)
 
     def float64(self, value: dict[str, np.ndarray], frozen: float | None = None) -> float:
@@ -128,9 +142,9 @@ class CompleteLoss:
         loss += SETTINGS.scale_weight * ((value["log_scale"] - self.seed) ** 2).mean()
         half = self.slices.planes.shape * self.slices.planes.spacing_mm / 2
         radius = np.sqrt((half**2).sum(1)).mean() / 2
-        moved = (value["shift"] ** 2).sum(1) + radius**2 * (value["turn"] ** 2).sum(1)
+        moved = (value["translation"] ** 2).sum(1) + radius**2 * (value["rotation"] ** 2).sum(1)
         loss += frozen * moved.mean() / SETTINGS.pose_prior_mm**2
-        return float(loss + SETTINGS.bias_field_ridge * (value["shading"] ** 2).mean())
+        return float(loss + SETTINGS.bias_field_ridge * (value["bias_field"] ** 2).mean())
 
     def _is_chosen(self) -> np.ndarray:
         drawn = self.loss.distilled.planes.center_mm[:, 2]
@@ -161,7 +175,7 @@ def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int,
     assert {"image", "distillation", "distillation_weight"} <= set(entry)
     assert value == pytest.approx(complete.float64(complete._values()), rel=1e-5)
     expected = complete.finite_differences()
-    assert set(expected) == {*CLOUD, "turn", "shift", "log_gain", "shading"}
+    assert set(expected) == {*CLOUD, "rotation", "translation", "log_gain", "bias_field"}
     for name, exact in expected.items():
         with tally.case():
             found = complete.parameters.gradient[name].astype(float)
@@ -177,17 +191,13 @@ def test_a_wrong_term_would_be_seen(tally):
     for name, change in {
         "scale": {"scale_weight": 0.0},
         "poses": {"pose_prior_mm": 1e9},
-        "shading": {"bias_field_ridge": 0.0},
+        "bias field": {"bias_field_ridge": 0.0},
         "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
     }.items():
         before = {n: g.copy() for n, g in complete.parameters.gradient.items()}
-        complete.loss.settings = replace(SETTINGS, **change)
-        complete.loss.objective.scale_weight = complete.loss.settings.scale_weight
-        complete.loss.evaluate(FRACTION)
+        complete.loss_with(replace(SETTINGS, **change)).evaluate(FRACTION)
         moved = [
             np.linalg.norm(g - before[n]) / np.linalg.norm(before[n]) for n, g in complete.parameters.gradient.items()
         ]
         assert max(moved) > 1e-2, name
-        complete.loss.settings = SETTINGS
-        complete.loss.objective.scale_weight = SETTINGS.scale_weight
         complete.loss.evaluate(FRACTION)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from g3r.uncertainty.error_model import (
-    LARGEST,
-    LEAST,
-    SMALLEST,
+    MAX_ERROR,
+    MIN_COEFFICIENT,
+    MIN_ERROR,
     ErrorModel,
     fit_model,
     load_calibration,
@@ -73,7 +73,7 @@ def test_misfit_of_slices_always_counts() -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(size=5000)
     found = fit_model({"log residual": x}, rng.exponential(np.exp(-x)))
-    assert found.coefficients["log residual"] == pytest.approx(LEAST["log residual"])
+    assert found.coefficients["log residual"] == pytest.approx(MIN_COEFFICIENT["log residual"])
 
 
 def test_too_few_voxels() -> None:
@@ -86,8 +86,8 @@ def test_shipped_calibration_grows_with_every_doubt(name: str) -> None:
     model, known = calibration()[name], predictors(500, np.random.default_rng(4))
     before = model.expected(known)
     assert np.isfinite(before).all()
-    assert before.min() >= SMALLEST
-    assert before.max() <= LARGEST
+    assert before.min() >= MIN_ERROR
+    assert before.max() <= MAX_ERROR
     for what in known:
         more = dict(known)
         more[what] = known[what] - 0.2 if what == "depth_mm" else known[what] * 1.2
@@ -100,8 +100,8 @@ def test_less_density_is_more_uncertain() -> None:
     sparse, dense = {**known, "unmeasured": np.full(500, 0.37)}, {**known, "unmeasured": np.full(500, 0.05)}
     more, less = model.expected(sparse), model.expected(dense)
     assert (more >= less).all()
-    assert (more > less)[less < LARGEST].all()
-    assert (less < LARGEST).mean() > 0.5
+    assert (more > less)[less < MAX_ERROR].all()
+    assert (less < MAX_ERROR).mean() > 0.5
 
 
 def test_extremes_stay_finite() -> None:
@@ -110,7 +110,7 @@ def test_extremes_stay_finite() -> None:
         for model in calibration().values():
             u = model.expected(known)
             assert np.isfinite(u).all()
-            assert ((u >= SMALLEST) & (u <= LARGEST)).all()
+            assert ((u >= MIN_ERROR) & (u <= MAX_ERROR)).all()
 
 
 def test_missing_evidence_is_named() -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import torch
 
-from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.planes import Planes
 from g3r.fitting.slice_stage import SliceFit
-from g3r.gaussians import GaussianCloud, render
+from g3r.gaussians import render
 from g3r.geometry import VolumeGrid
-from g3r.uncertainty import estimate_uncertainty
+from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
 from g3r.uncertainty.estimate import MEANING, UNCHECKED_NOTE, UNRELIABLE_NOTE
 from g3r.uncertainty.predictors import gather_predictors, mean_residual
+from tests.gaussians.scenes import cloud_of, slices_of
 
 SHAPE = (24, 22, 20)
 
@@ -31,13 +33,8 @@ def mask(grid: VolumeGrid) -> np.ndarray:
 def fit_of(noise: float) -> SliceFit:
     """Axial slices of a few Gaussians; the upper half of the head carries noise."""
     rng = np.random.default_rng(0)
-    cloud = GaussianCloud(
-        torch.from_numpy(rng.uniform(-7, 7, (200, 3)).astype(np.float32)),
-        torch.full((200, 3), 0.6),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(200, 1),
-        torch.full((200,), 0.3),
-        np.zeros(3),
-    )
+    identity = np.tile([1.0, 0, 0, 0], (200, 1))
+    cloud = cloud_of(rng.uniform(-7, 7, (200, 3)), np.full((200, 3), 0.6), identity, np.full(200, 0.3))
     z = np.arange(-9.0, 9.1, 2.0)
     n = len(z)
     planes = Planes(
@@ -50,16 +47,8 @@ def fit_of(noise: float) -> SliceFit:
     value = render(cloud, planes).numpy()
     upper = z[planes.plane_id()] > 0
     value = value + np.where(upper, noise * rng.standard_normal(len(value)), 0).astype(np.float32)
-    slices = Slices(
-        planes=planes,
-        value=value.astype(np.float32),
-        mask=np.ones(len(value), bool),
-        stack_id=np.zeros(n, np.int64),
-        slice_index=np.arange(n),
-        thickness_mm=np.full(n, 2.0),
-        header_pose=planes.pose,
-    )
-    return SliceFit(cloud, slices, np.ones(n), np.ones(n), [], [])
+    slices = slices_of(planes, value.astype(np.float32), np.ones(len(value), bool), 1, 2.0)
+    return SliceFit(cloud=cloud, slices=slices, gain=np.ones(n), weight=np.ones(n), history=[], bias_field=[])
 
 
 def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options: object):
@@ -71,22 +60,24 @@ def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options:
         "prior_grid": grid,
         "prior_share": np.full(grid.shape, 0.2, np.float32),
     }
-    return estimate_uncertainty(volume, mask, grid, fit, **{**given, **options})
+    own = {name: options.pop(name) for name in ("with_prior", "intensity", "reliable") if name in options}
+    inputs = UncertaintyInputs(volume=volume, mask=mask, grid=grid, fit=fit, **{**given, **options})
+    return estimate_uncertainty(inputs, **own)
 
 
 def test_residual_is_where_the_noise_is(grid: VolumeGrid) -> None:
     fit = fit_of(0.1)
-    found = mean_residual(fit.cloud, fit.slices, fit.gain, fit.weight, fit.bias_field, grid)
+    found = mean_residual(fit, grid)
     assert found.shape == grid.shape
     # mean absolute value of a normal deviate: 0.8 of its deviation
     assert np.median(found[6:18, 6:18, 14:17]) == pytest.approx(0.08, rel=0.15)
     assert np.median(found[6:18, 6:18, 3:6]) < 0.02
 
 
-def test_trust_decides_which_residuals_count(grid: VolumeGrid) -> None:
+def test_slice_weights_decide_which_residuals_count(grid: VolumeGrid) -> None:
     fit = fit_of(0.1)
-    distrusted = np.where(fit.slices.planes.center_mm[:, 2] > 0, 1e-6, 1.0)
-    found = mean_residual(fit.cloud, fit.slices, fit.gain, distrusted, [], grid)
+    down_weighted = np.where(fit.slices.planes.center_mm[:, 2] > 0, 1e-6, 1.0)
+    found = mean_residual(replace(fit, weight=down_weighted), grid)
     assert found.max() < 0.02
 
 

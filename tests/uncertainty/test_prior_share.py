@@ -13,7 +13,7 @@ from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty.prior_share import estimate_prior_share
-from tests.fitting.test_stages import BALL, GRID, INDEX, make_slices, seeded, true_cloud
+from tests.fitting.scene import BALL, GRID, INDEX, make_slices, seeded, true_volume
 
 UPPER = GRID.world(INDEX)[..., 2] > 2.0
 LOWER = GRID.world(INDEX)[..., 2] < -2.0
@@ -21,7 +21,7 @@ LOWER = GRID.world(INDEX)[..., 2] < -2.0
 
 @pytest.fixture(scope="module")
 def volume() -> np.ndarray:
-    return volume_from_pixels(render(true_cloud(), volume_planes(GRID), cutoff_sigma=6.0).numpy(), GRID)
+    return true_volume()
 
 
 def half_measured() -> Slices:
@@ -39,7 +39,7 @@ def whole_fit(prior: np.ndarray, slices: Slices) -> tuple[SliceFit, np.ndarray, 
     target = VolumeTarget.of(prior, (BALL * np.maximum(np.exp(-density), 1e-3)).astype(np.float32), GRID)
     ones = np.ones(len(slices))
     settings = SliceStageSettings(n_steps=40, optimise_poses=False, optimise_bias_field=False)
-    fit = fit_slices(cloud, slices, ones, ones, target, settings, rng)
+    fit = fit_slices(cloud, slices, gain=ones, weight=ones, prior=target, settings=settings, rng=rng)
     return fit, as_volume(cloud), as_volume(fit.cloud)
 
 
@@ -49,7 +49,9 @@ def as_volume(cloud: GaussianCloud) -> np.ndarray:
 
 def share_of(fit: SliceFit, slices: Slices, seed: int = 0) -> np.ndarray:
     density = coarse_and_density(slices, GRID)[1]
-    return estimate_prior_share(fit, density, GRID, BALL, GRID, np.random.default_rng(seed))
+    return estimate_prior_share(
+        fit, density=density, density_grid=GRID, mask=BALL, grid=GRID, rng=np.random.default_rng(seed)
+    )
 
 
 def test_the_share_is_what_refitting_to_another_prior_says(volume: np.ndarray) -> None:
@@ -83,10 +85,11 @@ def test_fewer_stacks_leave_more_to_the_prior(volume: np.ndarray) -> None:
         shares.append(float(share_of(part, slices)[BALL].mean()))
     assert shares[0] < 0.25
     assert shares[0] < shares[1] < shares[2]
-    # slices that are not trusted measure nothing
-    distrusted = replace(fit, weight=np.full(len(three), 1e-9))
+    # slices without weight measure nothing
+    weightless = replace(fit, weight=np.full(len(three), 1e-9))
+    density = np.zeros(GRID.shape, np.float32)
     nothing = estimate_prior_share(
-        distrusted, np.zeros(GRID.shape, np.float32), GRID, BALL, GRID, np.random.default_rng(0)
+        weightless, density=density, density_grid=GRID, mask=BALL, grid=GRID, rng=np.random.default_rng(0)
     )
     np.testing.assert_allclose(nothing, 1, atol=1e-6)
 
@@ -99,7 +102,8 @@ def test_the_share_is_given_on_any_grid_and_is_repeatable(volume: np.ndarray) ->
     mask = (fine.world(np.stack(np.meshgrid(*[np.arange(n) for n in fine.shape], indexing="ij"), -1)) ** 2).sum(
         -1
     ) < 9.5**2
-    one, two = (estimate_prior_share(fit, density, GRID, mask, fine, np.random.default_rng(3)) for _ in range(2))
+    given = {"density": density, "density_grid": GRID, "mask": mask, "grid": fine}
+    one, two = (estimate_prior_share(fit, **given, rng=np.random.default_rng(3)) for _ in range(2))
     assert one.shape == fine.shape
     np.testing.assert_array_equal(one, two)
     assert one[mask].mean() == pytest.approx(share_of(fit, slices)[BALL].mean(), abs=0.05)
