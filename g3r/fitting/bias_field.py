@@ -1,4 +1,4 @@
-"""Smooth multiplicative shading of each stack (receive-coil inhomogeneity), where stacks can tell it.
+"""Smooth multiplicative bias field of each stack (receive-coil inhomogeneity), where stacks can tell it.
 
 The coil stands still while the fetus moves, so the field belongs to a stack's header frame. Its logarithm is
 a polynomial of second order in the stack's in-plane coordinates without a constant; what varies from slice to

@@ -1,4 +1,4 @@
-"""Steps of a fit that are taken back when the loss rises: shorter steps, from the best state so far."""
+"""Rollback of a fit whose loss rises: back to the best state so far, and on with shorter steps."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from g3r.fitting.parameters import FitParameters
 logger = logging.getLogger(__name__)
 
 RISE = 1.5
-"""A loss is too high when it is over so many times the best ..."""
+"""A loss is too high when it is over this many times the best ..."""
 
 LEVEL_SHARE = 0.15
-"""... and has risen by so much of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (the
-amplitudes that they begin with are a least-squares optimum, and the loss is L1), with ten times the step sizes by
-0.4 (docs/numerics.md)."""
+"""... and has risen by this share of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (they begin at
+a least-squares optimum of the amplitudes, and the loss is L1), with ten times the step sizes by 0.4
+(docs/numerics.md)."""
 
 SHORTER = 0.3
-"""What a step back makes of all step sizes, from there to the end."""
+"""Factor of all step sizes after each rollback, to the end."""
 
 KEEP_EVERY = 5
 """Steps between two copies of the parameters, if the loss is the lowest by then."""
 
 
 class DivergenceGuard:
-    """Takes the steps of a fit, and takes them back if they lead up or out of the numbers.
+    """Takes the steps of a fit, and rolls back when the loss rises or is not finite.
 
     The parameters with the lowest loss are kept, in one copy that is renewed every few steps at most. A loss
     that has risen too far, or a loss or gradient that is not finite, brings them back; step sizes go down and
-    Adam begins anew. A fit in which that does not happen takes the steps that it would take without.
+    Adam begins anew. A fit in which that does not happen takes the same steps as without the guard.
 
     Args:
         parameters: of the fit.
@@ -73,13 +73,13 @@ class DivergenceGuard:
         return True
 
     def rescale(self, ratio: float) -> None:
-        """Tell that the loss has been defined anew and is now so many times what it was."""
+        """Account for a new definition of the loss, under which it is `ratio` times what it was."""
         if math.isfinite(ratio) and ratio > 0:
             self._best_loss *= ratio
             self._last_loss *= ratio
 
     def finish(self) -> None:
-        """Leave the parameters at the best state if the fit had to step back and did not make up for it."""
+        """Leave the parameters at the best state if the fit was rolled back and did not reach that loss again."""
         values = self.parameters.values
         risen = self.n_back > 0 and not self._last_loss <= self._best_loss
         if self._best is not None and (risen or not np.isfinite(values).all()):

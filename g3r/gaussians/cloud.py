@@ -18,13 +18,13 @@ from torch import Tensor
 from g3r.errors import InputError
 
 SIGMA_RANGE_MM = (1e-6, 1e6)
-"""Beyond it nothing of a head is described, and the kernels' integers and float32 would end."""
+"""No structure of a head is outside this range; beyond it the kernels' integers and float32 overflow."""
 
 MAX_LOG_SCALE = 13.816
-"""Logarithm of the largest sigma, and of one over the least."""
+"""Logarithm of the largest sigma, and of one over the smallest."""
 
 MIN_QUATERNION = 1e-15
-"""Shorter ones have no direction, and gradients that go with one over their length."""
+"""Shorter ones have no direction, and gradients grow as one over their length."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,10 @@ class GaussianCloud:
 
     def __len__(self) -> int:
         return len(self.mean_mm)
+
+    def __repr__(self) -> str:
+        origin = ", ".join(f"{x:.1f}" for x in self.origin_mm)
+        return f"GaussianCloud({len(self)} Gaussians about ({origin}) mm)"
 
     @property
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""More Gaussians where a residual asks for them, fewer where none would be missed."""
+"""Densification where a residual is large, pruning and merging where Gaussians hardly matter."""
 
 from __future__ import annotations
 
@@ -18,18 +18,22 @@ WIDEST = 3.0
 """Largest sigma of a new Gaussian, over that of the filter that found it."""
 
 FIRST_SHARE = 0.7
-"""Share of a blob's height that a new Gaussian starts with: neighbours that are added with it overlap."""
+"""Share of an extremum's height that a new Gaussian starts with: neighbours that are added with it overlap."""
 
 NEIGHBOURHOOD = 8
 """Cells of the finest lattice over which the density of Gaussians is counted."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ResidualExtrema:
     """Extrema of a residual, each described as a Gaussian.
 
-    index [M, 3] voxels; axes [M, 3, 3] principal axes in world space (columns, right-handed); sigma_mm [M, 3]
-    along them; amplitude [M]; gain [M] by about how much each lowers the squared residual (times mm^3).
+    Attributes:
+        index: [M, 3] voxels.
+        axes: [M, 3, 3] principal axes in world space (columns, right-handed).
+        sigma_mm: [M, 3] along them.
+        amplitude: [M].
+        gain: [M] about how much each lowers the squared residual (times mm^3).
     """
 
     index: NDArray[np.int64]
@@ -42,8 +46,8 @@ class ResidualExtrema:
         return len(self.index)
 
     def take(self, chosen: NDArray[np.integer] | NDArray[np.bool_]) -> ResidualExtrema:
-        """The blobs at an index array or a mask."""
-        return ResidualExtrema(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        """The extrema at an index array or a mask."""
+        return ResidualExtrema(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
     def cloud(self, grid: VolumeGrid, origin_mm: NDArray[np.float64]) -> GaussianCloud:
         """Gaussians of these shapes, at part of their height (`FIRST_SHARE`)."""
@@ -63,8 +67,8 @@ def find_extrema(
 ) -> ResidualExtrema:
     """The local extrema of a smoothed residual inside a mask, with the shapes that the residual has there.
 
-    Where a Gaussian blob of covariance C is smoothed with variance s^2, the logarithm of the result has the
-    Hessian -(C + s^2)^-1 at its top. So the second derivatives of the smoothed residual, over its value,
+    Where a Gaussian of covariance C is smoothed with variance s^2, the logarithm of the result has the Hessian
+    -(C + s^2)^-1 at its top. So the second derivatives of the smoothed residual, over its value,
     give C: flat along sheets, long along ridges, whatever their direction.
 
     Args:
@@ -72,7 +76,7 @@ def find_extrema(
         mask: [I, J, K].
         grid: their grid (voxels about as long as wide).
         filter_mm: sigma of the filter.
-        min_mm: least sigma of a blob; the largest is `WIDEST` filters.
+        min_mm: smallest sigma of an extremum; the largest is `WIDEST` filters.
     """
     voxel = float(grid.spacing_mm.mean())
     sigma = filter_mm / voxel
@@ -96,13 +100,20 @@ def find_extrema(
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     sigma_mm = np.sqrt(variance) * voxel
     gain = amplitude**2 * np.pi**1.5 * sigma_mm.prod(1)
-    return ResidualExtrema(index, axes, sigma_mm, amplitude, gain)
+    return ResidualExtrema(index=index, axes=axes, sigma_mm=sigma_mm, amplitude=amplitude, gain=gain)
 
 
 def local_rms(
     residual: NDArray[np.float32], mask: NDArray[np.bool_], grid: VolumeGrid, window_mm: float
 ) -> NDArray[np.float32]:
-    """Root mean square of a residual [I, J, K] around each voxel of a mask (Gaussian window); 0 outside."""
+    """Root mean square of a residual [I, J, K] around each voxel of a mask; 0 outside.
+
+    Args:
+        residual: [I, J, K].
+        mask: [I, J, K].
+        grid: their grid.
+        window_mm: sigma of the Gaussian window.
+    """
     sigma = window_mm / float(grid.spacing_mm.mean())
     inside = mask.astype(np.float32)
     weight = np.maximum(gaussian_filter(inside, sigma), 1e-6)
@@ -113,7 +124,13 @@ def local_rms(
 def exceeds_density(
     cloud: GaussianCloud, points_mm: NDArray[np.float64], finest_spacing_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether Gaussians stand as close around points [M, 3] as on a lattice of the finest spacing."""
+    """Whether Gaussians are as close around points as on a lattice of the finest spacing.
+
+    Args:
+        cloud: the Gaussians.
+        points_mm: [M, 3] in world space.
+        finest_spacing_mm: edge of the cell per Gaussian.
+    """
     if not len(points_mm):
         return np.zeros(0, bool)
     radius = finest_spacing_mm * (NEIGHBOURHOOD * 3 / (4 * np.pi)) ** (1 / 3)
@@ -131,7 +148,7 @@ def concatenated(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
 def pruned(cloud: GaussianCloud, tolerance: float) -> GaussianCloud:
     """The cloud without the Gaussians whose integral of the square is below a tolerance (mm^3).
 
-    Taking one away changes the volume by so much, and by less once its neighbours' amplitudes are solved for.
+    Pruning one changes the volume by that integral, and by less once its neighbours' amplitudes are solved for.
     """
     return cloud.take(torch.from_numpy(_energy(cloud) >= tolerance))
 

@@ -21,10 +21,17 @@ def render_reference(
     log_gain: Tensor | None = None,
     attenuation: str = "exact",
 ) -> Tensor:
-    """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without any cut-off; see `g3r.gaussians.render`.
+    """Dense y(u) = sum_j c_j B_j exp(-d^T S_j^-1 d / 2) without cut-off (G3R Eq. 3-5); see `render`.
 
     Works in the dtype (float64 or float32) and on the device of the cloud, whatever autocast is around it;
     poses are float64 in any case. Differentiable by autograd in everything.
+
+    Args:
+        cloud: N Gaussians.
+        planes: K planes.
+        twist: [K, 6] as in `render`.
+        log_gain: [K] as in `render`.
+        attenuation: "exact" or "printed", as in `render`.
 
     Numerics: the triangular factor of S = M M^T, M = [R^T R_g diag(s), D^(1/2)], comes from M itself by QR. A
     Cholesky factor of S would lose twice the digits and fail in float32 at axis ratios of a few thousand.
@@ -51,6 +58,7 @@ def _render(
         local_mean = ((mean.to(**exact) - center) @ rotation).to(**like)
         rotation = rotation.to(**like)
         psf_sigma = torch.as_tensor(np.sqrt(planes.psf_var_mm2[k]), **like)
+        # S = R^T Sigma R + D_psf (Eq. 4) as M M^T
         wide = torch.cat([rotation.T @ root, torch.diag(psf_sigma).expand(len(mean), 3, 3)], 2)
         upper = torch.linalg.qr(wide.transpose(1, 2))[1]
         if attenuation == "exact":
@@ -65,6 +73,7 @@ def _render(
             d = u[None] - local_mean[:, None]  # [N, p, 3]
             white = torch.linalg.solve_triangular(upper.mT, d.transpose(1, 2), upper=False)
             value = torch.exp(-0.5 * (white * white).sum(1))
+            # Eq. 5
             pixels.append(gain * ((amplitude * factor) @ value))
     return torch.cat(pixels) if pixels else mean.new_zeros(0)
 

@@ -1,4 +1,4 @@
-"""Where the first Gaussians stand: on a lattice in the foreground, bias_corrected across edges."""
+"""Seeds of the fit (G3R Sec. 2.4): Gaussians of Eq. 3 on a lattice in the foreground, thin across edges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
 
 SCALE_PER_SPACING = 0.6
-"""Sigma of a seed over the lattice spacing: neighbours overlap so that a constant comes out flat to 2 %."""
+"""Sigma of a seed over the lattice spacing: neighbours overlap so that a constant is flat to 2 %."""
 
 MAX_ANISOTROPY = 1.6
 """Largest ratio of a seed's sigma to that of a round one of equal volume."""
@@ -23,8 +23,8 @@ def seed_cloud(
 ) -> GaussianCloud:
     """Gaussians on a body-centred lattice inside the mask, shaped by the local structure of a volume.
 
-    Each Gaussian is bias_corrected across the edge that it stands on (structure tensor), keeping its
-    volume. Amplitudes are first guesses that reproduce the local mean.
+    Each Gaussian is made thin across the edge at its centre (structure tensor) and keeps its volume. Amplitudes are
+    first guesses that reproduce the local mean.
 
     Args:
         volume: [I, J, K], of order one.
