@@ -79,7 +79,13 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
     k = len(stack)
     spacing = np.full((k, 2), PIXEL_MM)
     variance = psf_variance_mm2(spacing, np.full(k, HEAD_THICKNESS_MM))
-    planes = Planes(np.array(rotation), np.array(center), spacing, np.array(shape, dtype=np.int64), variance)
+    planes = Planes(
+        rotation=np.array(rotation),
+        center_mm=np.array(center),
+        spacing_mm=spacing,
+        shape=np.array(shape, dtype=np.int64),
+        psf_var_mm2=variance,
+    )
     value = rng.random(planes.n_pixels, dtype=np.float32)
     return HeadScene(cloud, _slices(planes, value, np.array(stack), HEAD_THICKNESS_MM))
 
@@ -198,4 +204,12 @@ def _slices(planes: Planes, value: NDArray[np.float32], stack_id: NDArray[np.int
     k = len(planes)
     index = np.arange(k) - np.searchsorted(stack_id, stack_id)
     thickness = np.full(k, thickness_mm)
-    return Slices(planes, value, np.ones(len(value), bool), stack_id, index, thickness, planes.pose)
+    return Slices(
+        planes=planes,
+        value=value,
+        mask=np.ones(len(value), bool),
+        stack_id=stack_id,
+        slice_index=index,
+        thickness_mm=thickness,
+        header_pose=planes.pose,
+    )

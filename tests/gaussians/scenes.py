@@ -44,11 +44,11 @@ def make_planes(seed: int, n: int = 3, shape=(7, 6), psf: float = 1.0, origin=(4
     rng = np.random.default_rng(seed)
     spacing = rng.uniform(0.7, 1.1, (n, 2))
     return Planes(
-        Rotation.random(n, rng=rng).as_matrix(),
-        np.array(origin) + rng.normal(0, 1, (n, 3)),
-        spacing,
-        np.tile(shape, (n, 1)),
-        psf * psf_variance_mm2(spacing, rng.uniform(2, 4, n)),
+        rotation=Rotation.random(n, rng=rng).as_matrix(),
+        center_mm=np.array(origin) + rng.normal(0, 1, (n, 3)),
+        spacing_mm=spacing,
+        shape=np.tile(shape, (n, 1)),
+        psf_var_mm2=psf * psf_variance_mm2(spacing, rng.uniform(2, 4, n)),
     )
 
 
@@ -59,14 +59,24 @@ def stack_planes(n: int, spacing_mm: float, side: int, origin=(0.0, 0, 0)) -> Pl
     pixel = np.full((3 * n, 2), 1.0)
     variance = psf_variance_mm2(pixel, np.full(3 * n, spacing_mm))
     center = np.array(origin) + rotation[:, :, 2] * offset[:, None]
-    return Planes(rotation, center, pixel, np.full((3 * n, 2), side), variance)
+    return Planes(
+        rotation=rotation, center_mm=center, spacing_mm=pixel, shape=np.full((3 * n, 2), side), psf_var_mm2=variance
+    )
 
 
 def slices_of(planes: Planes, value: np.ndarray, mask: np.ndarray, n_stacks: int, thickness_mm: float) -> Slices:
     """Planes with pixels as the slices of stacks of equal length."""
     n = len(planes) // n_stacks
     stack_id, index = np.repeat(np.arange(n_stacks), n), np.tile(np.arange(n), n_stacks)
-    return Slices(planes, value, mask, stack_id, index, np.full(len(planes), thickness_mm), planes.pose)
+    return Slices(
+        planes=planes,
+        value=value,
+        mask=mask,
+        stack_id=stack_id,
+        slice_index=index,
+        thickness_mm=np.full(len(planes), thickness_mm),
+        header_pose=planes.pose,
+    )
 
 
 def single(cloud: GaussianCloud) -> GaussianCloud:

@@ -53,7 +53,13 @@ def test_ten_metres_from_the_origin_no_digit_is_lost():
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
     away = GaussianCloud(*cloud.parameters, far)
-    moved = Planes(planes.rotation, planes.center_mm + far, planes.spacing_mm, planes.shape, planes.psf_var_mm2)
+    moved = Planes(
+        rotation=planes.rotation,
+        center_mm=planes.center_mm + far,
+        spacing_mm=planes.spacing_mm,
+        shape=planes.shape,
+        psf_var_mm2=planes.psf_var_mm2,
+    )
     for (first, _), (second, _) in zip(images(cloud, planes), images(away, moved), strict=True):
         assert np.abs(first - second).max() < 1e-6 * np.abs(first).max()
 

@@ -27,7 +27,8 @@ def test_no_plane_renders_nothing(backend: str):
 def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed():
     cloud, planes = single(make_cloud(15, 10)), make_planes(15)
     away = planes.moved(RigidPose.from_rotvec([[0.0, 0, 0]], [[500.0, 0, 0]]))
-    both = Planes(*(np.concatenate([getattr(p, f) for p in (away, planes)]) for f in planes.__dataclass_fields__))
+    fields = planes.__dataclass_fields__
+    both = Planes(**{f: np.concatenate([getattr(p, f) for p in (away, planes)]) for f in fields})
     pixels = render(cloud, both)
     assert (pixels[: away.n_pixels] == 0).all()
     torch.testing.assert_close(pixels[away.n_pixels :], render(cloud, planes), rtol=1e-6, atol=1e-7)

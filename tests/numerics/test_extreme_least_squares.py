@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,9 +45,7 @@ def test_identical_gaussians_share_the_peak(n: int, damping: float, tally):
 def test_more_gaussians_than_pixels(damping: float, tally):
     scene = head_scene()
     planes = scene.planes.take([4])
-    planes = type(planes)(
-        planes.rotation, planes.center_mm, planes.spacing_mm * 6, np.array([[3, 3]]), planes.psf_var_mm2
-    )
+    planes = replace(planes, spacing_mm=planes.spacing_mm * 6, shape=np.array([[3, 3]]))
     target = np.linspace(0.1, 1, 9).astype(np.float32)
     with tally.case():
         start = single(scene.cloud)

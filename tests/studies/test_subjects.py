@@ -123,7 +123,7 @@ def test_a_volume_far_away_is_brought_near_by_the_motion_of_its_slices(rng):
     grid = VolumeGrid.isotropic([0, 0, 0], 1.5 * (np.array(shape) - 1), 1.5)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)
     mask = np.linalg.norm((index - (np.array(shape) - 1) / 2) / (15, 17, 13), axis=-1) < 1
-    case = SimulatedCase("head", Path(), (), PoseTable((), RigidPose.identity(0)), {})
+    case = SimulatedCase(name="head", folder=Path(), stacks=(), true=PoseTable((), RigidPose.identity(0)), points_mm={})
     case.__dict__.update(truth=Volume(truth, grid.affine, "truth"), truth_mask=mask)  # cached properties
     near = RigidPose.from_rotvec([[0.02, -0.03, 0.01]], [[1.0, -0.6, 0.4]])
     far = RigidPose.from_rotvec([[0.0, 0.0, 3.0]], [[1000.0, 0.0, 0.0]])

@@ -80,7 +80,9 @@ def test_a_ball_needs_few():
     volume, mask, grid = gaussian_count.ball(1.6)
     stage = PriorStageSettings(n_steps=15, scale_weight=0.0)
     settings = AdaptiveSettings(bound=0.1, start=4.0, round_steps=25, last_steps=25)
-    cloud, done = fit_adaptive(volume, mask, grid, 4.0, settings, stage, np.random.default_rng(1))
+    cloud, done = fit_adaptive(
+        volume, mask, grid, finest_spacing_mm=4.0, settings=settings, stage=stage, rng=np.random.default_rng(1)
+    )
     target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
     assert len(cloud) < gaussian_count.BALL_MOST
     psnr = gaussian_count.psnr_db(cloud, target)
