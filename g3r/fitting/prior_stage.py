@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
+from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.schedules import cosine_decay
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES

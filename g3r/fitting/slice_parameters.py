@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.bias_basis import N_TERMS
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.objective import PlaneState, TermLoss
+from g3r.fitting.objective import TermLoss
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
+from g3r.fitting.plane_state import PlaneState
 from g3r.gaussians.render import right_jacobian
 
 

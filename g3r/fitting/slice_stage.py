@@ -13,8 +13,9 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState, TermLoss
+from g3r.fitting.objective import CloudObjective, ImageTerm, TermLoss
 from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
@@ -28,8 +29,7 @@ MAX_PRIOR_STRENGTH = 1.0
 """A pixel read off the prior never counts for more than a measured one."""
 
 AMPLITUDE_DAMPING = 0.05
-"""Pull of the amplitudes, solved for at the start, towards those of stage 1 (relative): slices alone leave the
-amplitudes of Gaussians between them undetermined."""
+"""Pull of the first amplitudes towards stage 1 (relative): slices leave those of Gaussians between them open."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,13 +100,7 @@ class FitObserver(Protocol):
     """Steps between two calls; the last step always has one."""
 
     def __call__(self, step: int, cloud: GaussianCloud, pose: RigidPose) -> None:
-        """Called during the fit.
-
-        Args:
-            step: number of steps done.
-            cloud: detached, as it is at the moment.
-            pose: [K] of the slices at the moment.
-        """
+        """Called after `step` steps with the detached cloud and the poses [K] of that moment."""
 
 
 def fit_slices(

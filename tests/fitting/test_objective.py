@@ -10,8 +10,9 @@ import torch
 from g3r.acquisition.planes import volume_planes
 from g3r.errors import NumericalError
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
+from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import VolumeTarget
 from g3r.fitting.slice_parameters import SliceParameters
 from g3r.fitting.slice_stage import SliceStageSettings

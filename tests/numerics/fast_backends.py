@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from g3r.acquisition.planes import Planes
-from g3r.fitting.objective import CloudObjective, ImageTerm, PlaneState
+from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.plane_state import PlaneState
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.amplitudes import AmplitudeSystem
 from tests.numerics.errors import FULL_CUTOFF, gradients
