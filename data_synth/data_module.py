@@ -90,7 +90,7 @@ class SyntheticDataModule(LightningDataModule):
 
         Args:
             n_items: per epoch.
-            n_batches: per epoch, in each process.
+            n_batches: per epoch, over all processes.
             split_ranks: whether processes that train together have items of their own; Lightning sees to that
                 for the loaders that it is given itself.
             options: further ones of the loader.
@@ -103,7 +103,9 @@ class SyntheticDataModule(LightningDataModule):
         # they hold the loaded volumes.
         return DataLoader(
             self.train_set,
-            sampler=EpochSampler(n_items, now=epoch_of(trainer, max(1, n_batches)), rank=rank, n_ranks=n_ranks),
+            sampler=EpochSampler(
+                n_items, now=epoch_of(trainer, max(1, n_batches // n_ranks)), rank=rank, n_ranks=n_ranks
+            ),
             num_workers=n_workers,
             multiprocessing_context="spawn" if n_workers else None,
             persistent_workers=n_workers > 0,
