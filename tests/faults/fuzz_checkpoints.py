@@ -84,7 +84,7 @@ class CheckpointFuzz:
             path.write_bytes(change_header(whole, lambda header: change_claims(rng, header)))
         elif level < 9:
             changed = copy.deepcopy(content)
-            for _ in range(int(rng.integers(1, 4))):
+            for _ in range(int(rng.integers(1, 3))):
                 change_content(rng, changed)
             if rng.random() < 0.7 and "weights_sha256" in changed:
                 changed["weights_sha256"] = weights_digest(changed["weights"])
@@ -202,7 +202,7 @@ def odd_tensor(rng: np.random.Generator) -> torch.Tensor:
 
 def change_content(rng: np.random.Generator, content: Content) -> None:
     """Replace, remove, rename or add an entry of the description, or a tensor."""
-    if rng.random() < 0.4:
+    if rng.random() < 0.6:
         change_weights(rng, content["weights"])
         return
     inner = [content] + [value for name, value in content.items() if isinstance(value, dict) and name != "weights"]
@@ -224,9 +224,9 @@ def change_content(rng: np.random.Generator, content: Content) -> None:
 
 
 def change_weights(rng: np.random.Generator, weights: dict[str, torch.Tensor]) -> None:
-    """Replace, remove, add or alter a tensor."""
+    """Replace, remove or add a tensor, or more often alter one."""
     names = sorted(weights)
-    kind = rng.integers(5)
+    kind = rng.integers(9)
     if kind == 0 or not names:
         weights[f"new {rng.integers(9)}"] = odd_tensor(rng)
         return

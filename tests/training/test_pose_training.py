@@ -17,12 +17,12 @@ from g3r.pose_network.model import PoseModel
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from lightning.pytorch.loggers import TensorBoardLogger  # noqa: E402
 from torch.utils.data import DataLoader  # noqa: E402
 
 from g3r.pose_network.inference import as_pose  # noqa: E402
 from g3r.pose_network.network import PoseStep  # noqa: E402
 from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss  # noqa: E402
+from tests.training.small_runs import assert_export_refuses, logged, trainer  # noqa: E402
 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
 SMALL = {"network": NETWORK, "warmup_steps": 1}
@@ -71,35 +71,20 @@ class TinyData(lightning.LightningDataModule):
         return DataLoader([sample(8, n_stacks=1), sample(9, n_stacks=2)], batch_size=None)
 
 
-def trainer(folder, **options):
-    return lightning.Trainer(
-        default_root_dir=folder,
-        logger=TensorBoardLogger(folder, name="run"),
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        accelerator="cpu",
-        enable_progress_bar=False,
-        log_every_n_steps=1,
-        **{"max_epochs": 1, **options},
-    )
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run of one epoch: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
     module = PoseModule(**SMALL)
-    run = trainer(folder)
+    run = trainer(folder, max_epochs=1)
     run.fit(module, TinyData())
     run.save_checkpoint(folder / "last.ckpt")
     return folder, folder / "last.ckpt", module
 
 
 def test_tensorboard_has_scalars_and_the_panel(trained):
-    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    log = event_accumulator.EventAccumulator(str(trained[0] / "run" / "version_0"))
-    log.Reload()
+    log = logged(trained[0] / "run" / "version_0")
     scores = {"val/slice_mm", "val/slice_deg", "val/stack_deg", "val/stacks_within_20deg", "val/stack_mm_1"}
     train = {"train/mm_step0", "train/mm_step1", "train/vote_step0", "train/samples_per_second"}
     assert scores | train <= set(log.Tags()["scalars"])
@@ -146,13 +131,7 @@ def test_export_gives_the_same_network(trained, tmp_path, capsys):
     ],
 )
 def test_export_refuses(trained, tmp_path, capsys, alter, expected):
-    content = torch.load(trained[1], weights_only=True)
-    alter(content)
-    torch.save(content, tmp_path / "run.ckpt")
-    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "pose.safetensors")]) == 3
-    line = capsys.readouterr().err
-    assert expected in line
-    assert line.count("\n") == 1
+    assert_export_refuses(trained[1], alter, expected, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +140,7 @@ def test_export_refuses(trained, tmp_path, capsys, alter, expected):
 )
 def test_data_that_do_not_fit(tmp_path, settings, message):
     with pytest.raises(InputError, match=message):
-        trainer(tmp_path).fit(PoseModule(**SMALL), TinyData(**settings))
+        trainer(tmp_path, max_epochs=1).fit(PoseModule(**SMALL), TinyData(**settings))
 
 
 def test_resuming_with_another_template_is_refused(trained, tmp_path):

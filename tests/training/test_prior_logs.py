@@ -13,7 +13,6 @@ from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader
 
 lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
-accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
 
 from g3r.acquisition.images import save_volume  # noqa: E402
 from g3r.cli import export  # noqa: E402
@@ -23,6 +22,7 @@ from g3r.prior.model import Prior  # noqa: E402
 from g3r.reconstruct import GaussianReconstructor  # noqa: E402
 from g3r.training import prior_module as training  # noqa: E402
 from g3r.training import prior_validation as validation  # noqa: E402
+from tests.training.small_runs import logged, trainer  # noqa: E402
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 TINY_TRAINING = [
@@ -73,18 +73,9 @@ def log(tmp_path_factory):
     """What TensorBoard has of two epochs."""
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
-    run = lightning.Trainer(
-        accelerator="cpu",
-        max_epochs=2,
-        logger=training.TensorBoardLogger(folder, name="run"),
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        log_every_n_steps=1,
-    )
+    run = trainer(folder, max_epochs=2)
     run.fit(training.PriorModule(NETWORK), ValidatedByStacks())
-    found = accumulators.EventAccumulator(str(folder / "run" / "version_0"))
-    found.Reload()
-    return found
+    return logged(folder / "run" / "version_0")
 
 
 def test_scores_by_number_of_stacks_are_logged(log):
@@ -128,15 +119,8 @@ def test_panel_of_a_network_without_a_gate():
 def test_going_on_at_another_voxel_size_is_refused(tmp_path):
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
     first = training.PriorModule(NETWORK)
-    options = {
-        "accelerator": "cpu",
-        "max_steps": 1,
-        "logger": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-        "enable_checkpointing": False,
-    }
-    run = lightning.Trainer(**options)
+    options = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
+    run = trainer(tmp_path, **options)
     run.fit(first, ValidatedByStacks())
     run.save_checkpoint(tmp_path / "run.ckpt")
     path = tmp_path / "prior.safetensors"
@@ -145,7 +129,7 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path):
     data.spacing_mm = 1.0
     again = training.PriorModule(NETWORK, start_from=str(path))
     with pytest.raises(InputError, match=r"start_from: was trained on voxels of 0\.8 mm, the data have 1 mm"):
-        lightning.Trainer(**options).fit(again, data)
+        trainer(tmp_path, **options).fit(again, data)
     run, fresh = lightning.Trainer(**{**options, "max_steps": 2}), training.PriorModule(NETWORK)
     with pytest.raises(InputError, match=r"ckpt_path: was trained on voxels of 0\.8 mm, the data have 1 mm"):
         run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
@@ -184,8 +168,7 @@ def test_training_goes_on_after_a_kill(tmp_path):
     assert resumed.returncode == 0, words[-2000:]
     (after,) = (tmp_path / "prior" / "version_1" / "checkpoints").glob("last*.ckpt")
     assert steps_of(after) == done + 2
-    found = accumulators.EventAccumulator(str(tmp_path / "prior" / "version_1"))
-    found.Reload()
+    found = logged(tmp_path / "prior" / "version_1")
     assert min(event.step for event in found.Scalars("train/l1_prior")) >= done
 
 

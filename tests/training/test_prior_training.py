@@ -26,6 +26,7 @@ from g3r.training import prior_batches as batches  # noqa: E402
 from g3r.training import prior_module as training  # noqa: E402
 from g3r.training.annealed_module import cosine_factor  # noqa: E402
 from g3r.training.prior_validation import sample_scores  # noqa: E402
+from tests.training.small_runs import assert_export_refuses, logged, trainer  # noqa: E402
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 SMALL = {"network": NETWORK, "warmup_steps": 1}
@@ -63,33 +64,20 @@ class TinyData(lightning.LightningDataModule):
         return DataLoader([sample(seed) for seed in (8, 9)], batch_size=2)
 
 
-def trainer(folder, **options):
-    defaults = {"accelerator": "cpu", "max_steps": 2, "enable_progress_bar": False, "log_every_n_steps": 1}
-    return lightning.Trainer(
-        default_root_dir=folder,
-        logger=training.TensorBoardLogger(folder, name="run"),
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        **{**defaults, **options},
-    )
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run of two steps: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
     module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
-    run = trainer(folder)
+    run = trainer(folder, max_steps=2)
     run.fit(module, TinyData())
     run.save_checkpoint(folder / "last.ckpt")
     return folder, folder / "last.ckpt", module
 
 
 def test_tensorboard_has_scalars_and_the_panel(trained):
-    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    log = event_accumulator.EventAccumulator(str(trained[0] / "run" / "version_0"))
-    log.Reload()
+    log = logged(trained[0] / "run" / "version_0")
     scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
     assert scores | speed | {"train/l1_prior", "train/l1_coarse"} <= set(log.Tags()["scalars"])
@@ -154,14 +142,7 @@ def spoil(content):
     ],
 )
 def test_export_refuses(trained, tmp_path, capsys, alter, expected):
-    content = torch.load(trained[1], weights_only=True)
-    alter(content)
-    torch.save(content, tmp_path / "run.ckpt")
-    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
-    line = capsys.readouterr().err
-    assert expected in line
-    assert line.count("\n") == 1
-    assert not (tmp_path / "prior.safetensors").exists()
+    assert_export_refuses(trained[1], alter, expected, tmp_path, capsys)
 
 
 def test_export_wants_the_ending_of_its_format(trained, tmp_path, capsys):
@@ -181,7 +162,7 @@ def test_export_refuses_what_is_no_checkpoint(tmp_path, capsys, content):
 def test_voxel_size_must_agree_with_the_data(tmp_path):
     module = training.PriorModule(**SMALL, voxel_mm=1.0)
     with pytest.raises(InputError, match=r"1.0 mm, but the data are made at 0.8 mm"):
-        trainer(tmp_path).fit(module, TinyData())
+        trainer(tmp_path, max_steps=2).fit(module, TinyData())
 
 
 def test_a_patch_can_be_learnt():
