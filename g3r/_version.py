@@ -1,3 +1,3 @@
 """Version of g3r, read by the build and written into every output."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -179,11 +179,12 @@ class GaussianReconstructor:
         if given is not None:
             run.notes.append("registration was given, not estimated here")
             with run.clock(Stage.REGISTRATION):
-                return with_pixels_of(slices, given)
-        deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
-        settings = plan.settings.registration
-        poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, settings, report, deadline))
-        if settings.standard_orientation and poses.orientation is None:
+                poses = with_pixels_of(slices, given)
+        else:
+            deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
+            settings = plan.settings.registration
+            poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, settings, report, deadline))
+        if plan.settings.registration.standard_orientation and poses.orientation is None:
             run.notes.append(
                 "standard orientation unknown, the volume stays in scanner space: no atlas template fits the "
                 f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"

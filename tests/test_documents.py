@@ -1,0 +1,82 @@
+"""What the documents point at exists: links, anchors, files, and the names of functions in them."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.rooms import REPOSITORY
+
+DOCUMENTS = [
+    *sorted((REPOSITORY / "docs").glob("*.md")),
+    *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
+]
+FOLDERS = ("g3r", "data_synth", "studies", "tests", "lightning_configs", "docs")
+MAX_CHARACTERS = 120
+PLACEHOLDERS = ("ROOM", "PAGE", "NAME", "MODULE", "DIR", "*")
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(REPOSITORY).as_posix()
+
+
+def file_of(text: str) -> Path | None:
+    """The file or folder that a path in a document means: of the repository, or of g3r."""
+    return next((path for path in (REPOSITORY / text, REPOSITORY / "g3r" / text) if path.exists()), None)
+
+
+def anchors(path: Path) -> set[str]:
+    """Names of a document's headings, as links write them."""
+    titles = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
+def test_links_lead_somewhere(path: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
+        if link.startswith("http"):
+            continue
+        target, _, anchor = link.partition("#")
+        there = path.parent / target if target else path
+        assert there.exists(), link
+        assert not anchor or anchor in anchors(there), link
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
+def test_files_that_are_named_exist(path: Path) -> None:
+    rooms = {folder.name for folder in (REPOSITORY / "g3r").iterdir() if folder.is_dir()}
+    for text in re.findall(r"`([\w.]+/[\w/.]+)`", path.read_text(encoding="utf-8")):
+        if text.split("/")[0] in rooms | set(FOLDERS) and not any(word in text for word in PLACEHOLDERS):
+            assert file_of(text), f"{name_of(path)}: {text}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
+def test_functions_that_are_named_exist(path: Path) -> None:
+    """Written as `room/module.py`: `name` or `Class.name`."""
+    for text, names in re.findall(r"`([\w/]+\.py)`: ((?:`[\w.]+`(?:, )?)+)", path.read_text(encoding="utf-8")):
+        file = file_of(text)
+        assert file, f"{name_of(path)}: {text}"
+        defined = {
+            name
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+            for name in (
+                [node.name]
+                if isinstance(node, ast.FunctionDef | ast.ClassDef)
+                else [one.id for one in ast.walk(node) if isinstance(one, ast.Name)]
+                if isinstance(node, ast.Assign | ast.AnnAssign)
+                else []
+            )
+        }
+        for name in re.findall(r"`([\w.]+)`", names):
+            assert set(name.split(".")) <= defined, f"{name_of(path)}: {text} has no {name}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name_of)
+def test_lines_are_short(path: Path) -> None:
+    """Tables, and what commands write between markers, apart."""
+    text = re.sub(r"<!-- ([\w.-]+):begin -->.*?<!-- \1:end -->", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    long = [line for line in text.splitlines() if len(line) > MAX_CHARACTERS and not line.startswith("|")]
+    assert not long, f"{name_of(path)}: {long[0]}"
