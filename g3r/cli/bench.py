@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from g3r._version import __version__
-from g3r.errors import G3RError
+from g3r.cli.failures import missing_extra
+from g3r.errors import G3RError, InputError
 
 COMMANDS = {
     "kernels": "pair and pixel rates of the renderer, against what the machine can do",
@@ -48,6 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format=f"g3r-bench {name}: %(message)s", stream=sys.stderr)
     try:
         return int(module.run(options))
+    except ModuleNotFoundError as error:
+        print(f"g3r-bench {name}: {missing_extra(error)}", file=sys.stderr)
+        return InputError.exit_code
     except G3RError as error:
         print(f"g3r-bench {name}: {error}", file=sys.stderr)
         return error.exit_code

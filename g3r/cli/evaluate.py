@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r._version import __version__
+from g3r.cli.failures import missing_extra
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ def main(argv: list[str] | None = None) -> int:
     except G3RError as error:
         print(f"g3r-evaluate: {error}", file=sys.stderr)
         return error.exit_code
+    except ModuleNotFoundError as error:
+        print(f"g3r-evaluate: {missing_extra(error)}", file=sys.stderr)
+        return InputError.exit_code
     return 0
 
 

@@ -12,6 +12,9 @@ EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
 SAID_WITHOUT_MEMORY = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
 """Words of numpy, torch, the loader of libraries and the system."""
 
+EXTRAS = {"evaluate": ("SimpleITK", "skimage"), "train": ("lightning", "torchio", "jsonargparse", "tensorboard")}
+"""Packages, as they are imported, that only some commands need."""
+
 OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset draft, or crop the stacks"
 KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
 
@@ -32,6 +35,18 @@ def line_and_code(error: BaseException) -> tuple[str, int]:
         said = " ".join(str(error.strerror or error).split())
         remedy = f"; {KERNEL_CACHE}" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
         return f"a file could not be read or written ({said}){remedy}", InputError.exit_code
+    raise error
+
+
+def missing_extra(error: ModuleNotFoundError) -> str:
+    """The line for a package that an extra brings.
+
+    Raises:
+        ModuleNotFoundError: the error itself where no extra brings it.
+    """
+    for extra, packages in EXTRAS.items():
+        if (error.name or "").split(".")[0] in packages:
+            return f"{error.name} is not installed; install the {extra} extra: pip install 'g3r[{extra}]'"
     raise error
 
 

@@ -37,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"g3r-pretrain {__version__}")
         return 0
 
+    from g3r.cli.failures import missing_extra
     from g3r.errors import G3RError
 
     try:
@@ -45,8 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
     except ModuleNotFoundError as error:
-        advice = "install the training extra: pip install 'g3r[train]'"
-        print(f"g3r-pretrain: {error.name} is not installed; {advice}", file=sys.stderr)
+        print(f"g3r-pretrain: {missing_extra(error)}", file=sys.stderr)
         return 3
 
     class PretrainCLI(LightningCLI):
