@@ -32,7 +32,7 @@ ROW_HEIGHT_INCHES = 2.5
 DOTS_PER_INCH = 130
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class View:
     """One plane through the volume: which world axes run right and up, and the letters at its four sides.
 
@@ -48,13 +48,13 @@ class View:
 
 
 VIEWS = (
-    View("axial", normal=2, across=0, up=1, letters="RLAP"),
-    View("coronal", normal=1, across=0, up=2, letters="RLSI"),
-    View("sagittal", normal=0, across=1, up=2, letters="APSI"),
+    View(name="axial", normal=2, across=0, up=1, letters="RLAP"),
+    View(name="coronal", normal=1, across=0, up=2, letters="RLSI"),
+    View(name="sagittal", normal=0, across=1, up=2, letters="APSI"),
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One volume [I, J, K] to be shown: its name, whether it is a map, a caption, and the ends of its bar."""
 
@@ -113,7 +113,13 @@ def save_sections(
     box, center = _crop(inside, spacing_mm, has_mask=mask is not None)
     canonical = {n: nib.orientations.apply_orientation(data, orientation)[box] for n, data in arrays.items()}
     rows = [
-        Row(name, data, name in maps, (captions or {}).get(name, ""), (ranges or {}).get(name))
+        Row(
+            name=name,
+            data=data,
+            is_map=name in maps,
+            caption=(captions or {}).get(name, ""),
+            range=(ranges or {}).get(name),
+        )
         for name, data in canonical.items()
     ]
     figure = _draw(rows, inside[box], center, spacing_mm, title)

@@ -17,7 +17,7 @@ ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, la
 """About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructionSettings:
     """Everything that decides a result, besides the data and the prior's weights.
 

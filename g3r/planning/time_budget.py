@@ -66,7 +66,7 @@ COST_EXPONENT = 0.6
 """A step takes seconds as this power of the number of Gaussians in a head: smaller ones have fewer pixels."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TimeBudget:
     """Settings that follow the seconds that are left.
 
@@ -97,7 +97,7 @@ class TimeBudget:
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
         deadline = replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord())
-        return cls(settings, deadline, seconds)
+        return cls(settings=settings, deadline=deadline, given_s=seconds)
 
     @property
     def missed(self) -> bool:

@@ -45,7 +45,7 @@ class LesionSubject:
         return VolumeGrid(self.healthy.data.shape, self.healthy.affine)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LesionRun:
     """What one head gave with one number of stacks.
 
@@ -141,7 +141,7 @@ def lesion_run(
         volumes[variant] = pair["lesions"] * scale
         change = (pair["lesions"] - pair["healthy"]) * scale
         shares[variant] = [kept(change, lesion) for lesion in subject.lesions]
-    return LesionRun(subject, n_stacks, volumes, shares, seconds)
+    return LesionRun(subject=subject, n_stacks=n_stacks, volumes=volumes, kept=shares, seconds=seconds)
 
 
 def true_motion(stacks: list[SimulatedStack]) -> Registration:

@@ -20,7 +20,7 @@ from studies.tables import table
 FIRST_SEED = 61200
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Configuration:
     """A phantom, how it is scanned, and what is asked for; positional, as the rows of the table."""
 
@@ -39,20 +39,23 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration(22, 1, "draft", 1.2),
-    Configuration(22, 3, "draft", 0.5),
-    Configuration(22, 6, "fast", 0.8),
-    Configuration(30, 1, "draft", 0.5),
-    Configuration(30, 3, "draft", 0.8, 2),
-    Configuration(30, 3, "balanced", 0.8),
-    Configuration(30, 6, "draft", 1.2),
-    Configuration(37, 1, "draft", 0.8),
-    Configuration(37, 3, "draft", 1.2, 1, ("--no-prior",)),
-    Configuration(37, 3, "draft", 0.5, 2),
+    Configuration(weeks=22, n_stacks=1, preset="draft", voxel_mm=1.2),
+    Configuration(weeks=22, n_stacks=3, preset="draft", voxel_mm=0.5),
+    Configuration(weeks=22, n_stacks=6, preset="fast", voxel_mm=0.8),
+    Configuration(weeks=30, n_stacks=1, preset="draft", voxel_mm=0.5),
+    Configuration(weeks=30, n_stacks=3, preset="draft", voxel_mm=0.8, threads=2),
+    Configuration(weeks=30, n_stacks=3, preset="balanced", voxel_mm=0.8),
+    Configuration(weeks=30, n_stacks=6, preset="draft", voxel_mm=1.2),
+    Configuration(weeks=37, n_stacks=1, preset="draft", voxel_mm=0.8),
+    Configuration(weeks=37, n_stacks=3, preset="draft", voxel_mm=1.2, threads=1, more=("--no-prior",)),
+    Configuration(weeks=37, n_stacks=3, preset="draft", voxel_mm=0.5, threads=2),
 )
 """Small and large heads, few and many stacks, coarse and fine voxels; draft where nothing else is asked."""
 
-LIMITED = (Configuration(30, 3, "draft", 0.8), Configuration(30, 1, "draft", 0.5))
+LIMITED = (
+    Configuration(weeks=30, n_stacks=3, preset="draft", voxel_mm=0.8),
+    Configuration(weeks=30, n_stacks=1, preset="draft", voxel_mm=0.5),
+)
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
 
 

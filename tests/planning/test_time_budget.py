@@ -32,7 +32,7 @@ def stacks(subject: Path) -> list[Stack]:
 
 
 def budget(seconds: float, settings: ReconstructionSettings = SETTINGS) -> TimeBudget:
-    return TimeBudget(settings, Deadline.after(seconds, Clock()), seconds)
+    return TimeBudget(settings=settings, deadline=Deadline.after(seconds, Clock()), given_s=seconds)
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
@@ -48,7 +48,7 @@ def test_what_was_spent_before_counts():
 @pytest.mark.parametrize(("late_s", "missed"), [(-1.0, False), (2.9, False), (3.1, True)])
 def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool):
     clock = Clock()
-    one = TimeBudget(SETTINGS, Deadline.after(10.0, clock), 10.0)
+    one = TimeBudget(settings=SETTINGS, deadline=Deadline.after(10.0, clock), given_s=10.0)
     clock.now += 10.0 + late_s
     assert one.missed is missed
 

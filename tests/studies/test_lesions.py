@@ -111,7 +111,9 @@ def test_the_figure_shows_sections_that_a_run_has_kept(
 ) -> None:
     subject = LesionSubject("a", head[0], tuple(lesions), {})
     volumes = dict.fromkeys(VARIANTS, head[0].data)
-    run = LesionRun(subject, 3, volumes, dict.fromkeys(VARIANTS, [0.5] * len(lesions)), 1.0)
+    run = LesionRun(
+        subject=subject, n_stacks=3, volumes=volumes, kept=dict.fromkeys(VARIANTS, [0.5] * len(lesions)), seconds=1.0
+    )
     save_sections(run, tmp_path / "out" / "sections-3.npz")
     draw_lesions_kept("a", {3: tmp_path / "out" / "sections-3.npz"}, VARIANTS, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").is_file()
