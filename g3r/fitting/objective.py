@@ -1,4 +1,4 @@
-"""The loss of a fit as a value and explicit gradients.
+"""The loss of a fit (G3R Eq. 1: data term plus regulariser) as a value and explicit gradients.
 
 `CloudObjective.begin` returns a `LossStep` at the present parameters. `LossStep.add` evaluates an image term,
 `LossStep.finish` adds the scale regulariser and writes the gradient of the sum into the parameters. The tests compare

@@ -18,7 +18,7 @@ ORTHONORMALITY_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class RigidPose:
-    """S rigid motions x -> R x + t, the poses of the slice model (G3R Eq. 1).
+    """S rigid motions x -> R x + t, the T_k of G3R Eq. 2.
 
     Args:
         rotation: [S, 3, 3] proper rotations (det +1).

@@ -34,7 +34,7 @@ scoring the rigid stacks and for the orientation."""
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """Slices in estimated poses (the pose of every slice in G3R Eq. 1), and how well they fit.
+    """Slices in estimated poses (the T_k of G3R Eq. 2), and how well they fit.
 
     Args:
         slices: in the frame of the result.
