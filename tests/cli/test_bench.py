@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -25,7 +26,7 @@ MACHINE = {
 }
 
 
-def test_names_its_commands(capsys):
+def test_names_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         bench.main(["--help"])
     said = capsys.readouterr().out
@@ -34,7 +35,7 @@ def test_names_its_commands(capsys):
         bench.main(["nothing"])
 
 
-def test_presets_are_named_once():
+def test_presets_are_named_once() -> None:
     from g3r.planning import PRESET_NAMES
     from g3r.planning.presets import PRESETS
 
@@ -52,7 +53,9 @@ def test_presets_are_named_once():
         ["scaling", "--sizes", "1"],
     ],
 )
-def test_bad_input_is_one_line(words, capsys, tmp_path, monkeypatch):
+def test_bad_input_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert bench.main(words) == 3
     said = capsys.readouterr()
@@ -75,7 +78,7 @@ def preset(seconds, psnr):
     }
 
 
-def variant(seconds, psnr, *, same=False):
+def variant(seconds, psnr, *, same: bool = False):
     return {
         "seconds": seconds,
         "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1},
@@ -98,7 +101,7 @@ def made_record():
     return {"machine": MACHINE, "repeats": 3, "base": "balanced", "cases": {"made": case}}
 
 
-def test_trade_tables_and_figure(tmp_path):
+def test_trade_tables_and_figure(tmp_path: Path) -> None:
     text = trade_tables(made_record())
     assert "| made | `draft` | 16.0 (!) | 15 | 4.60 (!) | 4 |" in text
     assert "| made | `balanced` | 60.0 | 75 | 0.60 (!) | 0.5 |" in text
@@ -110,7 +113,7 @@ def test_trade_tables_and_figure(tmp_path):
     assert (tmp_path / "made" / "trade.png").stat().st_size > 10_000
 
 
-def test_scaling_measures_what_grows(tmp_path):
+def test_scaling_measures_what_grows(tmp_path: Path) -> None:
     rows = measured_growth("output voxels", 2)
     assert [row["size"] for row in rows] == [30**3, 38**3]
     assert rows[1]["evaluations"] > 1.5 * rows[0]["evaluations"]
@@ -121,7 +124,7 @@ def test_scaling_measures_what_grows(tmp_path):
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
 
 
-def test_work_is_proportional_to_what_grows():
+def test_work_is_proportional_to_what_grows() -> None:
     from dataclasses import replace
 
     from g3r.bench.scenes import SceneSize, evaluations, made_cloud, made_slices
@@ -139,7 +142,7 @@ def test_work_is_proportional_to_what_grows():
 
 
 @pytest.mark.slow
-def test_trade_from_end_to_end(tmp_path, capsys):
+def test_trade_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--phantom", "20", "--resolution", "1.5", "--thickness", "4", "--seed", "61009"]
     assert simulate.main([*words, "--output", str(tmp_path / "case")]) == 0
     page = tmp_path / "page.md"

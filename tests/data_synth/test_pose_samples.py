@@ -15,7 +15,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 
 
 @pytest.fixture(scope="module")
-def sampled(centred_head):
+def sampled(centred_head: TruthVolume):
     return Head.from_volume(centred_head)
 
 
@@ -28,7 +28,7 @@ def shown_at(sampled, pose, size, pixel_mm):
     return map_coordinates(sampled.data, np.moveaxis(index, -1, 0), order=1)
 
 
-def test_images_show_the_truth_at_their_poses(sampled, rng):
+def test_images_show_the_truth_at_their_poses(sampled, rng: np.random.Generator) -> None:
     one = draw_slice_set(sampled, rng, max_slices=30, vary=False)
     image = one.images.image
     assert 5 <= len(image) <= 30
@@ -38,7 +38,9 @@ def test_images_show_the_truth_at_their_poses(sampled, rng):
     assert np.corrcoef(image.ravel(), shown_at(sampled, wrong, 40, 3.0).ravel())[0, 1] < 0.93
 
 
-def test_stacks_are_centred_by_their_headers(sampled, rng, monkeypatch):
+def test_stacks_are_centred_by_their_headers(
+    sampled, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without motion the mean of a stack's masks, in its own axes, lies in the middle of its images."""
     monkeypatch.setattr(stack_planning, "LEVEL_SHARE", {"none": 1.0})
     monkeypatch.setattr(stack_planning, "TIMED_SHARE", 0.0)
@@ -52,7 +54,7 @@ def test_stacks_are_centred_by_their_headers(sampled, rng, monkeypatch):
         assert abs(np.average(one.position_mm[rows], weights=one.area_mm2[rows])) < 0.5
 
 
-def test_the_same_images_as_at_inference(centred_head, sampled, rng):
+def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled, rng: np.random.Generator) -> None:
     """Stacks of the full simulator, read as at inference, look like the fast synthesis at the same poses."""
     settings = [
         StackSettings(orientation=name, resolution_mm=1.0, thickness_mm=3.0, motion=LEVELS["mild"])
@@ -70,7 +72,7 @@ def test_the_same_images_as_at_inference(centred_head, sampled, rng):
             assert np.corrcoef(image.ravel(), other.ravel())[0, 1] > 0.95
 
 
-def test_a_set_varies_and_is_finite(sampled):
+def test_a_set_varies_and_is_finite(sampled) -> None:
     sets = [draw_slice_set(sampled, np.random.default_rng(seed), max_slices=24) for seed in range(12)]
     assert len({int(one.images.stack_id.max()) for one in sets}) >= 3
     known = [np.isfinite(one.images.time_rank).all() for one in sets]

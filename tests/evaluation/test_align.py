@@ -39,7 +39,7 @@ def pose_deg(rotation, translation_mm):
 @pytest.mark.parametrize(
     ("rotation_deg", "translation_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
 )
-def test_a_known_motion_is_found(rotation_deg, translation_mm):
+def test_a_known_motion_is_found(rotation_deg: tuple[int, int, int], translation_mm: tuple[int, int, int]) -> None:
     reference, mask = on_grid(GRID)
     pose = pose_deg(rotation_deg, translation_mm)
     moved, _ = on_grid(VolumeGrid.isotropic((-52, -60, -50), (56, 60, 48), 1.7), pose)
@@ -51,7 +51,7 @@ def test_a_known_motion_is_found(rotation_deg, translation_mm):
     assert found.rotation_deg == pytest.approx(np.linalg.norm(rotation_deg), abs=0.3)
 
 
-def test_same_input_same_result():
+def test_same_input_same_result() -> None:
     reference, mask = on_grid(GRID)
     moved, _ = on_grid(GRID, pose_deg((5, 2, -3), (2, 1, -2)))
     first, second = (align_rigid(moved, reference, mask).volume_from_reference for _ in range(2))
@@ -59,13 +59,13 @@ def test_same_input_same_result():
     np.testing.assert_array_equal(first.translation_mm, second.translation_mm)
 
 
-def test_resampling_on_the_same_grid_changes_nothing():
+def test_resampling_on_the_same_grid_changes_nothing() -> None:
     volume, _ = on_grid(GRID)
     np.testing.assert_array_equal(resample(volume, GRID), volume.data)
 
 
 @pytest.mark.parametrize("flip", [(), (0,), (0, 1), (2,)])
-def test_resampling_follows_the_header(flip):
+def test_resampling_follows_the_header(flip) -> None:
     volume, mask = on_grid(GRID)
     affine = GRID.affine.copy()
     for axis in flip:
@@ -75,7 +75,7 @@ def test_resampling_follows_the_header(flip):
     np.testing.assert_allclose(resample(flipped, GRID)[mask], volume.data[mask], atol=0.2)  # of 1000
 
 
-def test_resampling_agrees_with_scipy_on_an_oblique_grid():
+def test_resampling_agrees_with_scipy_on_an_oblique_grid() -> None:
     volume, _ = on_grid(GRID)
     pose = pose_deg((10, -20, 30), (3, 4, -5))
     affine = np.eye(4)
@@ -88,7 +88,7 @@ def test_resampling_agrees_with_scipy_on_an_oblique_grid():
     np.testing.assert_allclose(resample(volume, grid)[inner], expected[inner], atol=0.5)  # of 1000
 
 
-def test_compare_with_and_without_alignment(rng):
+def test_compare_with_and_without_alignment(rng: np.random.Generator) -> None:
     reference, mask = on_grid(GRID)
     moved, _ = on_grid(GRID, pose_deg((6, 3, -4), (3, 2, -3)))
     noisy = Volume(moved.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved")
@@ -111,7 +111,7 @@ def test_compare_with_and_without_alignment(rng):
         (lambda v, r: (Volume(v.data, v.affine @ SHEAR, "v"), r), "sheared"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(spoil, message):
+def test_what_cannot_be_compared_is_refused(spoil, message: str) -> None:
     reference, mask = on_grid(GRID)
     with pytest.raises(InputError, match=message):
         compare(*spoil(reference, reference), mask)

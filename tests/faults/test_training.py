@@ -82,7 +82,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[int, float]:
 
 
 @pytest.mark.faults
-def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path: Path):
+def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path: Path) -> None:
     assert len(whole) == 3 * N_EPOCHS
     assert trained(tmp_path) == whole
 
@@ -91,7 +91,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 @pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
-):
+) -> None:
     with tally.case():
         begun = trained(tmp_path, end_at)
         assert begun == {step: whole[step] for step in range(1, end_at + 1)}
@@ -100,7 +100,7 @@ def test_a_training_that_ended_goes_on_at_the_same_losses(
         assert resumed == {step: loss for step, loss in whole.items() if step > last_epoch}
 
 
-def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally):
+def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally) -> None:
     path, keeper = tmp_path / "last.ckpt", WholeCheckpoints()
     keeper.save_checkpoint({"a": torch.ones(3)}, path)
 
@@ -163,7 +163,7 @@ def losses(folder: Path) -> dict[int, float]:
 
 
 @pytest.mark.faults
-def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: Path, tally: Tally):
+def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: Path, tally: Tally) -> None:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     done = subprocess.run(command(tmp_path / "whole"), check=False, **quiet)
     assert done.returncode == 0, done.stderr

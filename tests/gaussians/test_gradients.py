@@ -48,7 +48,7 @@ def gradients(leaves, planes, pixel_weight, dtype, **options):
 @pytest.mark.parametrize("attenuation", ["exact", "printed"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("psf", [1.0, 0.0])
-def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
+def test_numba_gradients_agree_with_float64_autograd(seed: int, attenuation: str, psf: float) -> None:
     leaves, planes, weight = scene(seed, psf=psf)
     expected, expected_grad = gradients(
         leaves, planes, weight, torch.float64, backend="reference", attenuation=attenuation
@@ -61,7 +61,7 @@ def test_numba_gradients_agree_with_float64_autograd(seed, attenuation, psf):
 
 
 @pytest.mark.parametrize("attenuation", ["exact", "printed"])
-def test_reference_gradcheck(attenuation):
+def test_reference_gradcheck(attenuation: str) -> None:
     leaves, planes, _ = scene(3, n=2, n_planes=2)
     planes = Planes(
         rotation=planes.rotation,
@@ -80,7 +80,7 @@ def test_reference_gradcheck(attenuation):
     )
 
 
-def test_gradient_of_twist_is_finite_at_zero_and_tiny_turns():
+def test_gradient_of_twist_is_finite_at_zero_and_tiny_turns() -> None:
     leaves, planes, weight = scene(4)
     for size in (0.0, 1e-8):
         leaves[4] = torch.full_like(leaves[4], size)

@@ -19,6 +19,7 @@ from tests.numerics.errors import gradient_tolerance, shape_tolerance, sized_sce
 from tests.numerics.fast_backends import BACKENDS, FAST
 from tests.numerics.oracles import volume_at
 from tests.numerics.scenes import ORIGIN_MM, Scene, cloud_of, head_scene, single, slender_scenes, stacks_of_planes
+from tests.tally import Tally
 
 
 def of_sigma(sigma_mm: float, thickness_mm: float) -> Scene:
@@ -128,7 +129,7 @@ SCENES: dict[str, tuple[Callable[[], Scene], float]] = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_value_and_every_gradient_are_finite_and_right(name: str, tally):
+def test_value_and_every_gradient_are_finite_and_right(name: str, tally: Tally) -> None:
     make, ratio = SCENES[name]
     scene = make()
     cloud, planes = scene.cloud, scene.planes
@@ -153,7 +154,7 @@ def test_value_and_every_gradient_are_finite_and_right(name: str, tally):
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 1.0, np.pi - 1e-9, np.pi])
-def test_turns_of_the_twist_of_any_size(angle: float, tally):
+def test_turns_of_the_twist_of_any_size(angle: float, tally: Tally) -> None:
     scene = head_scene()
     axis = np.random.default_rng(1).normal(size=(len(scene.planes), 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -173,7 +174,7 @@ def test_turns_of_the_twist_of_any_size(angle: float, tally):
 
 
 @pytest.mark.numerics
-def test_a_million_gaussians(tally):
+def test_a_million_gaussians(tally: Tally) -> None:
     """Against the same Gaussians in a hundred parts: sums of images, and of their gradients."""
     n = 1_000_000
     rng = np.random.default_rng(6)
@@ -203,7 +204,7 @@ def test_a_million_gaussians(tally):
 
 
 @pytest.mark.parametrize("sigma_mm", [1e-3, 0.05, 1.0, 50.0])
-def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally):
+def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally: Tally) -> None:
     """y - V(x) = (D : Hessian of V) / 2 + ..., so it falls with the square of the PSF's width."""
     scene = of_sigma(sigma_mm, 0.0)
     exact = volume_at(scene.cloud, scene.planes.pixel_world_mm())
@@ -221,7 +222,7 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
             assert np.abs(rough - exact).max() / top <= 3 * width**2 + 3e-6
 
 
-def test_pairs_of_flat_gaussians_are_not_missed():
+def test_pairs_of_flat_gaussians_are_not_missed() -> None:
     """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
     scene = flat(False, 40, 1e-5, 0.03)
     pairs = find_overlaps(single(scene.cloud), scene.planes, 3.2)
@@ -231,7 +232,7 @@ def test_pairs_of_flat_gaussians_are_not_missed():
         assert k in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
 
 
-def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair():
+def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair() -> None:
     """Centres in float64, 10 m from the cloud's own origin."""
     scene = head_scene()
     far = GaussianCloud(scene.cloud.mean_mm + 1e4, *scene.cloud.parameters[1:], scene.cloud.origin_mm - 1e4)
@@ -256,7 +257,7 @@ BAD_CLOUDS = {
 
 
 @pytest.mark.parametrize("name", BAD_CLOUDS)
-def test_clouds_that_are_not_numbers_are_refused(name: str, tally):
+def test_clouds_that_are_not_numbers_are_refused(name: str, tally: Tally) -> None:
     which, value = BAD_CLOUDS[name]
     parameters = [p.clone() for p in head_scene().cloud.parameters]
     parameters[which][3] = value
@@ -265,7 +266,7 @@ def test_clouds_that_are_not_numbers_are_refused(name: str, tally):
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-def test_calls_that_make_no_sense_are_refused(backend: str, tally):
+def test_calls_that_make_no_sense_are_refused(backend: str, tally: Tally) -> None:
     scene = head_scene()
     cloud, n = single(scene.cloud), len(scene.planes)
     bad = [
@@ -282,7 +283,7 @@ def test_calls_that_make_no_sense_are_refused(backend: str, tally):
             render(half, scene.planes, backend=backend)
 
 
-def test_a_sigma_of_more_pixels_than_integers_hold_is_refused(tally):
+def test_a_sigma_of_more_pixels_than_integers_hold_is_refused(tally: Tally) -> None:
     scene = head_scene()
     log_scale = torch.full_like(scene.cloud.log_scale, np.log(0.99 * SIGMA_RANGE_MM[1]))
     cloud = GaussianCloud(scene.cloud.mean_mm, log_scale, *scene.cloud.parameters[2:], ORIGIN_MM)

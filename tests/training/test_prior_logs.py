@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ TINY_TRAINING = [
 ]
 
 
-def volumes(n, seed=0, size=12):
+def volumes(n, seed: int = 0, size: int = 12):
     generator = torch.Generator().manual_seed(seed)
     names = ("coarse", "density", "sharp", "truth")
     batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
@@ -69,7 +70,7 @@ class ValidatedByStacks(lightning.LightningDataModule):
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
+def log(tmp_path_factory: pytest.TempPathFactory):
     """What TensorBoard has of two epochs."""
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
@@ -78,7 +79,7 @@ def log(tmp_path_factory):
     return logged(folder / "run" / "version_0")
 
 
-def test_scores_by_number_of_stacks_are_logged(log):
+def test_scores_by_number_of_stacks_are_logged(log) -> None:
     tags = set(log.Tags()["scalars"])
     for stacks in ("", "_1stack", "_3stacks"):
         expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in validation.VALIDATED}
@@ -87,7 +88,7 @@ def test_scores_by_number_of_stacks_are_logged(log):
     assert {"train/samples_per_second", "train/waiting_for_data", "train/l1_prior"} <= tags
 
 
-def test_scores_are_means_over_volumes(log):
+def test_scores_are_means_over_volumes(log) -> None:
     def last(tag):
         return log.Scalars(tag)[-1].value
 
@@ -99,7 +100,7 @@ def test_scores_are_means_over_volumes(log):
     assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
 
 
-def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
+def test_images_show_gate_and_confidence_for_each_number_of_stacks(log) -> None:
     tags = log.Tags()["images"]
     assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
     assert "confidence, gate" in validation.PANEL_TAG
@@ -107,7 +108,7 @@ def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
     assert (image.height, image.width) == (12, 7 * 12)
 
 
-def test_panel_of_a_network_without_a_gate():
+def test_panel_of_a_network_without_a_gate() -> None:
     batch = volumes(1)
     shown = validation.panel(batch, batch["coarse"], None)
     coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
@@ -116,7 +117,7 @@ def test_panel_of_a_network_without_a_gate():
     assert torch.equal(prior, coarse)  # which stands for the prior here
 
 
-def test_going_on_at_another_voxel_size_is_refused(tmp_path):
+def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
     first = training.PriorModule(NETWORK)
     options = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
@@ -146,7 +147,7 @@ def steps_of(checkpoint):
 
 
 @pytest.mark.slow
-def test_training_goes_on_after_a_kill(tmp_path):
+def test_training_goes_on_after_a_kill(tmp_path: Path) -> None:
     """Killed without warning after its second epoch at the earliest, and resumed for one epoch more."""
     process = run_training(tmp_path, "--trainer.max_epochs=1000")
     last = tmp_path / "prior" / "version_0" / "checkpoints" / "last.ckpt"
@@ -178,7 +179,7 @@ def test_training_goes_on_after_a_kill(tmp_path):
     [["--trainer.precision=bf16-mixed"], ["--trainer.devices=2", "--trainer.strategy=ddp"]],
     ids=["mixed precision", "two devices"],
 )
-def test_trainer_flags(tmp_path, flags):
+def test_trainer_flags(tmp_path: Path, flags: list[str]) -> None:
     process = run_training(tmp_path, "--trainer.max_epochs=1", *flags)
     words, _ = process.communicate(timeout=400)
     assert process.returncode == 0, words[-2000:]
@@ -187,7 +188,7 @@ def test_trainer_flags(tmp_path, flags):
 
 
 @pytest.mark.slow
-def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
+def test_another_anatomy_is_trained_with_the_same_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder of volumes with masks is enough for the prior; names need not hold an age."""
     generator = np.random.default_rng(0)
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
