@@ -1,5 +1,7 @@
 """M_rho is 1 where one gapless stack covers once; V_coarse is a mean; confidence keeps its digits."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,7 @@ def cube_stack(
     pixel_mm: float = 1.0,
     thickness_mm: float = 3.0,
     distance_mm: float | None = None,
-    turn=TURNS["axial"],
+    turn: np.ndarray = TURNS["axial"],
     value: float | None = 7.0,
 ) -> Stack:
     """A stack whose mask is a cube of 40 mm about the origin."""
@@ -37,7 +39,7 @@ def cube_stack(
     return Stack(image=image, mask=np.ones(shape, bool), affine=affine, thickness_mm=thickness_mm)
 
 
-def density_inside(slices: Slices, voxel_mm: float = 1.0, **options) -> np.ndarray:
+def density_inside(slices: Slices, voxel_mm: float = 1.0, **options: Any) -> np.ndarray:
     """M over the inner cube of 24 mm, whole periods of every slice distance in use."""
     grid = VolumeGrid.isotropic([-12 + voxel_mm / 2] * 3, [12 - voxel_mm / 2] * 3, voxel_mm)
     return coarse_and_density(slices, grid, **options)[1]

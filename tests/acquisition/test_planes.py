@@ -10,7 +10,7 @@ from tests.acquisition.nifti_files import AXES, affine_of, stacks_of_two
 
 
 @pytest.mark.parametrize("index", [[3, 0, 7], slice(2, 6), "mask", []])
-def test_take_keeps_pixels_values_and_slices_together(index) -> None:
+def test_take_keeps_pixels_values_and_slices_together(index: list[int] | slice | str) -> None:
     slices = slices_from_stacks(stacks_of_two())
     if index == "mask":
         index = np.arange(len(slices)) % 3 == 1

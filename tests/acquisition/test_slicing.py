@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from data_synth.phantom import fetal_brain_phantom
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
@@ -35,7 +36,7 @@ def test_normalised_slices_have_their_99th_percentile_at_one() -> None:
     np.testing.assert_allclose(slices.value * scale, slices_from_stacks(stacks_of_two()).value, rtol=1e-6)
 
 
-def assert_pixels_are_voxels(slices, image, affine, n_masked) -> None:
+def assert_pixels_are_voxels(slices: Slices, image: np.ndarray, affine: np.ndarray, n_masked: int) -> None:
     """Every masked pixel of the slices: position and value are those of the voxel it was cut from."""
     world = slices.planes.pixel_world_mm(slices.pixel_index)
     assert len(world) == n_masked

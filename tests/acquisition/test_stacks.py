@@ -1,6 +1,7 @@
 """Stacks from files: axes, thickness, masks, and every refusal."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))
         ({"image": np.full((14, 11, 6), 7, np.float32)}, "every value inside the mask is 7"),
     ],
 )
-def test_unusable_stacks_are_refused(change, message: str) -> None:
+def test_unusable_stacks_are_refused(change: dict[str, Any], message: str) -> None:
     image, mask = arrays()
     good = {"image": image, "mask": mask, "affine": affine_of(AXES["RAS"]), "thickness_mm": 3.0, "name": "a.nii"}
     Stack(**good)

@@ -106,7 +106,7 @@ def test_planes_of_the_grid_read_its_voxels() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_dtype_is_kept(dtype) -> None:
+def test_dtype_is_kept(dtype: type[np.floating]) -> None:
     planes = random_planes(7)
     operator = VoxelOperator(planes, GRID)
     assert operator.forward(np.ones(GRID.shape, dtype)).dtype == dtype

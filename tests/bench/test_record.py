@@ -49,7 +49,7 @@ def test_only_what_is_between_the_markers_changes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "<!-- t:begin -->", "<!-- t:end --><!-- t:begin -->", "<!-- t:begin --><!-- t:end -->" * 2]
 )
-def test_markers_must_be_there_once(text) -> None:
+def test_markers_must_be_there_once(text: str) -> None:
     with pytest.raises(InputError, match="markers"):
         between_markers(text, "t", "x")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -64,7 +65,7 @@ def test_bad_input_is_one_line(
     assert not said.out
 
 
-def preset(seconds, psnr):
+def preset(seconds: float, psnr: float) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "cpu_seconds": 2 * seconds,
@@ -78,7 +79,7 @@ def preset(seconds, psnr):
     }
 
 
-def variant(seconds, psnr, *, same: bool = False):
+def variant(seconds: float, psnr: float, *, same: bool = False) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1},
@@ -90,7 +91,7 @@ def variant(seconds, psnr, *, same: bool = False):
     }
 
 
-def made_record():
+def made_record() -> dict[str, Any]:
     fit = {"curve": {"step": [1, 2], "seconds_before_end": [2.0, 0.0], "psnr_db": [20.0, 24.0]}}
     presets = {"draft": preset(16.0, 20.0), "balanced": preset(60.0, 24.0), "accurate": preset(200.0, 24.6)}
     case = {

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
 
+from data_synth.atlas import TruthVolume
+
 pytest.importorskip("torchio")
 
 from data_synth.head_variation import recurved, varied_head

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from data_synth.atlas import TruthVolume
+
 pytest.importorskip("lightning")
 pytest.importorskip("torchio")
 

@@ -9,21 +9,22 @@ from scipy.ndimage import affine_transform, center_of_mass
 from data_synth.atlas import AtlasSubject, find_subjects
 from data_synth.heads import PhantomSubject, load_head, weeks_of
 from data_synth.template import atlas_templates
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 
 @pytest.fixture(scope="module")
-def template():
+def template() -> AtlasTemplate:
     return atlas_templates([PhantomSubject("a", 25.0, 1), PhantomSubject("b", 31.5, 2)], 3.0, weeks=(25, 31, 37))
 
 
-def test_ages_without_a_subject_are_left_out(template) -> None:
+def test_ages_without_a_subject_are_left_out(template: AtlasTemplate) -> None:
     assert template.weeks.tolist() == [25, 31]
     assert len(template.volume) == 2
 
 
-def test_symmetric_centred_and_normalised(template) -> None:
+def test_symmetric_centred_and_normalised(template: AtlasTemplate) -> None:
     np.testing.assert_allclose(template.volume, template.volume[:, ::-1], atol=1e-6)
     np.testing.assert_allclose(template.grid.center_mm, 0, atol=1e-9)
     for head in template.volume:
@@ -32,7 +33,7 @@ def test_symmetric_centred_and_normalised(template) -> None:
         assert np.percentile(head[head > 0], 99.5) == pytest.approx(1, abs=1e-3)
 
 
-def test_older_heads_are_larger(template) -> None:
+def test_older_heads_are_larger(template: AtlasTemplate) -> None:
     young, old = (template.volume > 0).sum((1, 2, 3))
     assert old > 1.2 * young
 

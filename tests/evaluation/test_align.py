@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from g3r.acquisition.images import Volume
@@ -15,7 +18,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 GRID = VolumeGrid.isotropic((-40, -48, -36), (40, 48, 36), 2.0)
 
 
-def brain(points_mm):
+def brain(points_mm: np.ndarray) -> np.ndarray:
     """An uneven ellipsoid with inner structure, defined at any world point [..., 3]."""
     x, y, z = np.moveaxis(points_mm, -1, 0)
     inside = 1 / (1 + np.exp(2.0 * (np.sqrt((x / 28) ** 2 + (y / 36) ** 2 + (z / 24) ** 2) - 1) * 12))
@@ -24,7 +27,7 @@ def brain(points_mm):
     return (inside * (texture + bump)).astype(np.float32)
 
 
-def on_grid(grid, pose=None):
+def on_grid(grid: VolumeGrid, pose: RigidPose | None = None) -> tuple[Volume, np.ndarray]:
     """The brain sampled on a grid after a motion; mask of the brain."""
     points = grid.world(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1))
     points = points if pose is None else pose.inverse().apply(points[None])[0]
@@ -32,7 +35,7 @@ def on_grid(grid, pose=None):
     return Volume(data, grid.affine, "phantom"), data > 100
 
 
-def pose_deg(rotation, translation_mm):
+def pose_deg(rotation: ArrayLike, translation_mm: ArrayLike) -> RigidPose:
     return RigidPose.from_rotvec(np.deg2rad([rotation]), [translation_mm])
 
 
@@ -65,7 +68,7 @@ def test_resampling_on_the_same_grid_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("flip", [(), (0,), (0, 1), (2,)])
-def test_resampling_follows_the_header(flip) -> None:
+def test_resampling_follows_the_header(flip: tuple[int, ...]) -> None:
     volume, mask = on_grid(GRID)
     affine = GRID.affine.copy()
     for axis in flip:
@@ -111,7 +114,9 @@ def test_compare_with_and_without_alignment(rng: np.random.Generator) -> None:
         (lambda v, r: (Volume(v.data, v.affine @ SHEAR, "v"), r), "sheared"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(spoil, message: str) -> None:
+def test_what_cannot_be_compared_is_refused(
+    spoil: Callable[[Volume, Volume], tuple[Volume, Volume]], message: str
+) -> None:
     reference, mask = on_grid(GRID)
     with pytest.raises(InputError, match=message):
         compare(*spoil(reference, reference), mask)

@@ -9,12 +9,12 @@ import pytest
 
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError
-from g3r.evaluation.pose_error import PoseTable, read_poses, slice_points, target_registration_error
+from g3r.evaluation.pose_error import PoseTable, SliceKey, read_poses, slice_points, target_registration_error
 from g3r.geometry import RigidPose
 
 
 @pytest.fixture
-def points(rng: np.random.Generator):
+def points(rng: np.random.Generator) -> dict[SliceKey, np.ndarray]:
     """Two stacks of ten slices, 40 points each."""
     layout = {}
     for stack in range(2):
@@ -25,11 +25,11 @@ def points(rng: np.random.Generator):
     return layout
 
 
-def random_poses(rng: np.random.Generator, n, degrees, mm):
+def random_poses(rng: np.random.Generator, n: int, degrees: float, mm: float) -> RigidPose:
     return RigidPose.from_rotvec(np.deg2rad(rng.normal(0, degrees, (n, 3))), rng.normal(0, mm, (n, 3)))
 
 
-def test_a_common_motion_does_not_count(points, rng: np.random.Generator) -> None:
+def test_a_common_motion_does_not_count(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = random_poses(rng, len(keys), 8, 4)
     common = random_poses(rng, 1, 30, 20)
@@ -38,7 +38,7 @@ def test_a_common_motion_does_not_count(points, rng: np.random.Generator) -> Non
     assert (found.n_slices, found.n_missing) == (20, 0)
 
 
-def test_known_shift_of_few_slices(points, rng: np.random.Generator) -> None:
+def test_known_shift_of_few_slices(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = random_poses(rng, len(keys), 8, 4)
     shift = np.zeros((20, 3))
@@ -50,7 +50,7 @@ def test_known_shift_of_few_slices(points, rng: np.random.Generator) -> None:
     assert found.mean_mm == pytest.approx(1.5, abs=0.1)
 
 
-def test_missing_and_foreign_slices(points, rng: np.random.Generator) -> None:
+def test_missing_and_foreign_slices(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = PoseTable(keys, random_poses(rng, len(keys), 8, 4))
     some = PoseTable(((9, 9), *keys[:15]), true.pose.take([0, *range(15)]))

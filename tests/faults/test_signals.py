@@ -56,7 +56,7 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     tally: Tally,
-    number,
+    number: signal.Signals,
     code: int,
 ) -> None:
     with tally.case():

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,12 +17,14 @@ import torch
 from g3r.errors import InputError
 from tests.tally import Tally
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 pytest.importorskip("torchio", reason="the training extra is not installed")
 
-from data_synth.prior_data import StackSynthesisDataModule  # noqa: E402
-from g3r.training.annealed_module import WholeCheckpoints  # noqa: E402
-from g3r.training.prior_module import PriorModule  # noqa: E402
+import lightning.pytorch as lightning
+
+from data_synth.prior_data import StackSynthesisDataModule
+from g3r.training.annealed_module import WholeCheckpoints
+from g3r.training.prior_module import PriorModule
 
 NETWORK = {"channels": [4, 4], "units": [1, 1], "tail_channels": 2, "warmup_steps": 2}
 # ten patches an epoch in batches of three: one is left over each time
@@ -45,7 +48,9 @@ class Losses(lightning.Callback):
         self.found: dict[int, float] = {}
         self.end_at = end_at
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(
+        self, trainer: Any, module: Any, outputs: dict[str, torch.Tensor], batch: object, batch_idx: int
+    ) -> None:
         self.found[trainer.global_step] = float(outputs["loss"])
         if trainer.global_step == self.end_at:
             raise ZeroDivisionError

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
+from g3r.fitting.adaptive_stage import AdaptiveSettings, Densification, fit_adaptive
 from g3r.fitting.prior_stage import PriorStageSettings
+from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
 
 GRID = VolumeGrid.isotropic([-14.0] * 3, [14.0] * 3, 1.0)
@@ -18,7 +19,9 @@ STAGE = PriorStageSettings(n_steps=15, scale_weight=0.0)
 QUICK = AdaptiveSettings(bound=0.08, round_steps=15, n_rounds=5)
 
 
-def fitted(bound: float = 0.08, volume=SHEETS, mask=BALL, finest_mm: float = 2.0):
+def fitted(
+    bound: float = 0.08, volume: np.ndarray = SHEETS, mask: np.ndarray = BALL, finest_mm: float = 2.0
+) -> tuple[GaussianCloud, Densification]:
     settings = replace(QUICK, bound=bound)
     return fit_adaptive(
         volume, mask, GRID, finest_spacing_mm=finest_mm, settings=settings, stage=STAGE, rng=np.random.default_rng(3)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
@@ -21,7 +22,12 @@ FRAMES = np.stack(
 
 
 def cloud_of(
-    mean, log_scale, quaternion, amplitude, origin: tuple[float, float, float] = (0.0, 0, 0), dtype=np.float32
+    mean: ArrayLike,
+    log_scale: ArrayLike,
+    quaternion: ArrayLike,
+    amplitude: ArrayLike,
+    origin: tuple[float, float, float] = (0.0, 0, 0),
+    dtype: type[np.floating] = np.float32,
 ) -> GaussianCloud:
     """A cloud from arrays."""
     arrays = (mean, log_scale, quaternion, amplitude)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
@@ -29,7 +30,9 @@ GRID = VolumeGrid((40, 42, 38), AFFINE)
 ALL = np.ones(GRID.shape, bool)
 
 
-def gaussians(mean, sigma, amplitude, rotation=None) -> GaussianCloud:
+def gaussians(
+    mean: ArrayLike, sigma: ArrayLike, amplitude: ArrayLike, rotation: Rotation | None = None
+) -> GaussianCloud:
     mean = np.atleast_2d(np.asarray(mean, float))
     n = len(mean)
     rotation = Rotation.identity(n) if rotation is None else rotation
@@ -80,7 +83,9 @@ def test_density_is_exceeded_at_their_own_spacing_and_not_at_half_of_it() -> Non
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1), tolerance=st.floats(1e-4, 3.0))
-def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolerance(seed, tolerance) -> None:
+def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolerance(
+    seed: int, tolerance: float
+) -> None:
     """The integral of the squared change, as the voxels see it, for one Gaussian and for one pair."""
     rng = np.random.default_rng(seed)
     one = gaussians(rng.uniform(-3, 3, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1))

@@ -1,9 +1,12 @@
 """Every gradient of the renderer against float64 autograd of the dense reference."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import GaussianCloud, render
@@ -11,7 +14,7 @@ from g3r.gaussians import GaussianCloud, render
 NAMES = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude", "twist", "log_gain")
 
 
-def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0):
+def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0) -> tuple[list[Tensor], Planes, Tensor]:
     """Random Gaussians near the origin and random planes through it, as double leaves."""
     rng = np.random.default_rng(seed)
     leaves = [
@@ -33,12 +36,14 @@ def scene(seed: int, n: int = 6, n_planes: int = 3, psf: float = 1.0):
     return leaves, planes, pixel_weight
 
 
-def image(leaves, planes, **options):
+def image(leaves: list[Tensor], planes: Planes, **options: Any) -> Tensor:
     cloud = GaussianCloud.of(leaves[:4], np.full(3, 50.0))
     return render(cloud, planes, twist=leaves[4], log_gain=leaves[5], **options)
 
 
-def gradients(leaves, planes, pixel_weight, dtype, **options):
+def gradients(
+    leaves: list[Tensor], planes: Planes, pixel_weight: Tensor, dtype: torch.dtype, **options: Any
+) -> tuple[Tensor, list[Tensor | None]]:
     leaves = [leaf.detach().to(dtype).clone().requires_grad_() for leaf in leaves]
     pixels = image(leaves, planes, **options)
     (pixels * pixel_weight.to(pixels.dtype)).sum().backward()

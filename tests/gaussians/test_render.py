@@ -1,5 +1,7 @@
 """Small, empty and extreme scenes; cut-off, overlap lists, threads, options."""
 
+from typing import Any
+
 import numba
 import numpy as np
 import pytest
@@ -123,6 +125,6 @@ def test_two_thread_counts_agree() -> None:
         {"cutoff_sigma": float("nan")},
     ],
 )
-def test_unknown_options_are_refused(options) -> None:
+def test_unknown_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
         render(single(make_cloud(20, 2)), make_planes(20), **options)

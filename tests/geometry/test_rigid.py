@@ -78,7 +78,7 @@ def test_rotation_matrix_keeps_leading_axes() -> None:
         (np.eye(3)[None], np.zeros((2, 3)), "translation_mm"),
     ],
 )
-def test_what_is_no_motion_is_refused(rotation, translation: np.ndarray, message: str) -> None:
+def test_what_is_no_motion_is_refused(rotation: np.ndarray, translation: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RigidPose(rotation, translation)
 

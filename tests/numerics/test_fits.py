@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from tests.numerics.scenes import head_scene, single
 from tests.tally import Tally
 
 
-def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options) -> SliceFit:
+def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options: Any) -> SliceFit:
     ones = np.ones(len(slices))
     settings = SliceStageSettings(**({"n_steps": 25, "reweight_every": 10} | options))
     return fit_slices(

@@ -54,7 +54,9 @@ def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
 
 @given(scenes(), st.sampled_from(["numba", "objective", "amplitudes", "reference32"]))
 @QUICK
-def test_random_scenes_agree_with_the_reference(tally: Tally, scene_and_ratio, backend: str) -> None:
+def test_random_scenes_agree_with_the_reference(
+    tally: Tally, scene_and_ratio: tuple[Scene, float], backend: str
+) -> None:
     scene, ratio = scene_and_ratio
     weight = torch.tensor(np.random.default_rng(0).normal(size=scene.planes.n_pixels))
     expected, exact_gradient = BACKENDS["reference64"](scene.cloud, scene.planes, weight)
@@ -73,7 +75,9 @@ def test_random_scenes_agree_with_the_reference(tally: Tally, scene_and_ratio, b
 
 @given(scenes(), st.floats(-3, 3), st.integers(0, 2**32 - 1))
 @QUICK
-def test_images_are_linear_in_the_peaks(tally: Tally, scene_and_ratio, factor: float, seed: int) -> None:
+def test_images_are_linear_in_the_peaks(
+    tally: Tally, scene_and_ratio: tuple[Scene, float], factor: float, seed: int
+) -> None:
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     other = cloud.with_amplitude(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
@@ -89,7 +93,9 @@ def test_images_are_linear_in_the_peaks(tally: Tally, scene_and_ratio, factor: f
 
 @given(scenes())
 @QUICK
-def test_least_squares_never_leaves_the_numbers_nor_fits_worse(tally: Tally, scene_and_ratio) -> None:
+def test_least_squares_never_leaves_the_numbers_nor_fits_worse(
+    tally: Tally, scene_and_ratio: tuple[Scene, float]
+) -> None:
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     target = np.random.default_rng(1).normal(size=scene.planes.n_pixels).astype(np.float32)
@@ -137,7 +143,9 @@ def test_a_pose_and_its_inverse_are_nothing(tally: Tally, pose: RigidPose) -> No
 
 @given(poses(), poses(), poses(), st.integers(0, 2**32 - 1))
 @QUICK
-def test_composition_is_associative_and_is_applying_one_after_the_other(tally: Tally, a, b, c, seed: int) -> None:
+def test_composition_is_associative_and_is_applying_one_after_the_other(
+    tally: Tally, a: RigidPose, b: RigidPose, c: RigidPose, seed: int
+) -> None:
     a, b, c = (pose.take([0]) for pose in (a, b, c))
     points = np.random.default_rng(seed).normal(0, 100, (1, 7, 3))
     with tally.case():

@@ -7,7 +7,7 @@ import numpy as np
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose
 from g3r.output.record import inactive_terms
-from g3r.planning.presets import PRESETS
+from g3r.planning.presets import PRESETS, ReconstructionSettings
 
 
 def slices_of(stacks: list[int]) -> Slices:
@@ -32,7 +32,9 @@ def slices_of(stacks: list[int]) -> Slices:
     )
 
 
-def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:
+def terms(
+    slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"], counts: dict[str, int] | None = None
+) -> dict[str, str]:
     return {one.term: one.reason for one in inactive_terms(slices, settings, counts or {})}
 
 

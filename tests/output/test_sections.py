@@ -16,23 +16,23 @@ SHAPE = (40, 50, 30)
 AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
 
 
-def ball(at: tuple[int, int, int] = (20, 25, 15), radius: int = 4):
+def ball(at: tuple[int, int, int] = (20, 25, 15), radius: int = 4) -> np.ndarray:
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), -1)
     return (((index - np.array(at)) ** 2).sum(-1) < radius**2).astype(np.float32)
 
 
-def pixels(path):
+def pixels(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("L")).astype(float)
 
 
-def columns(image):
+def columns(image: np.ndarray) -> list[np.ndarray]:
     """The three panels of a one-row picture, found by thirds of equal mm scale (widths 80, 80, 100 mm)."""
     left, right = 0.06 * image.shape[1], 0.92 * image.shape[1]
     edges = left + (right - left) * np.cumsum([0, 80, 80, 100]) / 260
     return [image[int(0.15 * len(image)) : int(0.85 * len(image)), int(a) : int(b)] for a, b in pairwise(edges)]
 
 
-def side(panel):
+def side(panel: np.ndarray) -> tuple[bool, bool]:
     """Where the bright spot lies: (left of the middle, above the middle)."""
     rows, cols = np.nonzero(panel > 200)
     return cols.mean() < panel.shape[1] / 2, rows.mean() < panel.shape[0] / 2

@@ -24,7 +24,7 @@ SHAPE = (2, 9, 9, 9)
 
 
 @pytest.fixture(scope="module")
-def network():
+def network() -> PoseNetwork:
     torch.manual_seed(3)
     network = PoseNetwork(PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)).eval()
     for part in (network.transformer, network.refining_transformer):
@@ -34,11 +34,11 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def model(network):
+def model(network: PoseNetwork) -> PoseModel:
     return PoseModel(network=network, weeks=(25.0, 31.0), training_data="nothing")
 
 
-def blob_stack(rotation, seed, shape: tuple[int, int, int] = (50, 46, 12)):
+def blob_stack(rotation: np.ndarray, seed: int, shape: tuple[int, int, int] = (50, 46, 12)) -> Stack:
     """A stack of an egg with a bright spot, turned in the scanner."""
     rng = np.random.default_rng(seed)
     affine = np.eye(4)
@@ -77,25 +77,25 @@ def assert_same(one: RigidPose, other: RigidPose, tolerance_mm: float) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [(0, 0, 90), (180, 0, 0), (20, -50, 130)])
-def test_moving_all_headers_changes_nothing(model, slices: Slices, angle_deg: tuple[int, int, int]) -> None:
+def test_moving_all_headers_changes_nothing(model: PoseModel, slices: Slices, angle_deg: tuple[int, int, int]) -> None:
     motion = RigidPose.from_rotvec(np.deg2rad([angle_deg]), np.array([[30.0, -200.0, 7.0]]))
     before = model.predict(slices)
     assert len(before) == len(slices)
     assert_same(before, model.predict(moved_headers(slices, motion)), 1e-3)
 
 
-def test_present_poses_do_not_matter(model, slices: Slices) -> None:
+def test_present_poses_do_not_matter(model: PoseModel, slices: Slices) -> None:
     other = slices.with_pose(RigidPose.identity(len(slices)))
     assert_same(model.predict(slices), model.predict(other), 1e-6)
 
 
-def test_the_order_does_not_matter(model, slices: Slices) -> None:
+def test_the_order_does_not_matter(model: PoseModel, slices: Slices) -> None:
     order = np.random.default_rng(0).permutation(len(slices))
     before = model.predict(slices).take(order)
     assert_same(before, model.predict(slices.take(order)), 1e-2)  # sums in another order
 
 
-def test_numbers_of_stacks_do_not_matter(model, slices: Slices) -> None:
+def test_numbers_of_stacks_do_not_matter(model: PoseModel, slices: Slices) -> None:
     renamed = Slices(
         planes=slices.planes,
         value=slices.value,
@@ -108,13 +108,13 @@ def test_numbers_of_stacks_do_not_matter(model, slices: Slices) -> None:
     assert_same(model.predict(slices), model.predict(renamed), 1e-3)
 
 
-def test_cropping_does_not_matter(model, slices: Slices) -> None:
+def test_cropping_does_not_matter(model: PoseModel, slices: Slices) -> None:
     """The pose is that of the slice's own frame, wherever the cropping put its centre."""
     planes = slices.planes
     parts = [slice(*planes.offset[k : k + 2]) for k in range(len(slices))]
     width = planes.shape[:, 1]
 
-    def padded(values):
+    def padded(values: np.ndarray) -> np.ndarray:
         blank = [np.zeros(2 * n, values.dtype) for n in width]  # two rows more on one side, not in the mask
         return np.concatenate([np.concatenate([values[at], b]) for at, b in zip(parts, blank, strict=True)])
 
@@ -129,7 +129,9 @@ def test_cropping_does_not_matter(model, slices: Slices) -> None:
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_a_slice_turned_over_is_the_same_slice(network, slices: Slices, view) -> None:
+def test_a_slice_turned_over_is_the_same_slice(
+    network: PoseNetwork, slices: Slices, view: tuple[int, int, int]
+) -> None:
     """Other signs of a slice's own axes: the same pixels, so the same place."""
     images = slice_images(slices, 3.0, 40)
     flips = tuple(slice(None, None, sign) for sign in view[:2])
@@ -155,15 +157,15 @@ def test_mean_pose_leaves_one_wrong_view_aside(rng: np.random.Generator) -> None
     assert angle_deg.max() < 8
 
 
-def test_scale_of_intensities_does_not_matter(model, slices: Slices) -> None:
+def test_scale_of_intensities_does_not_matter(model: PoseModel, slices: Slices) -> None:
     assert_same(model.predict(slices), model.predict(slices.scaled(1000.0)), 0.01)
 
 
-def test_a_single_slice(model, slices: Slices) -> None:
+def test_a_single_slice(model: PoseModel, slices: Slices) -> None:
     assert len(model.predict(slices.take([4]))) == 1
 
 
-def test_time_is_used_if_known(network, slices: Slices) -> None:
+def test_time_is_used_if_known(network: PoseNetwork, slices: Slices) -> None:
     """Trainings know the order of acquisition of some stacks."""
     images = slice_images(slices, 3.0, 40)
     known = dataclasses.replace(images, time_rank=np.linspace(0, 1, len(slices)))

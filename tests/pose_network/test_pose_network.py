@@ -1,6 +1,7 @@
 """The pose network's pieces against plain references, its symmetries, and that it can learn at all."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,11 +24,13 @@ from g3r.pose_network.network import PoseNetwork
 SMALL = PoseNetworkConfig(template_shape=(2, 9, 9, 9), channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
 
 
-def rotations(n, seed: int = 0):
+def rotations(n: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(Rotation.random(n, random_state=seed).as_matrix())
 
 
-def random_batch(seed: int = 0, n_slices: int = 6, sets: tuple[int, int] = (2, 1), size: int = 40):
+def random_batch(
+    seed: int = 0, n_slices: int = 6, sets: tuple[int, int] = (2, 1), size: int = 40
+) -> dict[str, torch.Tensor]:
     """Noise images of a few stacks of a few heads."""
     generator = torch.Generator().manual_seed(seed)
     n_stacks = sum(sets)
@@ -47,7 +50,7 @@ def random_batch(seed: int = 0, n_slices: int = 6, sets: tuple[int, int] = (2, 1
     }
 
 
-def lively_network(**changes):
+def lively_network(**changes: Any) -> PoseNetwork:
     """A network with random weights large enough to matter."""
     torch.manual_seed(3)
     network = PoseNetwork(replace(SMALL, **changes)).eval()
@@ -213,7 +216,7 @@ def test_a_tiny_set_can_be_learnt() -> None:
         {"n_refinements": 0},
     ],
 )
-def test_wrong_arguments(changes) -> None:
+def test_wrong_arguments(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="no pose network has these arguments"):
         replace(SMALL, **changes)
 

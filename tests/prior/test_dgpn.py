@@ -1,6 +1,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -15,13 +16,13 @@ SMALL = PriorNetworkConfig(channels=(8, 8, 8), units=(1, 1, 1), tail_channels=4,
 
 
 @pytest.fixture
-def volumes():
+def volumes() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     v_coarse = torch.rand(2, 1, 16, 16, 16, generator=generator)
     return v_coarse, 3 * torch.rand(v_coarse.shape, generator=generator)
 
 
-def awaken(network):
+def awaken(network: DensityGatedPriorNetwork) -> DensityGatedPriorNetwork:
     """Give the zero-initialised last convolution weights, so that F does something."""
     torch.manual_seed(1)
     nn.init.normal_(network.refiner.head.weight, std=0.02)
@@ -31,12 +32,14 @@ def awaken(network):
 class Stub(nn.Module):
     """An F with known values: V + 10 M."""
 
-    def forward(self, v_coarse, m_rho, v_sharp=None):
+    def forward(self, v_coarse: torch.Tensor, m_rho: torch.Tensor, v_sharp: torch.Tensor | None = None) -> torch.Tensor:
         return v_coarse + 10 * m_rho
 
 
 @pytest.mark.parametrize(("alpha", "beta"), [(0.05, 1.0), (0.0, 0.5), (1.0, 1.0)])
-def test_equation_7_with_a_known_residual(volumes, alpha: float, beta: float) -> None:
+def test_equation_7_with_a_known_residual(
+    volumes: tuple[torch.Tensor, torch.Tensor], alpha: float, beta: float
+) -> None:
     v_coarse, m_rho = (volume.double() for volume in volumes)
     network = DensityGatedPriorNetwork(replace(SMALL, alpha=alpha, beta=beta))
     network.refiner = Stub()
@@ -45,19 +48,21 @@ def test_equation_7_with_a_known_residual(volumes, alpha: float, beta: float) ->
     torch.testing.assert_close(network(v_coarse, m_rho), expected, rtol=1e-14, atol=1e-14)
 
 
-def test_gate_can_be_left_out(volumes) -> None:
+def test_gate_can_be_left_out(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse, m_rho = volumes
     network = DensityGatedPriorNetwork(replace(SMALL, use_gate=False))
     network.refiner = Stub()
     torch.testing.assert_close(network(v_coarse, m_rho), 2 * v_coarse + 10 * m_rho)
 
 
-def test_training_starts_from_the_coarse_volume(volumes) -> None:
+def test_training_starts_from_the_coarse_volume(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     assert torch.equal(DensityGatedPriorNetwork(SMALL)(*volumes), volumes[0])
 
 
 @pytest.mark.parametrize("use_density", [True, False])
-def test_residual_depends_on_density_only_if_it_may(volumes, use_density: bool) -> None:
+def test_residual_depends_on_density_only_if_it_may(
+    volumes: tuple[torch.Tensor, torch.Tensor], use_density: bool
+) -> None:
     v_coarse, m_rho = volumes
     refiner = awaken(DensityGatedPriorNetwork(replace(SMALL, use_density=use_density))).refiner
     same = torch.equal(refiner(v_coarse, m_rho), refiner(v_coarse, 0 * m_rho))
@@ -73,12 +78,12 @@ def test_any_shape_works(shape: tuple[int, int, int]) -> None:
     assert bool(prior.isfinite().all())
 
 
-def test_one_level_works(volumes) -> None:
+def test_one_level_works(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     network = awaken(DensityGatedPriorNetwork(replace(SMALL, channels=(8,), units=(1,))))
     assert not torch.equal(network(*volumes), volumes[0])
 
 
-def test_samples_of_a_batch_do_not_see_each_other(volumes) -> None:
+def test_samples_of_a_batch_do_not_see_each_other(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse, m_rho = volumes
     network = awaken(DensityGatedPriorNetwork(SMALL))
     alone, together = network(v_coarse[:1], m_rho[:1]), network(v_coarse, m_rho)[:1]
@@ -86,7 +91,7 @@ def test_samples_of_a_batch_do_not_see_each_other(volumes) -> None:
     torch.testing.assert_close(alone, together, rtol=0, atol=2e-5)
 
 
-def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes) -> None:
+def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse = volumes[0].clone().requires_grad_()
     m_rho = torch.zeros_like(v_coarse)
     m_rho[:, :, :8] = 1e6
@@ -133,7 +138,7 @@ def test_receptive_radius_is_an_upper_bound() -> None:
         {"tail_channels": 0},
     ],
 )
-def test_networks_without_meaning_are_refused(wrong) -> None:
+def test_networks_without_meaning_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="one positive entry per level"):
         replace(SMALL, **wrong)
 

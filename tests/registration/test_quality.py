@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -
     assert registration_summary(found).startswith("0 of 3")
 
 
-def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[float], ids: list[int]):
+def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[float], ids: list[int]) -> Any:
     return SimpleNamespace(
         slices=SimpleNamespace(stack_id=np.array(ids)), held_out=held_out, ncc=np.array(ncc), weight=np.array(weight)
     )

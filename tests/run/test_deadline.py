@@ -1,5 +1,8 @@
 """Loops that end by number or by the clock."""
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from g3r.run.deadline import Deadline, timed_steps
@@ -9,11 +12,13 @@ class Clock:
     def __init__(self) -> None:
         self.now = 100.0
 
-    def __call__(self):
+    def __call__(self) -> float:
         return self.now
 
 
-def run(n_steps, seconds, per_step, **options):
+def run(
+    n_steps: int, seconds: float | None, per_step: float | Callable[[int], float], **options: Any
+) -> tuple[list[tuple[int, float]], float]:
     clock, done = Clock(), []
     deadline = Deadline.after(seconds, clock)
     for step, fraction in timed_steps(n_steps, deadline, **options):

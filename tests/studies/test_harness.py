@@ -108,7 +108,7 @@ def test_cells_of_tables() -> None:
 
 
 @pytest.mark.parametrize("module", STUDIES)
-def test_every_study_starts(module, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_study_starts(module: str, capsys: pytest.CaptureFixture[str]) -> None:
     found = import_module(module)
     with pytest.raises(SystemExit, match="0"):
         (found.STUDY if hasattr(found, "STUDY") else found).main(["--help"])

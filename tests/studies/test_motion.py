@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ def test_every_subject_has_a_seed_of_its_own() -> None:
     assert sweep.specs(["severe"], 2)[1] == sweep.specs(sweep.LEVELS, 10)[21]
 
 
-def subject(level, median, p90, *, warned, psnr=None, turned: bool = False):
+def subject(
+    level: str, median: float, p90: float, *, warned: bool, psnr: float | None = None, turned: bool = False
+) -> dict[str, Any]:
     row = {"level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90}
     row |= {"bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0, "turned": turned}
     row["orientation_deg"] = 2.0 if median < 1 else None if level == "mild" else 90.0
@@ -80,7 +83,7 @@ def test_bias_table() -> None:
 
 
 @pytest.mark.parametrize("variants", [layers.WITHOUT, bias.VARIANTS, {x.name: x.options for x in layers.LAYERS}])
-def test_variants_are_settings_that_exist(variants) -> None:
+def test_variants_are_settings_that_exist(variants: dict[str, dict[str, Any]]) -> None:
     for options in variants.values():
         changed(PRESETS["balanced"], options)
 

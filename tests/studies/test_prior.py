@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from studies.subjects import read_case
 SETTINGS = {"preset": "balanced", "weights": "abc", "threads": 2, "n_views": 4}
 
 
-def ablation_rows(gain: tuple[float, float, float] = (2.0, 1.0, 0.5)):
+def ablation_rows(gain: tuple[float, float, float] = (2.0, 1.0, 0.5)) -> dict[str, dict[str, Any]]:
     """Two subjects, from 1 and 3 stacks."""
     rows = {}
     for number, (name, volume) in enumerate({"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()):
@@ -59,7 +60,7 @@ def test_ablation_subjects_are_many_fresh_and_of_their_own() -> None:
 
 
 def test_alone_table_marks_what_falls_short() -> None:
-    def row(n_stacks, gain, ssim):
+    def row(n_stacks: int, gain: float, ssim: float) -> dict[str, Any]:
         psnr = {"V_coarse": 20.0, "V_sharp": 21.0, "V_prior": 20.0 + gain}
         scores = {name: {"psnr_db": db, "ssim": ssim} for name, db in psnr.items()}
         return {"case": "c", "n_stacks": n_stacks, "scores": scores, "seconds": 2.5}
@@ -76,7 +77,7 @@ def test_alone_table_marks_what_falls_short() -> None:
 
 
 def test_cases_table_marks_a_prior_that_costs() -> None:
-    def row(gain):
+    def row(gain: float) -> dict[str, Any]:
         scores = {v: {"psnr_db": 25.0, "ssim": 0.9} for v in ablation.VARIANTS}
         scores[cases.PRODUCT] = {"psnr_db": 25.0 + gain, "ssim": 0.9}
         return {"n_stacks": 3, "scores": scores, "median_mm": {cases.PRODUCT: 0.07}}
@@ -86,7 +87,7 @@ def test_cases_table_marks_a_prior_that_costs() -> None:
     assert "| 24.70 | -0.30 (!) | 0.900 | 0.07 |" in text
 
 
-def network_record():
+def network_record() -> dict[str, Any]:
     scores = {n: {"l1": 0.05, "psnr_db": 25.0 + k, "ssim": 0.9} for k, n in enumerate(("1", "2", "all"))}
     one = {"scores": scores, "parameters": 1_500_000, "seconds": 2.5, "steps": 288, "train_seconds": 600}
     rows = {"size-16-32-64": {**one, "what": "small", "is_size": True}, "full": {**one, "what": "all", "is_size": True}}

@@ -22,7 +22,7 @@ SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
 
 
 @pytest.fixture
-def atlas(tmp_path: Path, rng: np.random.Generator):
+def atlas(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A tree with one small head."""
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
     mask = np.linalg.norm(index / [10, 11, 9], axis=-1) < 1
@@ -34,7 +34,7 @@ def atlas(tmp_path: Path, rng: np.random.Generator):
     return tmp_path / "atlas"
 
 
-def test_subject_is_simulated_once_and_read_back(atlas, tmp_path: Path) -> None:
+def test_subject_is_simulated_once_and_read_back(atlas: Path, tmp_path: Path) -> None:
     folder = simulated_subject(SPEC, atlas, tmp_path / "cache")
     written = (folder / "poses.tsv").stat().st_mtime_ns
     assert simulated_subject(SPEC, atlas, tmp_path / "cache") == folder
@@ -57,7 +57,7 @@ def test_subject_is_simulated_once_and_read_back(atlas, tmp_path: Path) -> None:
     np.testing.assert_allclose(other.pose.translation_mm, table.pose.translation_mm, atol=1e-5)
 
 
-def test_turned_subject_keeps_its_size(atlas, tmp_path: Path) -> None:
+def test_turned_subject_keeps_its_size(atlas: Path, tmp_path: Path) -> None:
     case = load_case(simulated_subject(replace(SPEC, turned=True), atlas, tmp_path / "cache"))
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +14,19 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from g3r.acquisition.images import save_volume  # noqa: E402
-from g3r.cli import export  # noqa: E402
-from g3r.errors import InputError  # noqa: E402
-from g3r.prior.config import PriorNetworkConfig  # noqa: E402
-from g3r.prior.model import Prior  # noqa: E402
-from g3r.reconstruct import GaussianReconstructor  # noqa: E402
-from g3r.training import prior_module as training  # noqa: E402
-from g3r.training import prior_validation as validation  # noqa: E402
-from tests.training.small_runs import logged, trainer  # noqa: E402
+import lightning.pytorch as lightning
+
+from g3r.acquisition.images import save_volume
+from g3r.cli import export
+from g3r.errors import InputError
+from g3r.prior.config import PriorNetworkConfig
+from g3r.prior.model import Prior
+from g3r.reconstruct import GaussianReconstructor
+from g3r.training import prior_module as training
+from g3r.training import prior_validation as validation
+from tests.training.small_runs import logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 TINY_TRAINING = [
@@ -46,7 +49,7 @@ TINY_TRAINING = [
 ]
 
 
-def volumes(n, seed: int = 0, size: int = 12):
+def volumes(n: int, seed: int = 0, size: int = 12) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     names = ("coarse", "density", "sharp", "truth")
     batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
@@ -58,10 +61,10 @@ class ValidatedByStacks(lightning.LightningDataModule):
 
     spacing_mm = 0.8
 
-    def train_dataloader(self):
+    def train_dataloader(self) -> DataLoader:
         return DataLoader([volumes(2)], batch_size=None)
 
-    def val_dataloader(self):
+    def val_dataloader(self) -> DataLoader:
         batches = [
             {**volumes(1, 1), "n_stacks": torch.tensor([1])},
             {**volumes(2, 2), "n_stacks": torch.tensor([3, 3])},
@@ -70,7 +73,7 @@ class ValidatedByStacks(lightning.LightningDataModule):
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory):
+def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What TensorBoard has of two epochs."""
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
@@ -79,7 +82,7 @@ def log(tmp_path_factory: pytest.TempPathFactory):
     return logged(folder / "run" / "version_0")
 
 
-def test_scores_by_number_of_stacks_are_logged(log) -> None:
+def test_scores_by_number_of_stacks_are_logged(log: Any) -> None:
     tags = set(log.Tags()["scalars"])
     for stacks in ("", "_1stack", "_3stacks"):
         expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in validation.VALIDATED}
@@ -88,8 +91,8 @@ def test_scores_by_number_of_stacks_are_logged(log) -> None:
     assert {"train/samples_per_second", "train/waiting_for_data", "train/l1_prior"} <= tags
 
 
-def test_scores_are_means_over_volumes(log) -> None:
-    def last(tag):
+def test_scores_are_means_over_volumes(log: Any) -> None:
+    def last(tag: str) -> float:
         return log.Scalars(tag)[-1].value
 
     expected = (last("val/psnr_coarse_1stack") + 2 * last("val/psnr_coarse_3stacks")) / 3
@@ -100,7 +103,7 @@ def test_scores_are_means_over_volumes(log) -> None:
     assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
 
 
-def test_images_show_gate_and_confidence_for_each_number_of_stacks(log) -> None:
+def test_images_show_gate_and_confidence_for_each_number_of_stacks(log: Any) -> None:
     tags = log.Tags()["images"]
     assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
     assert "confidence, gate" in validation.PANEL_TAG
@@ -136,13 +139,13 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
         run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
 
 
-def run_training(folder, *arguments):
+def run_training(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "g3r.cli.pretrain", "fit", *TINY_TRAINING]
     command += [f"--trainer.logger.init_args.save_dir={folder}", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def steps_of(checkpoint):
+def steps_of(checkpoint: Path) -> int:
     return torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"]
 
 

@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,27 +21,28 @@ from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from torch.utils.data import DataLoader  # noqa: E402
+import lightning.pytorch as lightning
+from torch.utils.data import DataLoader
 
-from g3r.training import prior_batches as batches  # noqa: E402
-from g3r.training import prior_module as training  # noqa: E402
-from g3r.training.annealed_module import cosine_factor  # noqa: E402
-from g3r.training.prior_validation import sample_scores  # noqa: E402
-from tests.training.small_runs import assert_export_refuses, logged, trainer  # noqa: E402
+from g3r.training import prior_batches as batches
+from g3r.training import prior_module as training
+from g3r.training.annealed_module import cosine_factor
+from g3r.training.prior_validation import sample_scores
+from tests.training.small_runs import assert_export_refuses, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 SMALL = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 
 
-def smooth_noise(generator, size):
+def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
     coarse_noise = torch.rand(1, 1, size // 4, size // 4, size // 4, generator=generator)
     return torch.nn.functional.interpolate(coarse_noise, scale_factor=4, mode="trilinear")[0]
 
 
-def sample(seed, size: int = 16):
+def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
     """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
     generator = torch.Generator().manual_seed(seed)
     truth = smooth_noise(generator, size)
@@ -58,15 +61,15 @@ class TinyData(lightning.LightningDataModule):
         super().__init__()
         self.save_hyperparameters()
 
-    def train_dataloader(self):
+    def train_dataloader(self) -> DataLoader:
         return DataLoader([sample(seed) for seed in range(4)], batch_size=2)
 
-    def val_dataloader(self):
+    def val_dataloader(self) -> DataLoader:
         return DataLoader([sample(seed) for seed in (8, 9)], batch_size=2)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory):
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, training.PriorModule]:
     """A run of two steps: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
@@ -77,7 +80,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
     return folder, folder / "last.ckpt", module
 
 
-def test_tensorboard_has_scalars_and_the_panel(trained) -> None:
+def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, training.PriorModule]) -> None:
     log = logged(trained[0] / "run" / "version_0")
     scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
@@ -87,18 +90,20 @@ def test_tensorboard_has_scalars_and_the_panel(trained) -> None:
     assert (image.height, image.width) == (16, 7 * 16)
 
 
-def test_training_moves_the_weights(trained) -> None:
+def test_training_moves_the_weights(trained: tuple[Path, Path, training.PriorModule]) -> None:
     assert float(trained[2].network.refiner.head.weight.detach().abs().max()) > 0
 
 
-def test_resuming_goes_on(trained, tmp_path: Path) -> None:
+def test_resuming_goes_on(trained: tuple[Path, Path, training.PriorModule], tmp_path: Path) -> None:
     module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
     run = trainer(tmp_path, max_steps=3)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 3
 
 
-def test_export_gives_the_same_network(trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_gives_the_same_network(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, checkpoint, module = trained
     path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
@@ -113,7 +118,9 @@ def test_export_gives_the_same_network(trained, tmp_path: Path, capsys: pytest.C
     assert "val/psnr_prior" in capsys.readouterr().out
 
 
-def test_export_does_not_overwrite_unless_told(trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_does_not_overwrite_unless_told(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "prior.safetensors"
     path.write_text("precious")
     assert export.main([str(trained[1]), str(path)]) == 3
@@ -123,11 +130,11 @@ def test_export_does_not_overwrite_unless_told(trained, tmp_path: Path, capsys: 
     assert Prior.load(path).training_data == "three heads"
 
 
-def without(*keys):
+def without(*keys: str) -> Callable[[dict[str, Any]], object]:
     return lambda content: [content.pop(key) for key in keys]
 
 
-def spoil(content) -> None:
+def spoil(content: dict[str, Any]) -> None:
     content["state_dict"]["network.refiner.head.weight"][0, 0, 0, 0, 0] = np.inf
 
 
@@ -142,11 +149,19 @@ def spoil(content) -> None:
         (spoil, "NaN or infinity"),
     ],
 )
-def test_export_refuses(trained, tmp_path: Path, capsys: pytest.CaptureFixture[str], alter, expected: str) -> None:
+def test_export_refuses(
+    trained: tuple[Path, Path, training.PriorModule],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    alter: Callable[[dict[str, Any]], object],
+    expected: str,
+) -> None:
     assert_export_refuses(trained[1], alter, expected, tmp_path, capsys)
 
 
-def test_export_wants_the_ending_of_its_format(trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_wants_the_ending_of_its_format(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert export.main([str(trained[1]), str(tmp_path / "prior.pt")]) == 3
     assert "expected a name that ends in .safetensors" in capsys.readouterr().err
     assert not (tmp_path / "prior.pt").exists()
