@@ -4,6 +4,7 @@ from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.stacks import Stack
@@ -20,9 +21,7 @@ AXES = {
 
 
 def affine_of(
-    axes: np.ndarray,
-    spacing: tuple[float, float, float] = (0.8, 0.9, 3.0),
-    origin: tuple[float, float, float] = (-20.0, 31.0, 7.5),
+    axes: np.ndarray, spacing: ArrayLike = (0.8, 0.9, 3.0), origin: ArrayLike = (-20.0, 31.0, 7.5)
 ) -> np.ndarray:
     affine = np.eye(4)
     affine[:3, :3] = axes * np.array(spacing)

@@ -5,6 +5,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from nibabel.arrayproxy import ArrayProxy
 
 from g3r.acquisition.images import Volume, load_mask, load_volume, save_volume
 from g3r.acquisition.nifti import MAX_VOXEL_COUNT
@@ -18,8 +19,9 @@ def test_int16_with_slope_and_intercept(tmp_path: Path) -> None:
     image.header.set_slope_inter(0.25, -3.0)
     nib.save(image, tmp_path / "a.nii.gz")
     # nibabel stores what was given after scaling; read the raw numbers to know what the file says
-    stored = nib.load(tmp_path / "a.nii.gz")
+    stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz")
     assert stored.get_data_dtype() == np.int16
+    assert isinstance(stored.dataobj, ArrayProxy)
     expected = np.asarray(stored.dataobj.get_unscaled()) * stored.dataobj.slope + stored.dataobj.inter
     loaded = load_volume(tmp_path / "a.nii.gz")
     assert loaded.data.dtype == np.float32
@@ -63,7 +65,7 @@ def test_save_and_load_volume(tmp_path: Path) -> None:
         (rng.integers(-5, 5, (4, 5, 6)).astype(np.int16), np.int16),
     ):
         save_volume(tmp_path / "v.nii.gz", data, affine)
-        assert nib.load(tmp_path / "v.nii.gz").get_data_dtype() == kind
+        assert nib.Nifti1Image.from_filename(tmp_path / "v.nii.gz").get_data_dtype() == kind
         back = load_volume(tmp_path / "v.nii.gz")
         np.testing.assert_allclose(back.data, data.astype(np.float32), rtol=1e-7)
         np.testing.assert_allclose(back.affine, affine, atol=1e-5)

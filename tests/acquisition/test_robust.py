@@ -20,6 +20,7 @@ def test_slice_weights_are_smooth_and_never_zero() -> None:
             assert weight[-1] <= previous + 1e-12
             assert previous - weight[-1] < 0.02
         previous = weight[-1]
+    assert previous is not None
     assert previous <= 2e-3
     assert np.median(slice_weights(usual)) == 1.0
     assert (slice_weights(np.zeros(5)) == 1).all()

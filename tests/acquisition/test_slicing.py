@@ -56,7 +56,7 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str) -> None:
     )
     kept = mask.sum((0, 1)) >= 12
     slices = slices_from_stacks([stack])
-    stored = nib.load(tmp_path / "a.nii.gz").affine  # float32 in the file
+    stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz").affine  # float32 in the file
     assert_pixels_are_voxels(slices, image, stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
     np.testing.assert_allclose(np.linalg.det(slices.planes.rotation), 1, atol=1e-12)
@@ -78,7 +78,7 @@ def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through:
     np.testing.assert_allclose(stack.spacing_mm, [0.8, 0.9, 3.0], rtol=1e-6)
     slices = slices_from_stacks([stack])
     kept = mask.sum((0, 1)) >= 12
-    stored = nib.load(path).affine
+    stored = nib.Nifti1Image.from_filename(path).affine
     assert_pixels_are_voxels(slices, image.transpose(order), stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
 

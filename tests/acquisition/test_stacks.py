@@ -74,7 +74,13 @@ SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))
 )
 def test_unusable_stacks_are_refused(change: dict[str, Any], message: str) -> None:
     image, mask = arrays()
-    good = {"image": image, "mask": mask, "affine": affine_of(AXES["RAS"]), "thickness_mm": 3.0, "name": "a.nii"}
+    good: dict[str, Any] = {
+        "image": image,
+        "mask": mask,
+        "affine": affine_of(AXES["RAS"]),
+        "thickness_mm": 3.0,
+        "name": "a.nii",
+    }
     Stack(**good)
     with pytest.raises(InputError, match=message) as caught:
         Stack(**(good | change))

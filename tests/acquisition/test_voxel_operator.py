@@ -43,7 +43,7 @@ def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]) -> None:
 
 
 def test_the_adjoint_is_exact_with_several_buffers() -> None:
-    n_threads = numba.config.NUMBA_NUM_THREADS
+    n_threads = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     if n_threads < 2:
         pytest.skip("one thread only")
     rng = np.random.default_rng(3)

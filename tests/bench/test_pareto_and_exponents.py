@@ -49,7 +49,7 @@ def test_spread_covers_noise(rng: np.random.Generator) -> None:
     size = 2.0 ** np.arange(8)
     off = []
     for _ in range(200):
-        found = fitted_exponent(size, size * np.exp(0.1 * rng.standard_normal(8)))
+        found = fitted_exponent(size.tolist(), (size * np.exp(0.1 * rng.standard_normal(8))).tolist())
         off.append((found.value - 1) / found.spread)
     assert np.mean(np.abs(off) < 2) > 0.8
 

@@ -18,7 +18,7 @@ from g3r.cli.evaluate import main
 def files(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A noisy volume, its truth and mask."""
     axes = np.meshgrid(*(np.linspace(-1, 1, n) for n in (24, 28, 22)), indexing="ij")
-    mask = sum(a**2 for a in axes) < 0.7
+    mask = np.asarray(sum(a**2 for a in axes) < 0.7)
     truth = np.where(mask, 500 + 200 * np.sin(4 * axes[0] + 3 * axes[1] * axes[2]), 0)
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
     affine[:3, 3] = (-24, -28, -22)

@@ -68,7 +68,7 @@ def test_every_output_is_there_and_nothing_else(reconstructed: Path) -> None:
 
 
 def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path) -> None:
-    volume, mask = (nib.load(reconstructed / f"{name}.nii.gz") for name in ("volume", "mask"))
+    volume, mask = (nib.Nifti1Image.from_filename(reconstructed / f"{name}.nii.gz") for name in ("volume", "mask"))
     np.testing.assert_allclose(volume.header.get_zooms(), 1.5, rtol=1e-6)
     np.testing.assert_allclose(volume.affine, mask.affine)
     data, inside = np.asarray(volume.dataobj), np.asarray(mask.dataobj) > 0
@@ -97,7 +97,7 @@ def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, recon
         ["stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason"]
     )
     keys = [(int(row["stack"]), int(row["slice"])) for row in rows]
-    masks = [np.asarray(nib.load(path).dataobj) > 0 for path in files(subject, "mask")]
+    masks = [np.asarray(nib.Nifti1Image.from_filename(path).dataobj) > 0 for path in files(subject, "mask")]
     assert keys == [(s, k) for s, m in enumerate(masks) for k in np.flatnonzero(m.sum((0, 1)) >= 12)]
     for row in rows:
         assert 0 < float(row["weight"]) <= 1
@@ -210,8 +210,11 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
     relative = motion.take([0]).inverse() @ motion if standard else motion
     np.testing.assert_allclose(relative.translation_mm, 0, atol=1e-6)
     np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=1e-7)
+    assert result.record.registration is not None
     assert result.record.registration.space == ("standard" if standard else "scanner")
-    assert result.record.stacks[0].quality.held_out_correlation is None
+    quality = result.record.stacks[0].quality
+    assert quality is not None
+    assert quality.held_out_correlation is None
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].std() > 0
 
@@ -221,13 +224,17 @@ def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Pa
     few = np.zeros_like(stacks[0].mask)
     few[20:23, 20:23, 5] = True
     settings = quick_settings()
-    motion = replace(settings.registration, template=False, network=False, stacks=False, segments=False, n_rounds=1)
-    settings = replace(settings, resolution_mm=2.5, motion=motion)
+    registration = replace(
+        settings.registration, template=False, network=False, stacks=False, segments=False, n_rounds=1
+    )
+    settings = replace(settings, resolution_mm=2.5, registration=registration)
     result = GaussianReconstructor(settings=settings).reconstruct([replace(stacks[0], mask=few), stacks[1], stacks[2]])
     record = result.record
     assert [one.n_slices > 0 for one in record.stacks] == [False, True, True]
     assert record.stacks[0].interleave is None
-    assert record.stacks[0].quality.reliable is False
+    quality = record.stacks[0].quality
+    assert quality is not None
+    assert quality.reliable is False
     assert record.stacks[2].n_segments == 1
     assert any(stacks[0].name in line for line in record.warnings)
 
@@ -264,7 +271,7 @@ def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path) -> 
 def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], str]:
     """Arguments that must be refused, and the name that the message must hold."""
     stacks, masks = files(subject, "stack"), files(subject, "mask")
-    image = nib.load(stacks[0])
+    image = nib.Nifti1Image.from_filename(stacks[0])
     data, bad = np.asarray(image.dataobj), folder / "bad.nii.gz"
     options: list[object] = ["--no-prior", "--thickness", "4", "--output", folder / "out"]
     if kind == "missing file":
@@ -300,7 +307,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
 
 def _like(path: Path, image_path: Path) -> Path:
     """An empty mask on the grid of an image."""
-    image = nib.load(image_path)
+    image = nib.Nifti1Image.from_filename(image_path)
     nib.save(nib.Nifti1Image(np.zeros(image.shape, np.uint8), image.affine), path)
     return path
 

@@ -25,6 +25,7 @@ def test_batches(centred_head: TruthVolume) -> None:
     data = SliceSetDataModule(source="phantom", sets_per_epoch=3, batch_size=3, max_slices=12, val_sets=6)
     data.setup()
     for sets in (data.train_set, data.val_set):
+        assert sets is not None
         sets._volumes = dict.fromkeys(range(len(sets.subjects)), centred_head)
     batch = next(iter(data.train_dataloader()))
     n = len(batch["image"])

@@ -67,7 +67,7 @@ def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled: Hea
     motion = [stacks[s].true_pose.take([k]) for s, k in zip(slices.stack_id, slices.slice_index, strict=True)]
     moved = RigidPose(np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion]))
     pose = moved @ slices.header_pose @ images.frame_in_slice
-    fast, _ = sample_slices(sampled, np.linalg.inv(sampled.affine), pose, images.thickness_mm, 3.0, 40)
+    fast, _ = sample_slices(sampled, np.linalg.inv(sampled.affine).astype(float), pose, images.thickness_mm, 3.0, 40)
     for image, other in zip(images.image, fast, strict=True):
         if (other > 0).sum() > 60:
             assert np.corrcoef(image.ravel(), other.ravel())[0, 1] > 0.95

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from g3r.acquisition.images import Volume
@@ -16,6 +15,8 @@ from g3r.evaluation.compare import compare
 from g3r.geometry import RigidPose, VolumeGrid
 
 GRID = VolumeGrid.isotropic((-40, -48, -36), (40, 48, 36), 2.0)
+SHEAR = np.eye(4)
+SHEAR[0, 1] = 0.2
 
 
 def brain(points_mm: np.ndarray) -> np.ndarray:
@@ -35,7 +36,7 @@ def on_grid(grid: VolumeGrid, pose: RigidPose | None = None) -> tuple[Volume, np
     return Volume(data, grid.affine, "phantom"), data > 100
 
 
-def pose_deg(rotation: ArrayLike, translation_mm: ArrayLike) -> RigidPose:
+def pose_deg(rotation: Sequence[float], translation_mm: Sequence[float]) -> RigidPose:
     return RigidPose.from_rotvec(np.deg2rad([rotation]), [translation_mm])
 
 
@@ -94,9 +95,13 @@ def test_resampling_agrees_with_scipy_on_an_oblique_grid() -> None:
 def test_compare_with_and_without_alignment(rng: np.random.Generator) -> None:
     reference, mask = on_grid(GRID)
     moved, _ = on_grid(GRID, pose_deg((6, 3, -4), (3, 2, -3)))
-    noisy = Volume(moved.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved")
+    noisy = Volume(
+        moved.data / np.float32(50) + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved"
+    )
     headers, aligned = compare(noisy, reference, mask), compare(noisy, reference, mask, align=True)
-    still = Volume(reference.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still")
+    still = Volume(
+        reference.data / np.float32(50) + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still"
+    )
     assert headers.alignment is None
     assert headers.scores.psnr_db < 20
     # interpolation smooths the noise a little, so the moved volume may score better than the still one
@@ -120,7 +125,3 @@ def test_what_cannot_be_compared_is_refused(
     reference, mask = on_grid(GRID)
     with pytest.raises(InputError, match=message):
         compare(*spoil(reference, reference), mask)
-
-
-SHEAR = np.eye(4)
-SHEAR[0, 1] = 0.2

@@ -67,8 +67,8 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
                 assert names(small_disk) <= {"out.unfinished"}
                 assert not (small_disk / "out.unfinished" / "new").exists()
                 # somebody makes room
-                line = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
-                subprocess.run(line, check=True, capture_output=True)
+                remount = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
+                subprocess.run(remount, check=True, capture_output=True)
                 assert killed(case.arguments(out, "--resume"))["code"] == 0
                 assert names(small_disk) == {"out"}
                 one.refused()
@@ -222,7 +222,8 @@ def test_a_run_killed_while_files_move_onto_a_mount_point(
     out.mkdir()
     for name in (*result, "notes"):
         (out / name).write_text("old")
-    rename, done = os.rename, []
+    rename = os.rename
+    done: list[Path] = []
 
     def killed(source: Path, target: Path) -> None:
         if len(done) == moved:

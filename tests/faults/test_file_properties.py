@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from nibabel.arrayproxy import ArrayProxy
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import save_volume
@@ -89,7 +90,9 @@ def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack:
         written = nib.Nifti1Image(stack.image, stack.affine)
         written.set_data_dtype(np.dtype(dtype))
         nib.save(written, path)
-        slope = abs(float(nib.load(path).dataobj.slope))
+        stored = nib.Nifti1Image.from_filename(path).dataobj
+        assert isinstance(stored, ArrayProxy)
+        slope = abs(float(stored.slope))
         save_volume(path.with_name("mask.nii"), stack.mask, stack.affine)
         back = load_stack(path, path.with_name("mask.nii"), stack.thickness_mm)
         largest = float(np.abs(stack.image).max())

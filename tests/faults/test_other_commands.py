@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -78,8 +79,8 @@ def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tall
         case.refused()
 
 
-SAID = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
-RUNS = {
+SAID: dict[str, Any] = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
+RUNS: dict[str, Any] = {
     "missing": None,
     "empty": b"",
     "text": b"weights\n",

@@ -44,7 +44,7 @@ def test_options_then_config_then_config_of_that(
     case: SmallCase, tmp_path: Path, tally: Tally, threads: str, further: tuple[str, ...]
 ) -> None:
     """With all of registration, with and without the prior network, each in a process of its own."""
-    if int(threads) > int(numba.config.NUMBA_NUM_THREADS):
+    if int(threads) > int(numba.config.NUMBA_NUM_THREADS):  # type: ignore[attr-defined]
         pytest.skip("a machine of one core")
     files = ["--stacks", *case.files("stack"), "--masks", *case.files("mask"), "--quiet"]
     runs = {

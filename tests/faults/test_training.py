@@ -23,12 +23,13 @@ pytest.importorskip("torchio", reason="the training extra is not installed")
 import lightning.pytorch as lightning
 
 from data_synth.prior_data import StackSynthesisDataModule
+from g3r.prior.config import PriorNetworkConfig
 from g3r.training.annealed_module import WholeCheckpoints
 from g3r.training.prior_module import PriorModule
 
-NETWORK = {"channels": [4, 4], "units": [1, 1], "tail_channels": 2, "warmup_steps": 2}
+NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2)
 # ten patches an epoch in batches of three: one is left over each time
-DATA = {
+DATA: dict[str, Any] = {
     "spacing_mm": 2.0,
     "patch_size": 24,
     "patches_per_subject": 2,
@@ -49,7 +50,7 @@ class Losses(lightning.Callback):
         self.end_at = end_at
 
     def on_train_batch_end(
-        self, trainer: Any, module: Any, outputs: dict[str, torch.Tensor], batch: object, batch_idx: int
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: object, batch_idx: int
     ) -> None:
         self.found[trainer.global_step] = float(outputs["loss"])
         if trainer.global_step == self.end_at:
@@ -74,7 +75,7 @@ def trained(folder: Path, end_at: int | None = None, resume: Path | None = None)
         plugins=[WholeCheckpoints()],
     )
     try:
-        module, data = PriorModule(**NETWORK), StackSynthesisDataModule(**DATA)
+        module, data = PriorModule(NETWORK, warmup_steps=2), StackSynthesisDataModule(**DATA)
         trainer.fit(module, data, ckpt_path=resume, weights_only=True if resume else None)
     except ZeroDivisionError:
         assert end_at is not None
@@ -129,7 +130,7 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
 
 CONFIG = """
 seed_everything: 5
-model: {channels: [4, 4], units: [1, 1], tail_channels: 2, warmup_steps: 2}
+model: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
@@ -169,7 +170,7 @@ def losses(folder: Path) -> dict[int, float]:
 
 @pytest.mark.faults
 def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: Path, tally: Tally) -> None:
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     done = subprocess.run(command(tmp_path / "whole"), check=False, **quiet)
     assert done.returncode == 0, done.stderr
     folder, last = tmp_path / "killed", tmp_path / "killed" / "kept" / "last.ckpt"

@@ -236,7 +236,16 @@ def test_names_that_are_no_text_as_a_process(tmp_path: Path, tally: Tally) -> No
     """Bytes that are no UTF-8, in the stack's name and the output's, with an ASCII terminal."""
     name = os.fsencode(tmp_path) + b"/kopf-\xe4\xff.nii.gz"
     Path(os.fsdecode(name)).write_bytes(write(tmp_path / "a.nii.gz").read_bytes())
-    line = [sys.executable, "-m", "g3r.cli.infer", "--stacks", name, "--output", name + b".out", "--dry-run"]
+    line: list[str | bytes] = [
+        sys.executable,
+        "-m",
+        "g3r.cli.infer",
+        "--stacks",
+        name,
+        "--output",
+        name + b".out",
+        "--dry-run",
+    ]
     environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
     with tally.case():
         done = subprocess.run(line, capture_output=True, check=False, env=environment)

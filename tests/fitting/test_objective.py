@@ -21,6 +21,7 @@ from g3r.gaussians.overlap import OverlapFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
 from tests.fitting.scene import BALL, GRID, fit, make_slices, seeded, true_volume
 from tests.gaussians.scenes import cloud_of
+from tests.gradients import gradient_of
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, bias_field_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4
@@ -52,7 +53,7 @@ class Scene:
             "bias_field": (rng.normal(0, 0.2, (3, 5)), 8e-3),
         }
         self.parameters = FitParameters(cloud, LearningRates(), blocks)
-        self.prior = VolumeTarget.of(0.9 * volume, (BALL * 0.7).astype(np.float32), GRID)
+        self.prior = VolumeTarget.of(np.float32(0.9) * volume, (BALL * 0.7).astype(np.float32), GRID)
         self.chosen = np.array([1, 5, 9, 14])
         self.unknowns = SliceParameters(self.slices, np.ones(n), self.parameters)
         self.term = ImageTerm.of(
@@ -88,8 +89,8 @@ class Scene:
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
         """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
         leaves = {name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()}
-        cloud = GaussianCloud(
-            *[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
+        cloud = GaussianCloud.of(
+            [leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
         )
         log_gain = leaves["log_gain"] - leaves["log_gain"].mean()
         twist = torch.cat([leaves["rotation"], leaves["translation"]], 1)
@@ -110,7 +111,7 @@ class Scene:
         moved = leaves["translation"].square().sum(1) + (radius * leaves["rotation"]).square().sum(1)
         loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
         loss.backward()
-        return loss.item(), {name: leaf.grad.numpy() for name, leaf in leaves.items()}
+        return loss.item(), {name: gradient_of(leaf).numpy() for name, leaf in leaves.items()}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -189,7 +190,7 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray) -> None:
 
 
 def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray) -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
         pytest.skip("numba was started with one thread")
     before, found = numba.get_num_threads(), []
     try:
@@ -207,7 +208,7 @@ def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray) -> 
 
 
 def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: np.ndarray) -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
         pytest.skip("numba was started with one thread")
     slices = make_slices()
     prior = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)

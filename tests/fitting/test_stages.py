@@ -1,6 +1,7 @@
 """Both stages on a scene of a few dozen Gaussians, and the reconstructor's invariances."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,7 +116,7 @@ def test_a_single_slice_keeps_its_gain(volume: np.ndarray) -> None:
 def test_distillation_fades_and_holds_what_no_slice_sees(volume: np.ndarray) -> None:
     slices = make_slices().take(np.arange(3, 5))  # two slices through the middle of one stack
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
-    options = {"n_steps": 30, "optimise_poses": False}
+    options: dict[str, Any] = {"n_steps": 30, "optimise_poses": False}
     held = fit(volume, slices, target, distillation=AnnealedWeight(1.0, 0.2), **options)
     weights = [entry["distillation_weight"] for entry in held.history]
     assert weights[0] == 1.0

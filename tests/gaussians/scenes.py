@@ -26,7 +26,7 @@ def cloud_of(
     log_scale: ArrayLike,
     quaternion: ArrayLike,
     amplitude: ArrayLike,
-    origin: tuple[float, float, float] = (0.0, 0, 0),
+    origin: ArrayLike = (0.0, 0, 0),
     dtype: type[np.floating] = np.float32,
 ) -> GaussianCloud:
     """A cloud from arrays."""
@@ -39,7 +39,7 @@ def make_cloud(
     n: int,
     sigma: tuple[float, float] = (0.8, 2.0),
     spread_mm: float = 2.5,
-    origin: tuple[float, float, float] = (40.0, -30.0, 20.0),
+    origin: ArrayLike = (40.0, -30.0, 20.0),
 ) -> GaussianCloud:
     """Random Gaussians around an origin, float64."""
     rng = np.random.default_rng(seed)
@@ -54,11 +54,7 @@ def make_cloud(
 
 
 def make_planes(
-    seed: int,
-    n: int = 3,
-    shape: tuple[int, int] = (7, 6),
-    psf: float = 1.0,
-    origin: tuple[float, float, float] = (40.0, -30.0, 20.0),
+    seed: int, n: int = 3, shape: tuple[int, int] = (7, 6), psf: float = 1.0, origin: ArrayLike = (40.0, -30.0, 20.0)
 ) -> Planes:
     """Random planes near an origin; `psf` scales the variances."""
     rng = np.random.default_rng(seed)
@@ -72,7 +68,7 @@ def make_planes(
     )
 
 
-def stack_planes(n: int, spacing_mm: float, side: int, origin: tuple[float, float, float] = (0.0, 0, 0)) -> Planes:
+def stack_planes(n: int, spacing_mm: float, side: int, origin: ArrayLike = (0.0, 0, 0)) -> Planes:
     """Three orthogonal stacks of n gapless planes about an origin, pixels of 1 mm."""
     rotation = np.repeat(FRAMES, n, axis=0)
     offset = np.tile((np.arange(n) - (n - 1) / 2) * spacing_mm, 3)

@@ -104,12 +104,12 @@ def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolera
 
 
 def test_duplicates_become_one_and_opposites_stay() -> None:
-    duplicates = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
+    duplicates = gaussians([[0.0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
     merged = with_duplicates_merged(duplicates, 0.05)
     assert len(merged) == 1
     assert float(merged.mean_mm[0, 0]) == pytest.approx(0.1, abs=1e-5)
     assert np.abs(shown(duplicates) - shown(merged)).max() < 0.01
-    opposite = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
+    opposite = gaussians([[0.0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
     assert len(with_duplicates_merged(opposite, 0.05)) == 2
 
 

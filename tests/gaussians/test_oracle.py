@@ -70,8 +70,8 @@ def test_the_printed_attenuation_is_off_by_the_factor_of_the_design(backend: str
     planes = Planes(
         rotation=np.eye(3)[None],
         center_mm=np.zeros((1, 3)),
-        spacing_mm=[[0.8, 0.8]],
-        shape=[[1, 1]],
+        spacing_mm=np.array([[0.8, 0.8]]),
+        shape=np.array([[1, 1]]),
         psf_var_mm2=psf_variance_mm2([[0.8, 0.8]], np.array([3.0])),
     )
     exact = render(one, planes, backend=backend).item()

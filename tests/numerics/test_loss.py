@@ -8,6 +8,7 @@ away from what is rendered, so that central differences of 1e-5 stay on one side
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -189,12 +190,13 @@ def test_a_wrong_term_would_be_seen(tally: Tally) -> None:
     """Each term, left out of the float64 loss, changes some gradient by far more than the tolerance."""
     complete = CompleteLoss(0)
     complete.loss.evaluate(FRACTION)
-    for name, change in {
+    changes: dict[str, dict[str, Any]] = {
         "scale": {"scale_weight": 0.0},
         "poses": {"pose_prior_mm": 1e9},
         "bias field": {"bias_field_ridge": 0.0},
         "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
-    }.items():
+    }
+    for name, change in changes.items():
         before = {n: g.copy() for n, g in complete.parameters.gradient.items()}
         complete.loss_with(replace(SETTINGS, **change)).evaluate(FRACTION)
         moved = [

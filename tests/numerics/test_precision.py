@@ -12,6 +12,7 @@ from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_f
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from tests.gradients import gradient_of
 from tests.numerics.scenes import head_scene, single
 from tests.tally import Tally
 
@@ -28,7 +29,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
         with torch.autocast("cpu", dtype, enabled=mixed):  # backward passes belong outside of it
             pixels = render(cloud, scene.planes, twist=twist, backend=backend)
         pixels.square().sum().backward()
-        return [pixels.detach(), *(leaf.grad for leaf in (*leaves, twist))]
+        return [pixels.detach(), *(gradient_of(leaf) for leaf in (*leaves, twist))]
 
     plain = pixels_and_gradients(False)
     with tally.case():

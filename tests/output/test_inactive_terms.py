@@ -33,7 +33,7 @@ def slices_of(stacks: list[int]) -> Slices:
 
 
 def terms(
-    slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"], counts: dict[str, int] | None = None
+    slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"], counts: dict[str, float] | None = None
 ) -> dict[str, str]:
     return {one.term: one.reason for one in inactive_terms(slices, settings, counts or {})}
 

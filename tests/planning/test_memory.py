@@ -66,7 +66,7 @@ def unlimited(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 def volume_in(folder: Path) -> np.ndarray:
-    return np.asarray(nib.load(folder / "volume.nii.gz").dataobj)
+    return np.asarray(nib.Nifti1Image.from_filename(folder / "volume.nii.gz").dataobj)
 
 
 @pytest.mark.parametrize(
@@ -194,6 +194,7 @@ def test_a_small_limit_is_refused_in_one_line(
 def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRun, np.ndarray]) -> None:
     run, _ = unlimited
     said = run.record.memory
+    assert said is not None
     assert said.limit_bytes is None
     assert said.changes == []
     assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
@@ -203,11 +204,13 @@ def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path
 ) -> None:
     run, volume = unlimited
+    assert run.record.memory is not None
     limit = round(0.93 * run.record.memory.stated_bytes)
     output = tmp_path / "out"
     less = run_infer(arguments(subject, output, *QUIETLY, "--max-memory", str(limit)), output)
     assert less.peak_bytes < limit
     said = less.record.memory
+    assert said is not None
     assert said.limit_bytes == limit
     assert said.stated_bytes <= limit
     assert said.changes
@@ -217,14 +220,19 @@ def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
 
 
 def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path) -> None:
-    limit = round(0.93 * unlimited[0].record.memory.stated_bytes)
+    needs = unlimited[0].record.memory
+    assert needs is not None
+    limit = round(0.93 * needs.stated_bytes)
     output = tmp_path / "out"
     given = arguments(subject, output, "--time-budget", "0.1", "--threads", "1", "--quiet")
     run = run_infer([*given, "--max-memory", str(limit)], output)
     assert run.peak_bytes < limit
-    assert run.record.memory.stated_bytes <= limit
-    assert run.record.memory.changes
-    assert run.record.time_budget.seconds == 0.1
+    said, budget = run.record.memory, run.record.time_budget
+    assert said is not None
+    assert budget is not None
+    assert said.stated_bytes <= limit
+    assert said.changes
+    assert budget.seconds == 0.1
 
 
 def test_a_time_budget_keeps_what_was_planned(slices: Slices) -> None:

@@ -105,6 +105,7 @@ def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
     reconstructor = GaussianReconstructor(settings=SETTINGS)
     registration = reconstructor.register_stacks(stacks)
     result = reconstructor.reconstruct(stacks, registration, plan=TimeBudget.of(SETTINGS, 600.0))
+    assert result.record.time_budget is not None
     assert result.record.time_budget.fit == "accurate"
     assert len(result.record.loss["fit to slices"]) == PRESETS["accurate"].slice_stage.n_steps
     assert result.record.settings.adaptive is not None

@@ -204,7 +204,7 @@ def test_stack_motions_ignore_a_minority(rng: np.random.Generator) -> None:
 
 def test_pose_errors() -> None:
     pose = RigidPose.from_rotvec(np.zeros((2, 3)), np.zeros((2, 3)))
-    other = RigidPose.from_rotvec([[0, 0, 0.1], [0, 0, 0]], [[0, 0, 0], [3, 4, 0]])
+    other = RigidPose.from_rotvec([[0, 0, 0.1], [0.0, 0, 0]], [[0, 0, 0], [3, 4, 0]])
     distance_mm, angle_deg = pose_errors(pose, other)
     np.testing.assert_allclose(distance_mm, [0.8 * 25 * np.sqrt(2) * 2 * np.sin(0.05), 5.0], rtol=1e-6)
     np.testing.assert_allclose(angle_deg, [np.rad2deg(0.1), 0.0], atol=1e-9)

@@ -10,6 +10,7 @@ from torch import nn
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.network import ResidualRefiner
+from tests.gradients import gradient_of
 from tests.prior.receptive_field import receptive_radius_voxels
 
 SMALL = PriorNetworkConfig(channels=(8, 8, 8), units=(1, 1, 1), tail_channels=4, use_sharp=False)
@@ -42,7 +43,7 @@ def test_equation_7_with_a_known_residual(
 ) -> None:
     v_coarse, m_rho = (volume.double() for volume in volumes)
     network = DensityGatedPriorNetwork(replace(SMALL, alpha=alpha, beta=beta))
-    network.refiner = Stub()
+    network.register_module("refiner", Stub())
     c = 1 - torch.exp(-m_rho)
     expected = v_coarse + (alpha * c + beta * (1 - c)) * (v_coarse + 10 * m_rho)
     torch.testing.assert_close(network(v_coarse, m_rho), expected, rtol=1e-14, atol=1e-14)
@@ -51,7 +52,7 @@ def test_equation_7_with_a_known_residual(
 def test_gate_can_be_left_out(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse, m_rho = volumes
     network = DensityGatedPriorNetwork(replace(SMALL, use_gate=False))
-    network.refiner = Stub()
+    network.register_module("refiner", Stub())
     torch.testing.assert_close(network(v_coarse, m_rho), 2 * v_coarse + 10 * m_rho)
 
 
@@ -97,7 +98,7 @@ def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes: tuple[t
     m_rho[:, :, :8] = 1e6
     network = awaken(DensityGatedPriorNetwork(SMALL))
     network(v_coarse, m_rho).square().sum().backward()
-    gradients = [v_coarse.grad, *[parameter.grad for parameter in network.parameters()]]
+    gradients = [gradient_of(leaf) for leaf in (v_coarse, *network.parameters())]
     assert all(bool(gradient.isfinite().all()) for gradient in gradients)
 
 
@@ -122,7 +123,7 @@ def test_receptive_radius_is_an_upper_bound() -> None:
     extent, center = 160, 80
     v_coarse = torch.rand(1, 1, extent, 8, 8).requires_grad_()
     refiner(v_coarse, torch.ones_like(v_coarse))[0, 0, center].sum().backward()
-    reached = v_coarse.grad.abs().sum((0, 1, 3, 4)).nonzero().flatten()
+    reached = gradient_of(v_coarse).abs().sum((0, 1, 3, 4)).nonzero().flatten()
     reach = max(center - int(reached.min()), int(reached.max()) - center)
     assert receptive_radius_voxels(SMALL) // 2 < reach <= receptive_radius_voxels(SMALL)
 

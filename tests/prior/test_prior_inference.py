@@ -14,7 +14,7 @@ from tests.prior.receptive_field import receptive_radius_voxels
 
 def small(n_levels: int = 1, **changes: Any) -> DensityGatedPriorNetwork:
     """A network of 8 channels that sees V_coarse and M."""
-    levels = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
+    levels: dict[str, Any] = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
     return DensityGatedPriorNetwork(PriorNetworkConfig(**levels, **{"use_sharp": False, **changes})).eval()
 
 
@@ -111,7 +111,7 @@ def test_odd_tile_sizes_cover_every_voxel() -> None:
 def test_inputs_in_other_layouts_and_types(network: DensityGatedPriorNetwork) -> None:
     v_coarse = np.random.default_rng(0).random((9, 10, 11))
     straight = estimate_prior(network, v_coarse.astype(np.float32), np.ones((9, 10, 11), np.float32))
-    turned = estimate_prior(network, np.asfortranarray(v_coarse), np.ones((9, 10, 11)))
+    turned = estimate_prior(network, np.asfortranarray(v_coarse), np.ones((9, 10, 11)))  # type: ignore[arg-type]
     np.testing.assert_array_equal(straight, turned)
 
 

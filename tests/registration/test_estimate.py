@@ -38,6 +38,7 @@ def test_the_whole_estimate_says_how_it_was_found(moving: Moving) -> None:
     assert set(estimate.initialisations) == {"headers", "template", "stacks"}
     sums = {name: sum(values) for name, values in estimate.initialisations.items()}
     assert sums[estimate.initialisation] > sums["headers"]
+    assert estimate.held_out is not None
     assert len(estimate.held_out) == len(estimate.interleave) == len(estimate.n_segments) == 3
     assert min(estimate.held_out) > max(estimate.initialisations["headers"])
     assert estimate.interleave == [2, 2, 2]

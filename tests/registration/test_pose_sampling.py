@@ -37,7 +37,7 @@ def test_rotations_within_a_limit_are_the_share_that_the_sphere_has_there() -> N
 
 
 def test_angles_between_rotations() -> None:
-    turn = Rotation.from_rotvec(np.deg2rad([[0, 0, 0], [0, 30, 0], [180, 0, 0], [0, 1e-3, 0]])).as_matrix()
+    turn = Rotation.from_rotvec(np.deg2rad([[0.0, 0, 0], [0.0, 30, 0], [180.0, 0, 0], [0, 1e-3, 0]])).as_matrix()
     np.testing.assert_allclose(angle_deg(turn, np.eye(3)), [0, 30, 180, 1e-3], atol=1e-5)
     base = Rotation.random(1, rng=np.random.default_rng(3)).as_matrix()[0]
     np.testing.assert_allclose(angle_deg(turn @ base, base), [0, 30, 180, 1e-3], atol=1e-4)
@@ -76,5 +76,5 @@ def test_distinct_motions_are_kept_once_in_their_order(rng: np.random.Generator)
         np.concatenate([three.translation_mm, shifted.translation_mm]),
     )
     assert len(distinct(both, CENTER_MM)) == 6
-    turned = RigidPose.from_rotvec([[0, 0, 0], np.deg2rad([0, 0, 0.3])], np.zeros((2, 3)))
+    turned = RigidPose.from_rotvec(np.deg2rad([[0.0, 0, 0], [0, 0, 0.3]]), np.zeros((2, 3)))
     assert len(distinct(turned, np.zeros(3))) == 2

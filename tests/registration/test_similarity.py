@@ -65,7 +65,7 @@ def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too() -> None:
         rotation=np.tile(np.eye(3), (2, 1, 1)),
         center_mm=np.zeros((2, 3)),
         spacing_mm=np.ones((2, 2)),
-        shape=[[1, 50], [20, 20]],
+        shape=np.array([[1, 50], [20, 20]]),
         psf_var_mm2=np.zeros((2, 3)),
     )
     mask = np.zeros(450, bool)

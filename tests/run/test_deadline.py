@@ -17,7 +17,7 @@ class Clock:
 
 
 def run(
-    n_steps: int, seconds: float | None, per_step: float | Callable[[int], float], **options: Any
+    n_steps: int, seconds: float, per_step: float | Callable[[int], float], **options: Any
 ) -> tuple[list[tuple[int, float]], float]:
     clock, done = Clock(), []
     deadline = Deadline.after(seconds, clock)

@@ -1,6 +1,7 @@
 """Studies of the trade-off: steps read off a curve, marks in tables, few Gaussians for a ball, a small phantom."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +54,11 @@ def test_memory_is_judged_by_statements_and_limits() -> None:
     limit = {"name": "a", "limit_bytes": 1e9, "stated_bytes": 9e8, "measured_bytes": 9e8, "changes": []}
     limit |= {"cpu_seconds": 9.0, "psnr_db": 28.0}
     refused = {"name": "a", "limit_bytes": 5e8, "refused": "too small; ask for more"}
-    record = {"most": 1.5, "machine": machine(), "rows": {"a": stated, "b": {"limited": [limit, refused]}}}
+    record: dict[str, Any] = {
+        "most": 1.5,
+        "machine": machine(),
+        "rows": {"a": stated, "b": {"limited": [limit, refused]}},
+    }
     text = memory.tables(record)
     assert "| 1.20 GB | prior | 1.00 GB | 1.20 |" in text["memory"]
     assert "| a | 1.00 GB | 0.90 GB | 0.90 GB | 9 | 28.00 | nothing |" in text["memory-limits"]

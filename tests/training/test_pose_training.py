@@ -26,10 +26,10 @@ from torch.utils.data import DataLoader
 from g3r.pose_network.inference import as_pose
 from g3r.pose_network.network import PoseStep
 from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss
-from tests.training.small_runs import assert_export_refuses, logged, trainer
+from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
-SMALL = {"network": NETWORK, "warmup_steps": 1}
+SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/pose.yaml"
 
 
@@ -71,10 +71,10 @@ class TinyData(lightning.LightningDataModule):
         return AtlasTemplate(heads, config.template_grid.affine, np.arange(25.0, 25.0 + shape[0]))
 
     def train_dataloader(self) -> DataLoader:
-        return DataLoader([sample(seed) for seed in range(3)], batch_size=None)
+        return in_memory([sample(seed) for seed in range(3)])
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader([sample(8, n_stacks=1), sample(9, n_stacks=2)], batch_size=None)
+        return in_memory([sample(8, n_stacks=1), sample(9, n_stacks=2)])
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_export_refuses(
     ("settings", "message"),
     [({"template_mm": 4.0}, "not on a grid of 3 mm"), ({"pixel_mm": 4.0}, "data.pixel_mm: 4.0")],
 )
-def test_data_that_do_not_fit(tmp_path: Path, settings: dict[str, float], message: str) -> None:
+def test_data_that_do_not_fit(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         trainer(tmp_path, max_epochs=1).fit(PoseModule(**SMALL), TinyData(**settings))
 
@@ -181,7 +181,7 @@ def test_losses_and_scores_of_true_poses() -> None:
 
 def test_loss_is_a_distance_in_mm() -> None:
     batch = sample(0)
-    off = PoseStep(batch["true_rotation"], batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]), None)
+    off = exact_step(batch)._replace(translation_mm=batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]))
     assert float(point_loss(off, batch)) == pytest.approx(5.0, abs=1e-3)
 
 
@@ -206,7 +206,8 @@ def test_starting_from_other_weights(trained: tuple[Path, Path, PoseModule], tmp
         PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
     wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # what fits is taken
     torch.testing.assert_close(
-        wider.network.encoder.stem.conv.weight, trained[2].network.encoder.stem.conv.weight.cpu()
+        wider.network.get_parameter("encoder.stem.conv.weight"),
+        trained[2].network.get_parameter("encoder.stem.conv.weight").cpu(),
     )
 
 

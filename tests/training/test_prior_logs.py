@@ -26,7 +26,7 @@ from g3r.prior.model import Prior
 from g3r.reconstruct import GaussianReconstructor
 from g3r.training import prior_module as training
 from g3r.training import prior_validation as validation
-from tests.training.small_runs import logged, trainer
+from tests.training.small_runs import in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 TINY_TRAINING = [
@@ -62,14 +62,14 @@ class ValidatedByStacks(lightning.LightningDataModule):
     spacing_mm = 0.8
 
     def train_dataloader(self) -> DataLoader:
-        return DataLoader([volumes(2)], batch_size=None)
+        return in_memory([volumes(2)])
 
     def val_dataloader(self) -> DataLoader:
         batches = [
             {**volumes(1, 1), "n_stacks": torch.tensor([1])},
             {**volumes(2, 2), "n_stacks": torch.tensor([3, 3])},
         ]
-        return DataLoader(batches, batch_size=None)
+        return in_memory(batches)
 
 
 @pytest.fixture(scope="module")
@@ -123,11 +123,12 @@ def test_panel_of_a_network_without_a_gate() -> None:
 def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
     first = training.PriorModule(NETWORK)
-    options = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
+    options: dict[str, Any] = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
     run = trainer(tmp_path, **options)
     run.fit(first, ValidatedByStacks())
     run.save_checkpoint(tmp_path / "run.ckpt")
     path = tmp_path / "prior.safetensors"
+    assert first.voxel_mm is not None
     Prior(network=first.network, voxel_mm=first.voxel_mm, training_data="noise").save(path)
     data = ValidatedByStacks()
     data.spacing_mm = 1.0

@@ -30,10 +30,10 @@ from g3r.training import prior_batches as batches
 from g3r.training import prior_module as training
 from g3r.training.annealed_module import cosine_factor
 from g3r.training.prior_validation import sample_scores
-from tests.training.small_runs import assert_export_refuses, logged, trainer
+from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
-SMALL = {"network": NETWORK, "warmup_steps": 1}
+SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 
 
@@ -62,10 +62,10 @@ class TinyData(lightning.LightningDataModule):
         self.save_hyperparameters()
 
     def train_dataloader(self) -> DataLoader:
-        return DataLoader([sample(seed) for seed in range(4)], batch_size=2)
+        return in_memory([sample(seed) for seed in range(4)], 2)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader([sample(seed) for seed in (8, 9)], batch_size=2)
+        return in_memory([sample(seed) for seed in (8, 9)], 2)
 
 
 @pytest.fixture(scope="module")

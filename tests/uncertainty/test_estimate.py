@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def fit_of(noise: float) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=np.ones(n), weight=np.ones(n), history=[], bias_field=[])
 
 
-def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options: object) -> Uncertainty:
+def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options: Any) -> Uncertainty:
     rng = np.random.default_rng(1)
     volume = (0.5 + 0.1 * rng.standard_normal(grid.shape)).astype(np.float32) * mask
     given: dict = {
@@ -60,7 +61,9 @@ def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options:
         "prior_grid": grid,
         "prior_share": np.full(grid.shape, 0.2, np.float32),
     }
-    own = {name: options.pop(name) for name in ("with_prior", "intensity", "reliable") if name in options}
+    own: dict[str, Any] = {
+        name: options.pop(name) for name in ("with_prior", "intensity", "reliable") if name in options
+    }
     inputs = UncertaintyInputs(volume=volume, mask=mask, grid=grid, fit=fit, **{**given, **options})
     return estimate_uncertainty(inputs, **own)
 
