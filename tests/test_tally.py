@@ -17,7 +17,7 @@ def wrong_after_all(case: Case) -> None:
     raise ZeroDivisionError
 
 
-def test_cases_are_counted_and_errors_are_lost_and_go_on():
+def test_cases_are_counted_and_errors_are_lost_and_go_on() -> None:
     rows: dict[str, Counts] = {}
     tally = Tally("bad input", rows)
     with tally.case():
@@ -37,7 +37,7 @@ def test_cases_are_counted_and_errors_are_lost_and_go_on():
 
 
 @pytest.mark.parametrize("refused", [1, 2])
-def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int):
+def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int) -> None:
     test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
     (tmp_path / "test_kills.py").write_text(test)
     line = [

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.stacks import Stack
@@ -19,14 +20,16 @@ AXES = {
 }
 
 
-def affine_of(axes: np.ndarray, spacing=(0.8, 0.9, 3.0), origin=(-20.0, 31.0, 7.5)) -> np.ndarray:
+def affine_of(
+    axes: np.ndarray, spacing: ArrayLike = (0.8, 0.9, 3.0), origin: ArrayLike = (-20.0, 31.0, 7.5)
+) -> np.ndarray:
     affine = np.eye(4)
     affine[:3, :3] = axes * np.array(spacing)
     affine[:3, 3] = origin
     return affine
 
 
-def arrays(seed: int = 0, shape=(14, 11, 6)) -> tuple[np.ndarray, np.ndarray]:
+def arrays(seed: int = 0, shape: tuple[int, int, int] = (14, 11, 6)) -> tuple[np.ndarray, np.ndarray]:
     """Distinct values, so that a value tells its voxel, and a ragged mask off the middle."""
     rng = np.random.default_rng(seed)
     image = (1 + rng.permutation(np.prod(shape))).reshape(shape).astype(np.float32)

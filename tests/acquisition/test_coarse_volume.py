@@ -1,5 +1,7 @@
 """M_rho is 1 where one gapless stack covers once; V_coarse is a mean; confidence keeps its digits."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,7 @@ def cube_stack(
     pixel_mm: float = 1.0,
     thickness_mm: float = 3.0,
     distance_mm: float | None = None,
-    turn=TURNS["axial"],
+    turn: np.ndarray = TURNS["axial"],
     value: float | None = 7.0,
 ) -> Stack:
     """A stack whose mask is a cube of 40 mm about the origin."""
@@ -37,14 +39,14 @@ def cube_stack(
     return Stack(image=image, mask=np.ones(shape, bool), affine=affine, thickness_mm=thickness_mm)
 
 
-def density_inside(slices: Slices, voxel_mm: float = 1.0, **options) -> np.ndarray:
+def density_inside(slices: Slices, voxel_mm: float = 1.0, **options: Any) -> np.ndarray:
     """M over the inner cube of 24 mm, whole periods of every slice distance in use."""
     grid = VolumeGrid.isotropic([-12 + voxel_mm / 2] * 3, [12 - voxel_mm / 2] * 3, voxel_mm)
     return coarse_and_density(slices, grid, **options)[1]
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_one_gapless_stack_counts_once(turn: str):
+def test_one_gapless_stack_counts_once(turn: str) -> None:
     density = density_inside(slices_from_stacks([cube_stack(turn=TURNS[turn])]))
     assert density.mean() == pytest.approx(1, abs=0.01)
     # slices with FWHM = distance ripple by 2 exp(-2 pi^2 / 2.3548^2) = 5.7 %
@@ -54,19 +56,19 @@ def test_one_gapless_stack_counts_once(turn: str):
 
 @pytest.mark.parametrize("pixel_mm", [0.5, 0.8, 1.6])
 @pytest.mark.parametrize("thickness_mm", [2.0, 4.0])
-def test_density_depends_neither_on_pixel_size_nor_thickness(pixel_mm: float, thickness_mm: float):
+def test_density_depends_neither_on_pixel_size_nor_thickness(pixel_mm: float, thickness_mm: float) -> None:
     density = density_inside(slices_from_stacks([cube_stack(pixel_mm, thickness_mm)]))
     assert density.mean() == pytest.approx(1, abs=0.015)
 
 
 @pytest.mark.parametrize("voxel_mm", [0.6, 1.5, 3.0])
-def test_density_does_not_depend_on_the_grid(voxel_mm: float):
+def test_density_does_not_depend_on_the_grid(voxel_mm: float) -> None:
     density = density_inside(slices_from_stacks([cube_stack()]), voxel_mm)
     assert density.mean() == pytest.approx(1, abs=0.015)
     assert density.min() > 0.88
 
 
-def test_an_oblique_grid_sees_the_same_density():
+def test_an_oblique_grid_sees_the_same_density() -> None:
     affine = np.eye(4)
     affine[:3, :3] = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() * [-1.0, 1, 1]
     affine[:3, 3] = -affine[:3, :3] @ np.full(3, 7.5)
@@ -74,21 +76,21 @@ def test_an_oblique_grid_sees_the_same_density():
     assert density.mean() == pytest.approx(1, abs=0.015)
 
 
-def test_three_stacks_count_thrice():
+def test_three_stacks_count_thrice() -> None:
     stacks = [cube_stack(turn=turn) for turn in TURNS.values()]
     density = density_inside(slices_from_stacks(stacks))
     assert density.mean() == pytest.approx(3, abs=0.03)
     assert confidence(density).mean() == pytest.approx(0.95, abs=0.003)
 
 
-def test_a_gap_lowers_the_density_to_thickness_over_distance():
+def test_a_gap_lowers_the_density_to_thickness_over_distance() -> None:
     density = density_inside(slices_from_stacks([cube_stack(thickness_mm=2.0, distance_mm=4.0)]))
     assert density.mean() == pytest.approx(0.5, abs=0.01)
     assert density.min() < 0.35  # in the gaps
     assert density.max() > 0.65
 
 
-def test_weight_lowers_density_but_not_the_mean():
+def test_weight_lowers_density_but_not_the_mean() -> None:
     slices = slices_from_stacks([cube_stack()])
     grid = VolumeGrid.isotropic([-10] * 3, [10] * 3, 1.0)
     full = coarse_and_density(slices, grid)
@@ -97,7 +99,7 @@ def test_weight_lowers_density_but_not_the_mean():
     np.testing.assert_allclose(quarter[0], full[0], rtol=1e-5)
 
 
-def test_weight_zero_leaves_pixels_out():
+def test_weight_zero_leaves_pixels_out() -> None:
     stacks = [cube_stack(value=7.0), cube_stack(value=9000.0)]
     slices = slices_from_stacks(stacks)
     weight = (slices.stack_id[slices.pixel_plane] == 0).astype(np.float32)
@@ -106,7 +108,7 @@ def test_weight_zero_leaves_pixels_out():
     assert density.mean() == pytest.approx(1, abs=0.02)
 
 
-def test_a_constant_comes_out_constant_and_nothing_where_nothing_was_seen():
+def test_a_constant_comes_out_constant_and_nothing_where_nothing_was_seen() -> None:
     slices = slices_from_stacks([cube_stack(thickness_mm=2.0, distance_mm=5.0)])
     coarse, density = coarse_and_density(slices, VolumeGrid.isotropic([-40] * 3, [40] * 3, 2.0))
     seen = density > 1e-3
@@ -117,7 +119,7 @@ def test_a_constant_comes_out_constant_and_nothing_where_nothing_was_seen():
     assert coarse.dtype == density.dtype == np.float32
 
 
-def test_gains_are_divided_out():
+def test_gains_are_divided_out() -> None:
     slices = slices_from_stacks([cube_stack()])
     gain = np.random.default_rng(0).uniform(0.5, 2, len(slices))
     dark = Slices(
@@ -134,7 +136,7 @@ def test_gains_are_divided_out():
     np.testing.assert_allclose(coarse_and_density(dark, grid, gain)[1], coarse_and_density(slices, grid)[1])
 
 
-def test_confidence_at_its_ends():
+def test_confidence_at_its_ends() -> None:
     density = np.array([0.0, 1e-30, 1e-8, 1.0, 3.0, 1e6])
     found = confidence(density)
     assert found[0] == 0
@@ -148,7 +150,7 @@ def test_confidence_at_its_ends():
     assert (np.diff(single) >= 0).all()
 
 
-def test_normalisation_scale_is_the_99th_percentile_of_what_was_seen():
+def test_normalisation_scale_is_the_99th_percentile_of_what_was_seen() -> None:
     rng = np.random.default_rng(1)
     coarse, density = rng.uniform(0, 100, (20, 20, 20)), rng.uniform(0, 0.2, (20, 20, 20))
     coarse[density < 0.1] = 1e9
@@ -165,6 +167,6 @@ def test_normalisation_scale_is_the_99th_percentile_of_what_was_seen():
         (-np.ones(5), np.ones(5), "-1"),
     ],
 )
-def test_normalisation_scale_refuses(coarse, density, message):
+def test_normalisation_scale_refuses(coarse: np.ndarray, density: np.ndarray, message: str) -> None:
     with pytest.raises(InputError, match=message):
         normalisation_scale(coarse, density)

@@ -56,7 +56,7 @@ def volume_of(mask: np.ndarray) -> float:
 
 @pytest.mark.parametrize("n_stacks", [1, 2, 3])
 @pytest.mark.parametrize(("thickness_mm", "gap_mm"), [(2.2, 0.0), (4.0, 0.0), (3.0, 2.0)])
-def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: float):
+def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: float) -> None:
     stacks = [ellipsoid_stack(t, thickness_mm=thickness_mm, gap_mm=gap_mm) for t in TURNS[:n_stacks]]
     mask = foreground_mask(slices_from_stacks(stacks), GRID)
     # generous (INSIDE_SHARE below one half) by a share of the slice distance, with one stack as with three
@@ -69,7 +69,7 @@ def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: flo
     assert label(mask)[1] == 1
 
 
-def test_a_left_handed_header_ends_where_a_right_handed_one_does():
+def test_a_left_handed_header_ends_where_a_right_handed_one_does() -> None:
     right, left = (
         foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)]), GRID) for flag in (False, True)
     )
@@ -77,7 +77,7 @@ def test_a_left_handed_header_ends_where_a_right_handed_one_does():
     assert (left != right).sum() < 0.05 * right.sum()
 
 
-def test_beyond_the_ends_of_a_stack_there_is_no_brain():
+def test_beyond_the_ends_of_a_stack_there_is_no_brain() -> None:
     """The slices end inside of the head: the mask ends with them, not half a slice distance later."""
     slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)])
     mask = foreground_mask(slices, GRID)
@@ -85,7 +85,7 @@ def test_beyond_the_ends_of_a_stack_there_is_no_brain():
     assert not mask[WORLD[..., 2] < -3.5].any()
 
 
-def test_a_slice_without_weight_has_no_vote():
+def test_a_slice_without_weight_has_no_vote() -> None:
     """A slice that lies wrongly would put brain beside the head and a hole into it."""
     slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
     good = foreground_mask(slices, GRID)
@@ -105,7 +105,7 @@ def test_a_slice_without_weight_has_no_vote():
     assert (half != good).mean() < 0.002  # a common factor says nothing
 
 
-def test_what_one_stack_alone_has_seen_stays_inside():
+def test_what_one_stack_alone_has_seen_stays_inside() -> None:
     """Partial coverage: two stacks that stop half-way have no say in what they did not cover."""
     whole = ellipsoid_stack(TURNS[0])
     partly = [ellipsoid_stack(t, low_mm=0.0) for t in TURNS[1:]]
@@ -117,7 +117,7 @@ def test_what_one_stack_alone_has_seen_stays_inside():
     assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.08)
 
 
-def test_what_most_stacks_call_outside_is_outside():
+def test_what_most_stacks_call_outside_is_outside() -> None:
     stacks = [ellipsoid_stack(t) for t in TURNS]
     spilt = stacks[0].mask | (np.arange(stacks[0].mask.shape[0]) < 22)[:, None, None]
     wrong = replace(stacks[0], mask=spilt)
@@ -128,7 +128,7 @@ def test_what_most_stacks_call_outside_is_outside():
     assert mask[near].mean() < 0.1
 
 
-def test_holes_are_filled_and_only_the_largest_piece_stays():
+def test_holes_are_filled_and_only_the_largest_piece_stays() -> None:
     whole, stack = slices_from_stacks([ellipsoid_stack()]), ellipsoid_stack(hole=True)
     crumb = stack.mask.copy()
     crumb[2:8, 2:8, 4:7] = True
@@ -138,7 +138,7 @@ def test_holes_are_filled_and_only_the_largest_piece_stays():
     assert volume_of(mask) == pytest.approx(volume_of(foreground_mask(whole, GRID)), rel=0.01)
 
 
-def test_the_mask_moves_with_the_slices():
+def test_the_mask_moves_with_the_slices() -> None:
     slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
     shift = np.array([3.0, -4.5, 1.5])  # whole voxels
     moved = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + shift))
@@ -147,7 +147,7 @@ def test_the_mask_moves_with_the_slices():
 
 
 @pytest.mark.parametrize("n_slices", [1, 2])
-def test_one_or_two_slices_are_enough(n_slices: int):
+def test_one_or_two_slices_are_enough(n_slices: int) -> None:
     slices = slices_from_stacks([ellipsoid_stack()])
     middle = int(np.argmin(np.abs(slices.planes.center_mm[:, 2])))
     few = slices.take(np.arange(middle, middle + n_slices))
@@ -156,7 +156,7 @@ def test_one_or_two_slices_are_enough(n_slices: int):
     assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 6  # beyond a lone slice nobody is asked
 
 
-def test_the_foreground_of_nothing_is_refused():
+def test_the_foreground_of_nothing_is_refused() -> None:
     slices = slices_from_stacks([ellipsoid_stack()])
     far = VolumeGrid.isotropic([500] * 3, [520] * 3, 2.0)
     with pytest.raises(InputError, match="no voxel is covered"):

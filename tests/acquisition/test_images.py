@@ -5,6 +5,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from nibabel.arrayproxy import ArrayProxy
 
 from g3r.acquisition.images import Volume, load_mask, load_volume, save_volume
 from g3r.acquisition.nifti import MAX_VOXEL_COUNT
@@ -12,14 +13,15 @@ from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, write
 
 
-def test_int16_with_slope_and_intercept(tmp_path: Path):
+def test_int16_with_slope_and_intercept(tmp_path: Path) -> None:
     raw = np.random.default_rng(1).integers(0, 4000, (8, 9, 5)).astype(np.int16)
     image = nib.Nifti1Image(raw, affine_of(AXES["LAS"]))
     image.header.set_slope_inter(0.25, -3.0)
     nib.save(image, tmp_path / "a.nii.gz")
     # nibabel stores what was given after scaling; read the raw numbers to know what the file says
-    stored = nib.load(tmp_path / "a.nii.gz")
+    stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz")
     assert stored.get_data_dtype() == np.int16
+    assert isinstance(stored.dataobj, ArrayProxy)
     expected = np.asarray(stored.dataobj.get_unscaled()) * stored.dataobj.slope + stored.dataobj.inter
     loaded = load_volume(tmp_path / "a.nii.gz")
     assert loaded.data.dtype == np.float32
@@ -27,7 +29,7 @@ def test_int16_with_slope_and_intercept(tmp_path: Path):
     np.testing.assert_allclose(loaded.data, expected, rtol=1e-6, atol=1e-3)
 
 
-def test_mask_whose_header_lost_digits_is_accepted(tmp_path: Path):
+def test_mask_whose_header_lost_digits_is_accepted(tmp_path: Path) -> None:
     image, mask = arrays()
     affine = affine_of(AXES["oblique"])
     shifted = affine.copy()
@@ -38,7 +40,7 @@ def test_mask_whose_header_lost_digits_is_accepted(tmp_path: Path):
 
 
 @pytest.mark.parametrize("change", ["shift", "flip", "shape"])
-def test_mask_of_another_grid_is_refused(tmp_path: Path, change: str):
+def test_mask_of_another_grid_is_refused(tmp_path: Path, change: str) -> None:
     image, mask = arrays()
     affine = affine_of(AXES["RAS"])
     other = affine.copy()
@@ -54,7 +56,7 @@ def test_mask_of_another_grid_is_refused(tmp_path: Path, change: str):
         load_mask(path, reference)
 
 
-def test_save_and_load_volume(tmp_path: Path):
+def test_save_and_load_volume(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     affine = affine_of(AXES["oblique left-handed"])
     for data, kind in (
@@ -63,14 +65,14 @@ def test_save_and_load_volume(tmp_path: Path):
         (rng.integers(-5, 5, (4, 5, 6)).astype(np.int16), np.int16),
     ):
         save_volume(tmp_path / "v.nii.gz", data, affine)
-        assert nib.load(tmp_path / "v.nii.gz").get_data_dtype() == kind
+        assert nib.Nifti1Image.from_filename(tmp_path / "v.nii.gz").get_data_dtype() == kind
         back = load_volume(tmp_path / "v.nii.gz")
         np.testing.assert_allclose(back.data, data.astype(np.float32), rtol=1e-7)
         np.testing.assert_allclose(back.affine, affine, atol=1e-5)
     assert [path.name for path in tmp_path.iterdir()] == ["v.nii.gz"]
 
 
-def test_save_volume_into_a_missing_folder_is_refused(tmp_path: Path):
+def test_save_volume_into_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         save_volume(tmp_path / "no" / "v.nii.gz", np.zeros((2, 2, 2)), np.eye(4))
 
@@ -131,7 +133,7 @@ def bad_files(folder: Path) -> dict[str, Path]:
         ("other format", "not NIfTI by its name; expected .nii"),
     ],
 )
-def test_unusable_files_are_refused_in_one_line_that_names_them(tmp_path: Path, kind: str, message: str):
+def test_unusable_files_are_refused_in_one_line_that_names_them(tmp_path: Path, kind: str, message: str) -> None:
     path = bad_files(tmp_path)[kind]
     with pytest.raises(InputError, match=message) as caught:
         load_volume(path)
@@ -141,7 +143,7 @@ def test_unusable_files_are_refused_in_one_line_that_names_them(tmp_path: Path, 
     assert MAX_VOXEL_COUNT < 2000**3
 
 
-def test_an_empty_mask_is_refused(tmp_path: Path):
+def test_an_empty_mask_is_refused(tmp_path: Path) -> None:
     image, mask = arrays()
     reference = Volume(image, affine_of(AXES["RAS"]), "a")
     path = write(tmp_path / "m.nii.gz", np.zeros(mask.shape, np.uint8), reference.affine)

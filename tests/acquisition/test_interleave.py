@@ -17,7 +17,7 @@ from g3r.acquisition.interleave import acquisition_order
         (0, 2, []),
     ],
 )
-def test_small_orders(n_slices: int, interleave: int, expected: list[int]):
+def test_small_orders(n_slices: int, interleave: int, expected: list[int]) -> None:
     order = acquisition_order(n_slices, interleave)
     assert order.tolist() == expected
     assert order.dtype == np.int64
@@ -25,7 +25,7 @@ def test_small_orders(n_slices: int, interleave: int, expected: list[int]):
 
 @pytest.mark.parametrize("interleave", [1, 2, 3])
 @pytest.mark.parametrize("n_slices", [11, 12, 40])
-def test_every_slice_is_taken_once(n_slices: int, interleave: int):
+def test_every_slice_is_taken_once(n_slices: int, interleave: int) -> None:
     order = acquisition_order(n_slices, interleave)
     assert sorted(order) == list(range(n_slices))
     steps = np.diff(order)
@@ -33,6 +33,6 @@ def test_every_slice_is_taken_once(n_slices: int, interleave: int):
     assert (steps < 0).sum() == interleave - 1  # so many times back to the beginning
 
 
-def test_an_interleave_below_one_is_refused():
+def test_an_interleave_below_one_is_refused() -> None:
     with pytest.raises(ValueError, match="interleave 0"):
         acquisition_order(5, 0)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from data_synth.atlas import TruthVolume
 from data_synth.heads import PhantomSubject, load_volume_of
 from data_synth.phantom import fetal_brain_phantom
 from data_synth.simulator import orthogonal_settings, simulate_stacks
@@ -17,12 +18,12 @@ from tests.registration.moving_heads import as_slices, simulated
 
 
 @pytest.fixture(scope="module")
-def head():
+def head() -> TruthVolume:
     return load_volume_of(PhantomSubject("26w", 26.0, 3), 1.2)
 
 
 @pytest.fixture(scope="module", params=[1, 3])
-def slices(request, head) -> Slices:
+def slices(request: pytest.FixtureRequest, head: TruthVolume) -> Slices:
     settings = orthogonal_settings(
         request.param, resolution_mm=1.2, thickness_mm=3.0, snr=40.0, bias=0.0, gain_deviation=0.0
     )
@@ -30,7 +31,7 @@ def slices(request, head) -> Slices:
     return slices_from_stacks([one.stack for one in stacks])
 
 
-def test_v_sharp_is_nearer_to_the_head(head, slices) -> None:
+def test_v_sharp_is_nearer_to_the_head(head: TruthVolume, slices: Slices) -> None:
     grid = VolumeGrid(head.data.shape, head.affine)
     coarse, _ = coarse_and_density(slices, grid)
     sharp = sharpened_volume(slices, grid, coarse)
@@ -41,7 +42,7 @@ def test_v_sharp_is_nearer_to_the_head(head, slices) -> None:
     assert error["sharp"] < 0.9 * error["coarse"]
 
 
-def test_gain_and_weight_count(head, slices) -> None:
+def test_gain_and_weight_count(head: TruthVolume, slices: Slices) -> None:
     grid = VolumeGrid(head.data.shape, head.affine)
     coarse, _ = coarse_and_density(slices, grid)
     plain = sharpened_volume(slices, grid, coarse)
@@ -60,7 +61,7 @@ def test_the_convention_names_what_it_depends_on() -> None:
     assert SHARP_CONVENTION == "cg6-smoothness0.1-v1"
 
 
-def test_a_volume_explains_its_slices_and_more_steps_explain_more():
+def test_a_volume_explains_its_slices_and_more_steps_explain_more() -> None:
     slices, _ = as_slices(simulated(fetal_brain_phantom(24, 1.2)))
     grid = grid_around(slices, 1.5)
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)

@@ -1,5 +1,7 @@
 """Planes and slices: taken, moved, refused; a volume as planes."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from tests.acquisition.nifti_files import AXES, affine_of, stacks_of_two
 
 
 @pytest.mark.parametrize("index", [[3, 0, 7], slice(2, 6), "mask", []])
-def test_take_keeps_pixels_values_and_slices_together(index):
+def test_take_keeps_pixels_values_and_slices_together(index: Any) -> None:
     slices = slices_from_stacks(stacks_of_two())
     if index == "mask":
         index = np.arange(len(slices)) % 3 == 1
@@ -30,7 +32,7 @@ def test_take_keeps_pixels_values_and_slices_together(index):
         np.testing.assert_array_equal(part.header_pose.rotation[new], slices.header_pose.rotation[old])
 
 
-def test_moving_the_world_moves_the_pixels_and_is_reported():
+def test_moving_the_world_moves_the_pixels_and_is_reported() -> None:
     slices = slices_from_stacks(stacks_of_two())
     motion = RigidPose.from_rotvec([[0.2, -0.1, 0.4]], [[5.0, -3, 2]])
     moved = slices.with_pose(motion @ slices.planes.pose)
@@ -42,7 +44,7 @@ def test_moving_the_world_moves_the_pixels_and_is_reported():
     np.testing.assert_allclose(reported.translation_mm - motion.translation_mm, 0, atol=1e-10)
 
 
-def test_volume_planes_are_the_volume_in_order():
+def test_volume_planes_are_the_volume_in_order() -> None:
     data = np.random.default_rng(3).normal(size=(5, 4, 3)).astype(np.float32)
     for axes in AXES.values():
         grid = VolumeGrid(data.shape, affine_of(axes))
@@ -65,8 +67,8 @@ def test_volume_planes_are_the_volume_in_order():
         {"center_mm": [[0.0, 0]]},
     ],
 )
-def test_planes_without_meaning_are_refused(change):
-    good = {
+def test_planes_without_meaning_are_refused(change: dict[str, list[list[float]]]) -> None:
+    good: dict[str, Any] = {
         "rotation": np.eye(3)[None],
         "center_mm": [[0.0, 0, 0]],
         "spacing_mm": [[1.0, 1]],
@@ -78,7 +80,7 @@ def test_planes_without_meaning_are_refused(change):
         Planes(**(good | change))
 
 
-def test_records_print_their_sizes_in_one_line():
+def test_records_print_their_sizes_in_one_line() -> None:
     stack = stacks_of_two()[1]
     slices = slices_from_stacks(stacks_of_two())
     assert repr(stack) == "Stack(second: 9 x 16 x 5 voxels of 0.8 x 0.9 x 3 mm, 2 mm thick)"

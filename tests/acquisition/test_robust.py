@@ -8,7 +8,7 @@ import pytest
 from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE, robust_width, slice_weights
 
 
-def test_slice_weights_are_smooth_and_never_zero():
+def test_slice_weights_are_smooth_and_never_zero() -> None:
     rng = np.random.default_rng(0)
     usual = rng.normal(1.0, 0.1, 200).clip(0.1)
     previous = None
@@ -20,6 +20,7 @@ def test_slice_weights_are_smooth_and_never_zero():
             assert weight[-1] <= previous + 1e-12
             assert previous - weight[-1] < 0.02
         previous = weight[-1]
+    assert previous is not None
     assert previous <= 2e-3
     assert np.median(slice_weights(usual)) == 1.0
     assert (slice_weights(np.zeros(5)) == 1).all()
@@ -30,7 +31,7 @@ def test_slice_weights_are_smooth_and_never_zero():
 
 @pytest.mark.parametrize("bad_share", [0.1, 0.3, 0.45])
 @pytest.mark.parametrize("n", [10, 49, 200])
-def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float):
+def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float) -> None:
     rng = np.random.default_rng(n)
     loss = rng.normal(1.0, 0.05, n)
     bad = rng.permutation(n)[: int(bad_share * n)]
@@ -46,7 +47,7 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float):
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 2.0, 3.0])
-def test_the_robust_width_is_the_standard_deviation_without_outliers(rng: np.random.Generator, n_sigma: float):
+def test_the_robust_width_is_the_standard_deviation_without_outliers(rng: np.random.Generator, n_sigma: float) -> None:
     residual = rng.normal(0, 0.3, 20_000)
     residual[::50] = 100.0
     assert robust_width(residual, n_sigma) == pytest.approx(n_sigma * 0.3, rel=0.05)

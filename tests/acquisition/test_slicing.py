@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from data_synth.phantom import fetal_brain_phantom
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
@@ -15,7 +16,7 @@ from tests.acquisition.nifti_files import AXES, affine_of, arrays, stacks_of_two
 from tests.registration.moving_heads import as_slices, simulated
 
 
-def test_the_masked_volume_is_the_heads():
+def test_the_masked_volume_is_the_heads() -> None:
     head = fetal_brain_phantom(24, 1.2)
     slices, _ = as_slices(simulated(head))
     true_mm3 = head.mask.sum() * abs(np.linalg.det(head.affine))
@@ -29,13 +30,13 @@ def test_the_masked_volume_is_the_heads():
     assert head_volume_mm3(one) == pytest.approx(area * one.thickness_mm[0])
 
 
-def test_normalised_slices_have_their_99th_percentile_at_one():
+def test_normalised_slices_have_their_99th_percentile_at_one() -> None:
     slices, scale = normalised_slices(stacks_of_two())
     assert np.percentile(slices.masked_value, 99) == pytest.approx(1)
     np.testing.assert_allclose(slices.value * scale, slices_from_stacks(stacks_of_two()).value, rtol=1e-6)
 
 
-def assert_pixels_are_voxels(slices, image, affine, n_masked):
+def assert_pixels_are_voxels(slices: Slices, image: np.ndarray, affine: np.ndarray, n_masked: int) -> None:
     """Every masked pixel of the slices: position and value are those of the voxel it was cut from."""
     world = slices.planes.pixel_world_mm(slices.pixel_index)
     assert len(world) == n_masked
@@ -47,7 +48,7 @@ def assert_pixels_are_voxels(slices, image, affine, n_masked):
 
 
 @pytest.mark.parametrize("name", AXES)
-def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str):
+def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str) -> None:
     image, mask = arrays()
     affine = affine_of(AXES[name])
     stack = load_stack(
@@ -55,7 +56,7 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str):
     )
     kept = mask.sum((0, 1)) >= 12
     slices = slices_from_stacks([stack])
-    stored = nib.load(tmp_path / "a.nii.gz").affine  # float32 in the file
+    stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz").affine  # float32 in the file
     assert_pixels_are_voxels(slices, image, stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
     np.testing.assert_allclose(np.linalg.det(slices.planes.rotation), 1, atol=1e-12)
@@ -64,7 +65,7 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str):
 
 
 @pytest.mark.parametrize("through", [0, 1, 2])
-def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through: int):
+def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through: int) -> None:
     image, mask = arrays()
     order = [0, 1]
     order.insert(through, 2)  # file axis `through` is the third axis of the image
@@ -77,12 +78,12 @@ def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through:
     np.testing.assert_allclose(stack.spacing_mm, [0.8, 0.9, 3.0], rtol=1e-6)
     slices = slices_from_stacks([stack])
     kept = mask.sum((0, 1)) >= 12
-    stored = nib.load(path).affine
+    stored = nib.Nifti1Image.from_filename(path).affine
     assert_pixels_are_voxels(slices, image.transpose(order), stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
 
 
-def test_values_outside_the_mask_may_be_nan(tmp_path: Path):
+def test_values_outside_the_mask_may_be_nan(tmp_path: Path) -> None:
     image, mask = arrays()
     image[~mask] = np.nan
     stack = Stack(image=image, mask=mask, affine=affine_of(AXES["RAS"]), thickness_mm=3.0)
@@ -90,7 +91,7 @@ def test_values_outside_the_mask_may_be_nan(tmp_path: Path):
     assert np.isfinite(slices_from_stacks([stack]).value).all()
 
 
-def test_slices_with_hardly_a_pixel_are_left_out():
+def test_slices_with_hardly_a_pixel_are_left_out() -> None:
     image, mask = arrays()
     mask[:, :, 2] = False
     mask[5:8, 5:8, 2] = True
@@ -103,6 +104,6 @@ def test_slices_with_hardly_a_pixel_are_left_out():
         slices_from_stacks([lonely])
 
 
-def test_no_stack_is_refused():
+def test_no_stack_is_refused() -> None:
     with pytest.raises(InputError, match="no stack"):
         slices_from_stacks([])

@@ -1,6 +1,7 @@
 """Stacks from files: axes, thickness, masks, and every refusal."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, write
 
 
-def test_four_dimensions_with_one_frame(tmp_path: Path):
+def test_four_dimensions_with_one_frame(tmp_path: Path) -> None:
     image, mask = arrays()
     path = write(tmp_path / "a.nii.gz", image[..., None], affine_of(AXES["RAS"]))
     mask_path = write(tmp_path / "m.nii.gz", mask[..., None].astype(np.uint8), affine_of(AXES["RAS"]))
@@ -20,7 +21,7 @@ def test_four_dimensions_with_one_frame(tmp_path: Path):
     np.testing.assert_array_equal(stack.mask, mask)
 
 
-def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image, mask = arrays()
     path = write(tmp_path / "a.nii.gz", image, affine_of(AXES["RAS"]))
     mask_path = write(tmp_path / "m.nii.gz", mask.astype(np.uint8), affine_of(AXES["RAS"]))
@@ -35,14 +36,16 @@ def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.
     assert normal_sigma == pytest.approx(2.2 / 2.3548, rel=1e-4)
 
 
-def test_without_a_mask_positive_voxels_count_and_a_line_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_without_a_mask_positive_voxels_count_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     image, mask = arrays()
     stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])))
     np.testing.assert_array_equal(stack.mask, mask)
     assert "no mask" in caplog.text
 
 
-def test_a_stack_without_a_positive_value_and_without_mask_is_refused(tmp_path: Path):
+def test_a_stack_without_a_positive_value_and_without_mask_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no positive value"):
         load_stack(write(tmp_path / "a.nii.gz", -arrays()[0], affine_of(AXES["RAS"])))
 
@@ -69,9 +72,15 @@ SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))
         ({"image": np.full((14, 11, 6), 7, np.float32)}, "every value inside the mask is 7"),
     ],
 )
-def test_unusable_stacks_are_refused(change, message):
+def test_unusable_stacks_are_refused(change: dict[str, Any], message: str) -> None:
     image, mask = arrays()
-    good = {"image": image, "mask": mask, "affine": affine_of(AXES["RAS"]), "thickness_mm": 3.0, "name": "a.nii"}
+    good: dict[str, Any] = {
+        "image": image,
+        "mask": mask,
+        "affine": affine_of(AXES["RAS"]),
+        "thickness_mm": 3.0,
+        "name": "a.nii",
+    }
     Stack(**good)
     with pytest.raises(InputError, match=message) as caught:
         Stack(**(good | change))

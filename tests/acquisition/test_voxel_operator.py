@@ -31,7 +31,7 @@ def random_planes(seed: int, n: int = 6, spread_mm: float = 6.0, thickness_mm: f
 
 @pytest.mark.parametrize("points", [(1, 1, 1), (1, 1, 5), (3, 3, 7)])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]):
+def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(seed)
     planes = random_planes(seed)
     index = np.flatnonzero(rng.random(planes.n_pixels) < 0.7)
@@ -42,8 +42,8 @@ def test_the_adjoint_is_exact(seed: int, points: tuple[int, int, int]):
     assert np.abs(image @ pixels - (volume * back).sum()) <= 1e-12 * np.linalg.norm(image) * np.linalg.norm(pixels)
 
 
-def test_the_adjoint_is_exact_with_several_buffers():
-    n_threads = numba.config.NUMBA_NUM_THREADS
+def test_the_adjoint_is_exact_with_several_buffers() -> None:
+    n_threads = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     if n_threads < 2:
         pytest.skip("one thread only")
     rng = np.random.default_rng(3)
@@ -62,7 +62,7 @@ def test_the_adjoint_is_exact_with_several_buffers():
 
 
 @pytest.mark.parametrize("points", [(1, 1, 1), (1, 1, 5), (3, 3, 5)])
-def test_a_ramp_is_reproduced(points: tuple[int, int, int]):
+def test_a_ramp_is_reproduced(points: tuple[int, int, int]) -> None:
     """Trilinear reading and symmetric nodes are exact for a linear volume, whatever the PSF."""
     grid = VolumeGrid((60, 60, 60), np.array(GRID.affine))
     slope, height = np.array([0.3, -1.2, 0.7]), 5.0
@@ -74,7 +74,7 @@ def test_a_ramp_is_reproduced(points: tuple[int, int, int]):
     np.testing.assert_allclose(pixels, planes.pixel_world_mm() @ slope + height, rtol=0, atol=1e-11)
 
 
-def test_a_gaussian_through_the_psf_has_its_closed_form():
+def test_a_gaussian_through_the_psf_has_its_closed_form() -> None:
     grid = VolumeGrid.isotropic([-13] * 3, [13] * 3, 0.3)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
     mean, sigma = np.array([0.4, -0.7, 0.2]), 2.5
@@ -98,7 +98,7 @@ def test_a_gaussian_through_the_psf_has_its_closed_form():
     assert np.abs(pixels - np.concatenate(expected)).max() < 0.005
 
 
-def test_planes_of_the_grid_read_its_voxels():
+def test_planes_of_the_grid_read_its_voxels() -> None:
     volume = np.random.default_rng(6).normal(size=GRID.shape)
     grid = VolumeGrid(GRID.shape, np.diag([1.1, 1.3, 0.9, 1.0]))
     pixels = VoxelOperator(volume_planes(grid), grid, None, (1, 1, 1)).forward(volume)
@@ -106,14 +106,14 @@ def test_planes_of_the_grid_read_its_voxels():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_dtype_is_kept(dtype):
+def test_dtype_is_kept(dtype: type[np.floating]) -> None:
     planes = random_planes(7)
     operator = VoxelOperator(planes, GRID)
     assert operator.forward(np.ones(GRID.shape, dtype)).dtype == dtype
     assert operator.adjoint(np.ones(planes.n_pixels, dtype)).dtype == dtype
 
 
-def test_move_takes_other_poses():
+def test_move_takes_other_poses() -> None:
     planes, others = random_planes(8), random_planes(9)
     others = planes.with_pose(others.pose)
     volume = np.random.default_rng(8).normal(size=GRID.shape)
@@ -122,7 +122,7 @@ def test_move_takes_other_poses():
     np.testing.assert_array_equal(operator.forward(volume), VoxelOperator(others, GRID).forward(volume))
 
 
-def test_arrays_of_another_size_are_refused():
+def test_arrays_of_another_size_are_refused() -> None:
     operator = VoxelOperator(random_planes(10), GRID)
     with pytest.raises(ValueError, match="volume has shape"):
         operator.forward(np.zeros((3, 3, 3)))
@@ -130,7 +130,7 @@ def test_arrays_of_another_size_are_refused():
         operator.adjoint(np.zeros(3))
 
 
-def test_a_grid_of_one_voxel_and_no_planes():
+def test_a_grid_of_one_voxel_and_no_planes() -> None:
     grid = VolumeGrid((1, 1, 1), np.eye(4))
     planes = random_planes(11)
     operator = VoxelOperator(planes, grid)
@@ -141,7 +141,7 @@ def test_a_grid_of_one_voxel_and_no_planes():
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 7, 15, 31])
-def test_psf_nodes_have_the_moments_of_a_gaussian(n: int):
+def test_psf_nodes_have_the_moments_of_a_gaussian(n: int) -> None:
     nodes, weights = psf_nodes(n)
     assert len(nodes) == len(weights) == n
     assert weights.sum() == pytest.approx(1, abs=1e-14)
@@ -152,7 +152,7 @@ def test_psf_nodes_have_the_moments_of_a_gaussian(n: int):
         assert 2.2 < (weights * nodes**4).sum() < 3.1
 
 
-def test_psf_variance_is_that_of_the_source():
+def test_psf_variance_is_that_of_the_source() -> None:
     """FWHM 1.2 pixels in plane and the thickness through it (Kuklisova-Murgasova 2012)."""
     variance = psf_variance_mm2([[0.8, 1.0]], [3.0])
     np.testing.assert_allclose(np.sqrt(variance) * FWHM_PER_SIGMA, [[0.96, 1.2, 3.0]])

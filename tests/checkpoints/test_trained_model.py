@@ -36,7 +36,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.safetensors" for name in MODELS}
 
 
-def test_round_trip(model: TrainedModel, saved: dict[str, Path]):
+def test_round_trip(model: TrainedModel, saved: dict[str, Path]) -> None:
     path = saved[model.kind]
     loaded = type(model).load(path)
     assert loaded.record() == model.record()
@@ -49,14 +49,14 @@ def test_round_trip(model: TrainedModel, saved: dict[str, Path]):
     assert loaded.file_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_saving_what_was_loaded_writes_the_same(model: TrainedModel, saved: dict[str, Path], tmp_path: Path):
+def test_saving_what_was_loaded_writes_the_same(model: TrainedModel, saved: dict[str, Path], tmp_path: Path) -> None:
     """Whatever the memory format of the loaded weights."""
     type(model).load(saved[model.kind]).save(tmp_path / "twin.safetensors")
     assert (tmp_path / "twin.safetensors").read_bytes() == saved[model.kind].read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["twin.safetensors"]
 
 
-def test_the_prior_s_file_says_all_that_has_to_be_known(saved: dict[str, Path]):
+def test_the_prior_s_file_says_all_that_has_to_be_known(saved: dict[str, Path]) -> None:
     prior, said = Prior.load(saved["prior"]), content_of(saved["prior"])
     assert (prior.network.config.alpha, prior.network.config.beta) == (0.1, 0.9)
     assert (said["network_arguments"]["alpha"], said["network_arguments"]["beta"]) == (0.1, 0.9)
@@ -68,7 +68,7 @@ def test_the_prior_s_file_says_all_that_has_to_be_known(saved: dict[str, Path]):
     torch.testing.assert_close(prior.network(*inputs), small_prior().network(*inputs), rtol=0, atol=0)
 
 
-def test_the_pose_network_s_file_holds_its_template(saved: dict[str, Path]):
+def test_the_pose_network_s_file_holds_its_template(saved: dict[str, Path]) -> None:
     pose, before = PoseModel.load(saved["pose"]), small_pose()
     assert pose.template.weeks.tolist() == [25, 31]
     np.testing.assert_array_equal(pose.template.volume, before.template.volume)
@@ -78,7 +78,7 @@ def test_the_pose_network_s_file_holds_its_template(saved: dict[str, Path]):
 
 
 @pytest.mark.parametrize(("kind", "path"), [(Prior, SHIPPED_PRIOR), (PoseModel, SHIPPED_POSE)])
-def test_the_shipped_weights(kind: type[TrainedModel], path: Path):
+def test_the_shipped_weights(kind: type[TrainedModel], path: Path) -> None:
     """They have kept every value: the checksum is the one that their training's export wrote."""
     shipped = kind.load()
     assert shipped.file_name == path.name
@@ -164,7 +164,7 @@ REFUSALS: dict[str, tuple[str, Callable[[Content], object], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_refusal_of_an_altered_file(name: str, saved: dict[str, Path], tmp_path: Path):
+def test_refusal_of_an_altered_file(name: str, saved: dict[str, Path], tmp_path: Path) -> None:
     kind, alter, says = REFUSALS[name]
     content = content_of(saved[kind])
     alter(content)
@@ -173,13 +173,13 @@ def test_refusal_of_an_altered_file(name: str, saved: dict[str, Path], tmp_path:
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
-def test_refusal_of_a_truncated_file(model: TrainedModel, saved: dict[str, Path], tmp_path: Path, share: float):
+def test_refusal_of_a_truncated_file(model: TrainedModel, saved: dict[str, Path], tmp_path: Path, share: float) -> None:
     whole = saved[model.kind].read_bytes()
     (tmp_path / "part").write_bytes(whole[: int(share * len(whole))])
     assert_refused(type(model), tmp_path / "part", "is damaged or not written by g3r-export")
 
 
-def test_refusal_of_flipped_bits(model: TrainedModel, saved: dict[str, Path], tmp_path: Path):
+def test_refusal_of_flipped_bits(model: TrainedModel, saved: dict[str, Path], tmp_path: Path) -> None:
     """At the end of the file there are weights."""
     content = bytearray(saved[model.kind].read_bytes())
     for position in range(len(content) - 16, len(content)):
@@ -188,19 +188,19 @@ def test_refusal_of_flipped_bits(model: TrainedModel, saved: dict[str, Path], tm
     assert_refused(type(model), tmp_path / "flipped", "checksum|NaN or infinity")
 
 
-def test_a_file_of_torch_save_is_refused_with_the_way_on(model: TrainedModel, tmp_path: Path):
+def test_a_file_of_torch_save_is_refused_with_the_way_on(model: TrainedModel, tmp_path: Path) -> None:
     torch.save({"format": f"g3r-{model.kind}", "weights": {}}, tmp_path / "old.pt")
     assert_refused(type(model), tmp_path / "old.pt", r"export the run's \.ckpt again with g3r-export")
 
 
-def test_a_prior_of_absurd_voxels_is_not_made():
+def test_a_prior_of_absurd_voxels_is_not_made() -> None:
     with pytest.raises(ValueError, match=r"voxel size is 1000\.0 mm"):
         Prior(network=small_prior().network, voxel_mm=1e3, training_data="")
 
 
 def test_a_network_is_built_only_if_the_file_can_fill_it(
     saved: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+) -> None:
     content = content_of(saved["prior"])
     content["network_arguments"] |= {"channels": [4096, 4096], "units": [64, 64]}
     write_content(tmp_path / "wide", content)
@@ -216,7 +216,7 @@ def assert_refused(kind: type[TrainedModel], path: Path, says: str) -> None:
     assert "\n" not in message
 
 
-def test_a_file_that_was_read_already_is_not_opened_again(saved: dict[str, Path], tmp_path: Path):
+def test_a_file_that_was_read_already_is_not_opened_again(saved: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "prior.safetensors"
     path.write_bytes(saved["prior"].read_bytes())
     file = read_weights(path, "prior")

@@ -24,7 +24,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "a.safetensors"
 
 
-def test_round_trip(file: Path):
+def test_round_trip(file: Path) -> None:
     found = read_weights(file, "prior")
     assert found.description == SAID
     tensors = found.tensors()
@@ -36,13 +36,13 @@ def test_round_trip(file: Path):
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
 
-def test_equal_content_is_equal_bytes(file: Path, tmp_path: Path):
+def test_equal_content_is_equal_bytes(file: Path, tmp_path: Path) -> None:
     write_weights(tmp_path / "b.safetensors", SAID, dict(reversed(TENSORS.items())))
     assert (tmp_path / "b.safetensors").read_bytes() == file.read_bytes()
     assert read_weights(tmp_path / "b.safetensors", "prior").sha256 == read_weights(file, "prior").sha256
 
 
-def test_it_is_a_file_that_others_read(file: Path):
+def test_it_is_a_file_that_others_read(file: Path) -> None:
     from safetensors import safe_open
 
     with safe_open(file, "pt") as opened:
@@ -50,7 +50,7 @@ def test_it_is_a_file_that_others_read(file: Path):
         assert torch.equal(opened.get_tensor("a"), TENSORS["a"])
 
 
-def test_a_file_that_cannot_be_written(tmp_path: Path):
+def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         write_weights(tmp_path / "no" / "such" / "folder.safetensors", SAID, TENSORS)
 
@@ -81,7 +81,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("name", LIES)
-def test_a_header_that_lies_is_refused_before_the_file_is_read(name: str, file: Path):
+def test_a_header_that_lies_is_refused_before_the_file_is_read(name: str, file: Path) -> None:
     file.write_bytes(change_header(file.read_bytes(), LIES[name]))
     tracemalloc.start()
     try:
@@ -95,7 +95,7 @@ def test_a_header_that_lies_is_refused_before_the_file_is_read(name: str, file: 
 @pytest.mark.parametrize(
     "offsets", [[0, 24], [8, 32], [4, 28], [-24, 0], [0, 10**30], [24, 0]], ids=lambda offsets: str(offsets)
 )
-def test_offsets_that_overlap_or_leave_gaps(offsets: list[int], file: Path):
+def test_offsets_that_overlap_or_leave_gaps(offsets: list[int], file: Path) -> None:
     """The library finds these when the tensors are decoded."""
     file.write_bytes(change_header(file.read_bytes(), lambda header: header["a"].update(data_offsets=offsets)))
     found = read_weights(file, "prior")
@@ -127,7 +127,7 @@ BYTES = {
 
 
 @pytest.mark.parametrize("name", BYTES)
-def test_files_that_are_none(name: str, file: Path):
+def test_files_that_are_none(name: str, file: Path) -> None:
     content, says = BYTES[name]
     file.write_bytes(content)
     with pytest.raises(InputError) as caught:
@@ -138,14 +138,14 @@ def test_files_that_are_none(name: str, file: Path):
 
 
 @pytest.mark.parametrize("n_bytes", [4, 20, -4])
-def test_a_file_cut_off_or_continued(n_bytes: int, file: Path):
+def test_a_file_cut_off_or_continued(n_bytes: int, file: Path) -> None:
     whole = file.read_bytes()
     file.write_bytes(whole[:-n_bytes] if n_bytes > 0 else whole + bytes(-n_bytes))
     with pytest.raises(InputError, match=r"is damaged .* bytes expected, \d+ found"):
         read_weights(file, "prior")
 
 
-def test_a_sparse_file_of_a_terabyte(file: Path):
+def test_a_sparse_file_of_a_terabyte(file: Path) -> None:
     with file.open("wb") as stream:
         stream.write(with_header(json.dumps({"a": {"dtype": "F32", "shape": [250, 10**9]}}).encode()))
         stream.truncate(10**12)
@@ -154,7 +154,7 @@ def test_a_sparse_file_of_a_terabyte(file: Path):
 
 
 @pytest.mark.parametrize("name", ["missing", "folder", "pipe", "device", "zero byte"])
-def test_what_is_no_file(name: str, tmp_path: Path):
+def test_what_is_no_file(name: str, tmp_path: Path) -> None:
     import os
 
     path = Path("/dev/zero") if name == "device" else tmp_path / ("a\0b" if name == "zero byte" else "bad")

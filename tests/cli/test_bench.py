@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +27,7 @@ MACHINE = {
 }
 
 
-def test_names_its_commands(capsys):
+def test_names_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         bench.main(["--help"])
     said = capsys.readouterr().out
@@ -34,7 +36,7 @@ def test_names_its_commands(capsys):
         bench.main(["nothing"])
 
 
-def test_presets_are_named_once():
+def test_presets_are_named_once() -> None:
     from g3r.planning import PRESET_NAMES
     from g3r.planning.presets import PRESETS
 
@@ -52,7 +54,9 @@ def test_presets_are_named_once():
         ["scaling", "--sizes", "1"],
     ],
 )
-def test_bad_input_is_one_line(words, capsys, tmp_path, monkeypatch):
+def test_bad_input_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert bench.main(words) == 3
     said = capsys.readouterr()
@@ -61,7 +65,7 @@ def test_bad_input_is_one_line(words, capsys, tmp_path, monkeypatch):
     assert not said.out
 
 
-def preset(seconds, psnr):
+def preset(seconds: float, psnr: float) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "cpu_seconds": 2 * seconds,
@@ -75,7 +79,7 @@ def preset(seconds, psnr):
     }
 
 
-def variant(seconds, psnr, *, same=False):
+def variant(seconds: float, psnr: float, *, same: bool = False) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "stages": {"fit to prior": 1.0, "fit to slices": seconds - 1},
@@ -87,7 +91,7 @@ def variant(seconds, psnr, *, same=False):
     }
 
 
-def made_record():
+def made_record() -> dict[str, Any]:
     fit = {"curve": {"step": [1, 2], "seconds_before_end": [2.0, 0.0], "psnr_db": [20.0, 24.0]}}
     presets = {"draft": preset(16.0, 20.0), "balanced": preset(60.0, 24.0), "accurate": preset(200.0, 24.6)}
     case = {
@@ -98,7 +102,7 @@ def made_record():
     return {"machine": MACHINE, "repeats": 3, "base": "balanced", "cases": {"made": case}}
 
 
-def test_trade_tables_and_figure(tmp_path):
+def test_trade_tables_and_figure(tmp_path: Path) -> None:
     text = trade_tables(made_record())
     assert "| made | `draft` | 16.0 (!) | 15 | 4.60 (!) | 4 |" in text
     assert "| made | `balanced` | 60.0 | 75 | 0.60 (!) | 0.5 |" in text
@@ -110,7 +114,7 @@ def test_trade_tables_and_figure(tmp_path):
     assert (tmp_path / "made" / "trade.png").stat().st_size > 10_000
 
 
-def test_scaling_measures_what_grows(tmp_path):
+def test_scaling_measures_what_grows(tmp_path: Path) -> None:
     rows = measured_growth("output voxels", 2)
     assert [row["size"] for row in rows] == [30**3, 38**3]
     assert rows[1]["evaluations"] > 1.5 * rows[0]["evaluations"]
@@ -121,7 +125,7 @@ def test_scaling_measures_what_grows(tmp_path):
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
 
 
-def test_work_is_proportional_to_what_grows():
+def test_work_is_proportional_to_what_grows() -> None:
     from dataclasses import replace
 
     from g3r.bench.scenes import SceneSize, evaluations, made_cloud, made_slices
@@ -139,7 +143,7 @@ def test_work_is_proportional_to_what_grows():
 
 
 @pytest.mark.slow
-def test_trade_from_end_to_end(tmp_path, capsys):
+def test_trade_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--phantom", "20", "--resolution", "1.5", "--thickness", "4", "--seed", "61009"]
     assert simulate.main([*words, "--output", str(tmp_path / "case")]) == 0
     page = tmp_path / "page.md"

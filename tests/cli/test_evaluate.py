@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from g3r.cli.evaluate import main
 
 
 @pytest.fixture
-def files(tmp_path, rng):
+def files(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A noisy volume, its truth and mask."""
     axes = np.meshgrid(*(np.linspace(-1, 1, n) for n in (24, 28, 22)), indexing="ij")
-    mask = sum(a**2 for a in axes) < 0.7
+    mask = np.asarray(sum(a**2 for a in axes) < 0.7)
     truth = np.where(mask, 500 + 200 * np.sin(4 * axes[0] + 3 * axes[1] * axes[2]), 0)
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
     affine[:3, 3] = (-24, -28, -22)
@@ -31,12 +32,12 @@ def files(tmp_path, rng):
     return tmp_path
 
 
-def options(folder, **changes):
+def options(folder: Path, **changes: str) -> list[str]:
     names = {"volume": "volume.nii.gz", "reference": "truth.nii.gz", "mask": "mask.nii.gz"} | changes
     return [part for name, file in names.items() for part in (f"--{name}", str(folder / file))]
 
 
-def test_scores_as_a_process(files):
+def test_scores_as_a_process(files: Path) -> None:
     arguments = options(files, json="scores.json", sections="picture.png")
     command = [sys.executable, "-m", "g3r.cli.evaluate", *arguments]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -49,12 +50,12 @@ def test_scores_as_a_process(files):
     assert {p.name for p in files.iterdir() if p.name.startswith(".")} == set()
 
 
-def test_alignment_is_reported(files, capsys):
+def test_alignment_is_reported(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*options(files), "--align"]) == 0
     assert "aligned: 0." in capsys.readouterr().out
 
 
-def test_pose_error_is_reported(files, capsys):
+def test_pose_error_is_reported(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = "".join(f"0\t{k}\t0\t0\t0\t0\t0\t0\n" for k in range(22))
     (files / "poses.tsv").write_text("stack\tslice\trx\try\trz\ttx\tty\ttz\n" + rows)
     (files / "mask-0.nii.gz").write_bytes((files / "mask.nii.gz").read_bytes())
@@ -75,14 +76,16 @@ def test_pose_error_is_reported(files, capsys):
         ({"poses": "nowhere.tsv", "slices": "nowhere.tsv"}, "no such file"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_3(files, capsys, changes, message):
+def test_bad_input_is_one_line_and_exit_code_3(
+    files: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], message: str
+) -> None:
     assert main(options(files, **changes)) == 3
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_usage_errors(files):
+def test_usage_errors(files: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["--volume", "a.nii.gz"])
     assert stop.value.code == 2

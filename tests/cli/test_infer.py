@@ -62,13 +62,13 @@ def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-def test_every_output_is_there_and_nothing_else(reconstructed: Path):
+def test_every_output_is_there_and_nothing_else(reconstructed: Path) -> None:
     assert {path.name for path in reconstructed.iterdir()} == OUTPUTS == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
     assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
 
 
-def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path):
-    volume, mask = (nib.load(reconstructed / f"{name}.nii.gz") for name in ("volume", "mask"))
+def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path) -> None:
+    volume, mask = (nib.Nifti1Image.from_filename(reconstructed / f"{name}.nii.gz") for name in ("volume", "mask"))
     np.testing.assert_allclose(volume.header.get_zooms(), 1.5, rtol=1e-6)
     np.testing.assert_allclose(volume.affine, mask.affine)
     data, inside = np.asarray(volume.dataobj), np.asarray(mask.dataobj) > 0
@@ -89,7 +89,7 @@ def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path):
     assert 2 < np.median(maps[2].data[maps[2].data > 0.5]) < 4  # three gapless stacks
 
 
-def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, reconstructed: Path):
+def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, reconstructed: Path) -> None:
     with (reconstructed / "slices.tsv").open() as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
     assert tuple(rows[0]) == SLICE_COLUMNS
@@ -97,7 +97,7 @@ def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, recon
         ["stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason"]
     )
     keys = [(int(row["stack"]), int(row["slice"])) for row in rows]
-    masks = [np.asarray(nib.load(path).dataobj) > 0 for path in files(subject, "mask")]
+    masks = [np.asarray(nib.Nifti1Image.from_filename(path).dataobj) > 0 for path in files(subject, "mask")]
     assert keys == [(s, k) for s, m in enumerate(masks) for k in np.flatnonzero(m.sum((0, 1)) >= 12)]
     for row in rows:
         assert 0 < float(row["weight"]) <= 1
@@ -111,7 +111,7 @@ def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, recon
     assert error.median_mm < 1.5
 
 
-def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
+def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path) -> None:
     text = (reconstructed / "run.json").read_text()
     record = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     for path in (subject, reconstructed, Path.home(), Path(sys.prefix)):
@@ -132,13 +132,13 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path):
         assert 1 <= stack["n_segments"] <= stack["n_slices"]
 
 
-def test_the_picture_is_a_picture(reconstructed: Path):
+def test_the_picture_is_a_picture(reconstructed: Path) -> None:
     from matplotlib.image import imread
 
     assert imread(reconstructed / "sections.png").std() > 0.05
 
 
-def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: Path, tmp_path: Path):
+def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: Path, tmp_path: Path) -> None:
     (tmp_path / "volume.nii.gz").write_text("mine")
     (tmp_path / "notes.txt").write_text("mine too")
     refused = run("infer", *inputs(subject), *QUICK, "--output", tmp_path)
@@ -154,7 +154,7 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
     )
 
 
-def test_from_python_in_three_lines(subject: Path, tmp_path: Path):
+def test_from_python_in_three_lines(subject: Path, tmp_path: Path) -> None:
     stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     result = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
     result.save(tmp_path / "out")
@@ -174,7 +174,7 @@ def quick_settings() -> ReconstructionSettings:
     )
 
 
-def test_one_registration_serves_several_fits(subject: Path):
+def test_one_registration_serves_several_fits(subject: Path) -> None:
     stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     reconstructor = GaussianReconstructor(settings=quick_settings())
     motion = reconstructor.register_stacks(stacks)
@@ -186,7 +186,7 @@ def test_one_registration_serves_several_fits(subject: Path):
 
 
 @pytest.mark.parametrize("power", [-20, 20])
-def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int):
+def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int) -> None:
     """A power of two (about 1e-6 and 1e6) rounds nothing: no constant may have a hidden unit."""
     stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     plain = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
@@ -199,7 +199,7 @@ def test_intensities_scale_the_volume_and_nothing_else(subject: Path, power: int
 
 
 @pytest.mark.parametrize("standard", [False, True])
-def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path, standard: bool):
+def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path, standard: bool) -> None:
     """All slices stay in line; as a whole they are turned only where the standard orientation is wanted."""
     stack = load_stack(files(subject, "stack")[0], files(subject, "mask")[0], 4.0)
     settings = quick_settings()
@@ -210,29 +210,36 @@ def test_a_single_still_stack_keeps_its_header_poses_and_says_why(subject: Path,
     relative = motion.take([0]).inverse() @ motion if standard else motion
     np.testing.assert_allclose(relative.translation_mm, 0, atol=1e-6)
     np.testing.assert_allclose(relative.rotvec_rad(), 0, atol=1e-7)
+    assert result.record.registration is not None
     assert result.record.registration.space == ("standard" if standard else "scanner")
-    assert result.record.stacks[0].quality.held_out_correlation is None
+    quality = result.record.stacks[0].quality
+    assert quality is not None
+    assert quality.held_out_correlation is None
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].std() > 0
 
 
-def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Path):
+def test_a_stack_without_usable_slices_is_named_and_the_others_go_on(subject: Path) -> None:
     stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     few = np.zeros_like(stacks[0].mask)
     few[20:23, 20:23, 5] = True
     settings = quick_settings()
-    motion = replace(settings.registration, template=False, network=False, stacks=False, segments=False, n_rounds=1)
-    settings = replace(settings, resolution_mm=2.5, motion=motion)
+    registration = replace(
+        settings.registration, template=False, network=False, stacks=False, segments=False, n_rounds=1
+    )
+    settings = replace(settings, resolution_mm=2.5, registration=registration)
     result = GaussianReconstructor(settings=settings).reconstruct([replace(stacks[0], mask=few), stacks[1], stacks[2]])
     record = result.record
     assert [one.n_slices > 0 for one in record.stacks] == [False, True, True]
     assert record.stacks[0].interleave is None
-    assert record.stacks[0].quality.reliable is False
+    quality = record.stacks[0].quality
+    assert quality is not None
+    assert quality.reliable is False
     assert record.stacks[2].n_segments == 1
     assert any(stacks[0].name in line for line in record.warnings)
 
 
-def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):
+def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path) -> None:
     done = run("infer", *inputs(subject), *QUICK, "--output", tmp_path / "out", "--dry-run")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("thickness 4 mm") == 3
@@ -240,7 +247,7 @@ def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path):
 
 
 @pytest.mark.skipif(not SHIPPED_PRIOR.exists(), reason="the shipped weights are not there yet")
-def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path):
+def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path) -> None:
     quick = [option for option in QUICK if option != "--no-prior"]
     done = run("infer", *inputs(subject), *quick, "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
@@ -264,7 +271,7 @@ def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path):
 def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], str]:
     """Arguments that must be refused, and the name that the message must hold."""
     stacks, masks = files(subject, "stack"), files(subject, "mask")
-    image = nib.load(stacks[0])
+    image = nib.Nifti1Image.from_filename(stacks[0])
     data, bad = np.asarray(image.dataobj), folder / "bad.nii.gz"
     options: list[object] = ["--no-prior", "--thickness", "4", "--output", folder / "out"]
     if kind == "missing file":
@@ -300,7 +307,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
 
 def _like(path: Path, image_path: Path) -> Path:
     """An empty mask on the grid of an image."""
-    image = nib.load(image_path)
+    image = nib.Nifti1Image.from_filename(image_path)
     nib.save(nib.Nifti1Image(np.zeros(image.shape, np.uint8), image.affine), path)
     return path
 
@@ -322,7 +329,7 @@ def _like(path: Path, image_path: Path) -> Path:
         "resolution",
     ],
 )
-def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path):
+def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: Path, tmp_path: Path) -> None:
     arguments, name = bad_command(kind, subject, tmp_path)
     before = {path.name for path in tmp_path.iterdir()}
     done = run("infer", *arguments)
@@ -352,7 +359,7 @@ def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: P
         ["--stacks", "a.nii.gz", "--output", "o", "--resolution", "fine"],
     ],
 )
-def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     from g3r.cli.infer import main
 
     with pytest.raises(SystemExit) as caught:
@@ -361,18 +368,18 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
     assert "usage: g3r-infer" in capsys.readouterr().err
 
 
-def test_a_missing_checkpoint_is_refused(tmp_path: Path):
+def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent\.pt"):
         GaussianReconstructor(tmp_path / "absent.pt")
 
 
 @pytest.mark.parametrize("settings", ["best", replace(PRESETS["draft"], resolution_mm=5.0, use_prior=False)])
-def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str):
+def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str) -> None:
     with pytest.raises(InputError, match="expected"):
         GaussianReconstructor(settings=settings)
 
 
-def test_a_usage_error_as_a_process():
+def test_a_usage_error_as_a_process() -> None:
     done = run("infer", "--stacks")
     assert done.returncode == 2
     assert done.stderr.startswith("usage: g3r-infer")

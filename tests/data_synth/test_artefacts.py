@@ -60,7 +60,7 @@ def test_motion_rings_within_the_slice(stacks: list[SimulatedStack], monkeypatch
     still = stacks[0].stack
     corner = still.image[:4].mean()  # noise
     k = int(still.mask.sum((0, 1)).argmax())
-    columns = still.mask[:, :, k].any(1)
+    columns = np.asarray(still.mask[:, :, k].any(1))
     outside = ~still.mask[:, :, k] & columns[:, None]
     assert still.image[:, :, k][outside].mean() < 3 * corner
     assert moved.image[:, :, k][outside].mean() > 1.3 * still.image[:, :, k][outside].mean()

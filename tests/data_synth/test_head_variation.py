@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
 
+from data_synth.atlas import TruthVolume
+
 pytest.importorskip("torchio")
 
 from data_synth.head_variation import recurved, varied_head
 from g3r.geometry import VolumeGrid
 
 
-def test_still_in_the_atlas_frame(centred_head, rng):
+def test_still_in_the_atlas_frame(centred_head: TruthVolume, rng: np.random.Generator) -> None:
     varied = varied_head(centred_head, rng)
     grid = VolumeGrid(varied.data.shape, varied.affine)
     np.testing.assert_allclose(grid.world(center_of_mass(varied.mask)), 0, atol=1e-6)
@@ -18,7 +20,7 @@ def test_still_in_the_atlas_frame(centred_head, rng):
     assert varied.data.min() >= 0
 
 
-def test_bent_by_millimetres_not_more(centred_head, rng):
+def test_bent_by_millimetres_not_more(centred_head: TruthVolume, rng: np.random.Generator) -> None:
     overlaps = []
     for _ in range(5):
         varied = varied_head(centred_head, rng)
@@ -28,7 +30,7 @@ def test_bent_by_millimetres_not_more(centred_head, rng):
     assert 0.85 < np.mean(overlaps) < 0.98
 
 
-def test_intensities_follow_a_curve(centred_head, rng):
+def test_intensities_follow_a_curve(centred_head: TruthVolume, rng: np.random.Generator) -> None:
     """Equal intensities stay equal."""
     varied = recurved(centred_head, rng)
     order = np.argsort(centred_head.data[centred_head.mask])

@@ -16,6 +16,7 @@ def test_ventricles_grow_and_the_head_does_not(head: TruthVolume) -> None:
     sizes = []
     for translation_mm in (0.0, 2.0, 4.0):
         grown = enlarged_ventricles(head, translation_mm)
+        assert grown.ventricles is not None
         sizes.append(grown.ventricles.sum() / before)
         np.testing.assert_array_equal(grown.mask, head.mask)
         assert np.isfinite(grown.data).all()

@@ -101,7 +101,8 @@ def test_impossible_requests(weeks: float, spacing_mm: float) -> None:
 
 
 class TestShapes:
-    grid = tuple(np.meshgrid(*[np.arange(-10, 11, dtype=np.float32)] * 3, indexing="ij", sparse=True))
+    axis = np.arange(-10, 11, dtype=np.float32)
+    grid = (axis[:, None, None], axis[None, :, None], axis[None, None, :])
 
     def test_sphere_is_exact(self) -> None:
         x, y, z = self.grid
@@ -114,10 +115,10 @@ class TestShapes:
         np.testing.assert_allclose(distance[20, 10, 10], 1 - 5, atol=1e-5)
 
     def test_union_and_coverage(self) -> None:
-        a, b = np.float32([1.0, -1.0, -3.0]), np.float32([-1.0, -1.0, 2.0])
+        a, b = np.array([1.0, -1.0, -3.0], np.float32), np.array([-1.0, -1.0, 2.0], np.float32)
         np.testing.assert_allclose(union(a, b), [1, -1, 2])
         assert (union(a, b, 1.0) >= np.maximum(a, b)).all()
-        np.testing.assert_allclose(coverage(np.float32([-5, 0, 0.25, 5]), 1.0), [0, 0.5, 0.75, 1])
+        np.testing.assert_allclose(coverage(np.array([-5, 0, 0.25, 5], np.float32), 1.0), [0, 0.5, 0.75, 1])
 
     def test_noise_has_unit_variance(self) -> None:
         noise = smooth_noise((60, 60, 60), 4.0, 1.0, np.random.default_rng(0))

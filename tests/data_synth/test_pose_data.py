@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from data_synth.atlas import TruthVolume
+
 pytest.importorskip("lightning")
 pytest.importorskip("torchio")
 
@@ -10,7 +12,7 @@ from data_synth.heads import PhantomSubject
 from data_synth.pose_data import SliceSetDataModule, SliceSets
 
 
-def test_items_are_functions_of_seed_and_number():
+def test_items_are_functions_of_seed_and_number() -> None:
     subjects = [PhantomSubject("a", 28.0, 3)]
     first, second = (SliceSets(subjects, length=4, seed=7, max_slices=12, pixel_mm=3.0, size=40) for _ in range(2))
     np.testing.assert_array_equal(first[5].images.image, second[5].images.image)
@@ -19,10 +21,11 @@ def test_items_are_functions_of_seed_and_number():
     )
 
 
-def test_batches(centred_head):
+def test_batches(centred_head: TruthVolume) -> None:
     data = SliceSetDataModule(source="phantom", sets_per_epoch=3, batch_size=3, max_slices=12, val_sets=6)
     data.setup()
     for sets in (data.train_set, data.val_set):
+        assert sets is not None
         sets._volumes = dict.fromkeys(range(len(sets.subjects)), centred_head)
     batch = next(iter(data.train_dataloader()))
     n = len(batch["image"])

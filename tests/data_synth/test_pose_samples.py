@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from data_synth import stack_planning
+from data_synth.atlas import TruthVolume
 from data_synth.motion import LEVELS
 from data_synth.pose_samples import draw_slice_set
 from data_synth.simulator import StackSettings, simulate_stacks
@@ -15,11 +16,11 @@ from g3r.geometry import RigidPose, VolumeGrid
 
 
 @pytest.fixture(scope="module")
-def sampled(centred_head):
+def sampled(centred_head: TruthVolume) -> Head:
     return Head.from_volume(centred_head)
 
 
-def shown_at(sampled, pose, size, pixel_mm):
+def shown_at(sampled: Head, pose: RigidPose, size: int, pixel_mm: float) -> np.ndarray:
     """The truth at the pixels' centres, by another interpolation."""
     at = (np.arange(size) - (size - 1) / 2) * pixel_mm
     points = np.stack([*np.meshgrid(at, at, indexing="ij"), np.zeros((size, size))], -1)
@@ -28,7 +29,7 @@ def shown_at(sampled, pose, size, pixel_mm):
     return map_coordinates(sampled.data, np.moveaxis(index, -1, 0), order=1)
 
 
-def test_images_show_the_truth_at_their_poses(sampled, rng):
+def test_images_show_the_truth_at_their_poses(sampled: Head, rng: np.random.Generator) -> None:
     one = draw_slice_set(sampled, rng, max_slices=30, vary=False)
     image = one.images.image
     assert 5 <= len(image) <= 30
@@ -38,7 +39,9 @@ def test_images_show_the_truth_at_their_poses(sampled, rng):
     assert np.corrcoef(image.ravel(), shown_at(sampled, wrong, 40, 3.0).ravel())[0, 1] < 0.93
 
 
-def test_stacks_are_centred_by_their_headers(sampled, rng, monkeypatch):
+def test_stacks_are_centred_by_their_headers(
+    sampled: Head, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without motion the mean of a stack's masks, in its own axes, lies in the middle of its images."""
     monkeypatch.setattr(stack_planning, "LEVEL_SHARE", {"none": 1.0})
     monkeypatch.setattr(stack_planning, "TIMED_SHARE", 0.0)
@@ -52,7 +55,7 @@ def test_stacks_are_centred_by_their_headers(sampled, rng, monkeypatch):
         assert abs(np.average(one.position_mm[rows], weights=one.area_mm2[rows])) < 0.5
 
 
-def test_the_same_images_as_at_inference(centred_head, sampled, rng):
+def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled: Head, rng: np.random.Generator) -> None:
     """Stacks of the full simulator, read as at inference, look like the fast synthesis at the same poses."""
     settings = [
         StackSettings(orientation=name, resolution_mm=1.0, thickness_mm=3.0, motion=LEVELS["mild"])
@@ -64,13 +67,13 @@ def test_the_same_images_as_at_inference(centred_head, sampled, rng):
     motion = [stacks[s].true_pose.take([k]) for s, k in zip(slices.stack_id, slices.slice_index, strict=True)]
     moved = RigidPose(np.concatenate([m.rotation for m in motion]), np.concatenate([m.translation_mm for m in motion]))
     pose = moved @ slices.header_pose @ images.frame_in_slice
-    fast, _ = sample_slices(sampled, np.linalg.inv(sampled.affine), pose, images.thickness_mm, 3.0, 40)
+    fast, _ = sample_slices(sampled, np.linalg.inv(sampled.affine).astype(float), pose, images.thickness_mm, 3.0, 40)
     for image, other in zip(images.image, fast, strict=True):
         if (other > 0).sum() > 60:
             assert np.corrcoef(image.ravel(), other.ravel())[0, 1] > 0.95
 
 
-def test_a_set_varies_and_is_finite(sampled):
+def test_a_set_varies_and_is_finite(sampled: Head) -> None:
     sets = [draw_slice_set(sampled, np.random.default_rng(seed), max_slices=24) for seed in range(12)]
     assert len({int(one.images.stack_id.max()) for one in sets}) >= 3
     known = [np.isfinite(one.images.time_rank).all() for one in sets]

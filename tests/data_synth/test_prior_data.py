@@ -1,6 +1,7 @@
 """Training data of the prior network: batches, epochs, settings."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from data_synth.prior_data import StackSynthesisDataModule
 from data_synth.prior_samples import IMAGE_KEYS
 from g3r.errors import InputError
 
-TINY = {
+TINY: dict[str, Any] = {
     "spacing_mm": 2.0,
     "patch_size": 24,
     "patches_per_subject": 4,
@@ -68,11 +69,14 @@ def test_what_remains_of_an_epoch_is_left_out() -> None:
 def test_training_on_a_folder(atlas: Path) -> None:
     data = StackSynthesisDataModule(source=str(atlas), include=["a/*"], val_include=["b/*"], **TINY)
     data.setup()
+    assert data.train_set is not None
+    assert data.val_set is not None
     assert [s.name for s in data.train_set.subjects] == ["a/week24", "a/week30"]
     assert [s.name for s in data.val_set.subjects] == ["b/sub-27"]
     assert len(next(iter(data.val_dataloader()))) == len(IMAGE_KEYS) + 1
     mixed = StackSynthesisDataModule(source=str(atlas), val_include=["week24"], phantom_share=0.5, **TINY)
     mixed.setup()
+    assert mixed.train_set is not None
     assert len(mixed.train_set.subjects) == 4
 
 

@@ -1,6 +1,7 @@
 """Training subjects of the prior network: values, and that every one can be made again."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,15 @@ from data_synth.prior_samples import IMAGE_KEYS, SyntheticSubjects, patch_corner
 SPACING_MM = 2.0
 
 
-def make_dataset(**options: object) -> SyntheticSubjects:
+def make_dataset(**options: Any) -> SyntheticSubjects:
     subjects = [PhantomSubject("young", 23.0, 1), PhantomSubject("old", 33.0, 2)]
-    defaults = {"spacing_mm": SPACING_MM, "length": 4, "seed": 7, "patch_size": 30, "artefact_share": 0.1}
+    defaults: dict[str, Any] = {
+        "spacing_mm": SPACING_MM,
+        "length": 4,
+        "seed": 7,
+        "patch_size": 30,
+        "artefact_share": 0.1,
+    }
     return SyntheticSubjects(subjects, **{**defaults, **options})
 
 
@@ -87,12 +94,14 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(kept.mask, fresh.mask)
         assert (kept.name, kept.n_stacks, kept.residual) == (fresh.name, fresh.n_stacks, fresh.residual)
     # another spec does not take this one's files, and a damaged file is made again
-    assert dataset(tmp_path, seed=8).cache.load(0, 1) is None
+    cache = dataset(tmp_path, seed=8).cache
+    assert cache is not None
+    assert cache.load(0, 1) is None
     files[0].write_bytes(files[0].read_bytes()[:1000])
     np.testing.assert_array_equal(dataset(tmp_path).sample(0, 1).coarse, fresh.coarse)
     # patches of one subject differ from epoch to epoch
-    first, later = (dataset(tmp_path)[2 * epoch + 1]["truth"] for epoch in (0, 1))
-    assert not torch.equal(first, later)
+    earlier, later = (dataset(tmp_path)[2 * epoch + 1]["truth"] for epoch in (0, 1))
+    assert not torch.equal(earlier, later)
 
 
 def test_a_real_atlas(shared_data: Path) -> None:

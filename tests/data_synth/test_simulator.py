@@ -1,6 +1,7 @@
 """Slices against volumes whose slices are known in closed form, and poses against sampling."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def deep(one: SimulatedStack, radius_mm: float = 15.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("profile", ["box", "gaussian"])
-def test_a_ramp_is_seen_as_it_is(profile: str) -> None:
+def test_a_ramp_is_seen_as_it_is(profile: Literal["box", "gaussian"]) -> None:
     # any symmetric profile of unit integral leaves a linear function unchanged
     slope = np.array([3.0, -2.0, 5.0])
     volume = (500 + (WORLD - GRID.center_mm) @ slope).astype(np.float32)
@@ -55,7 +56,9 @@ def test_a_ramp_is_seen_as_it_is(profile: str) -> None:
 
 @pytest.mark.parametrize("profile", ["box", "gaussian"])
 @pytest.mark.parametrize("thickness_mm", [2.2, 4.0])
-def test_a_blob_keeps_its_integral_and_widens_by_the_profile(profile: str, thickness_mm: float) -> None:
+def test_a_blob_keeps_its_integral_and_widens_by_the_profile(
+    profile: Literal["box", "gaussian"], thickness_mm: float
+) -> None:
     sigma_mm = 4.5
     offset = WORLD - GRID.center_mm
     volume = (1000 * np.exp(-0.5 * (offset**2).sum(-1) / sigma_mm**2)).astype(np.float32)
@@ -118,10 +121,10 @@ def test_orientations_and_handedness() -> None:
 
 def test_generator_decides_everything() -> None:
     def make(seed: int, n: int = 2) -> list[SimulatedStack]:
-        state = np.random.get_state()[1].copy()  # noqa: NPY002 - the global state must stay untouched
+        state = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002 - the global state must stay untouched
         settings = orthogonal_settings(n, "severe")
         stacks = simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(seed))
-        np.testing.assert_array_equal(state, np.random.get_state()[1])  # noqa: NPY002
+        np.testing.assert_array_equal(state, np.random.get_state(legacy=False)["state"]["key"])  # noqa: NPY002
         return stacks
 
     first, again, other = make(5), make(5, 3), make(6)

@@ -1,5 +1,7 @@
 """Motion in time: recorded, and modelled."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from g3r.errors import InputError
 from g3r.geometry import RigidPose
 
 
-def test_recorded_trajectories(tmp_path, rng):
+def test_recorded_trajectories(tmp_path: Path, rng: np.random.Generator) -> None:
     angle, shift = rng.normal(0, 0.1, (30, 3)), rng.normal(0, 2, (30, 3))
     np.savez(tmp_path / "t.npz", rot_0=angle, trans_0=shift)
     (recorded,) = load_trajectories(tmp_path / "t.npz")
@@ -19,7 +21,7 @@ def test_recorded_trajectories(tmp_path, rng):
     assert any(np.allclose(steps, np.diff(shift[k : k + 20], axis=0)) for k in range(11))
 
 
-def test_the_model_has_quiet_steps_and_jerks(rng):
+def test_the_model_has_quiet_steps_and_jerks(rng: np.random.Generator) -> None:
     steps = []
     for _ in range(60):
         walk = modelled_trajectory(100, rng)
@@ -31,7 +33,7 @@ def test_the_model_has_quiet_steps_and_jerks(rng):
 
 
 @pytest.mark.parametrize("content", ["nothing", "not an npz", "no pair"])
-def test_damaged_trajectories(tmp_path, content):
+def test_damaged_trajectories(tmp_path: Path, content: str) -> None:
     path = tmp_path / "t.npz"
     if content == "not an npz":
         path.write_text("hello")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -13,9 +15,11 @@ from g3r.evaluation.compare import compare
 from g3r.geometry import RigidPose, VolumeGrid
 
 GRID = VolumeGrid.isotropic((-40, -48, -36), (40, 48, 36), 2.0)
+SHEAR = np.eye(4)
+SHEAR[0, 1] = 0.2
 
 
-def brain(points_mm):
+def brain(points_mm: np.ndarray) -> np.ndarray:
     """An uneven ellipsoid with inner structure, defined at any world point [..., 3]."""
     x, y, z = np.moveaxis(points_mm, -1, 0)
     inside = 1 / (1 + np.exp(2.0 * (np.sqrt((x / 28) ** 2 + (y / 36) ** 2 + (z / 24) ** 2) - 1) * 12))
@@ -24,7 +28,7 @@ def brain(points_mm):
     return (inside * (texture + bump)).astype(np.float32)
 
 
-def on_grid(grid, pose=None):
+def on_grid(grid: VolumeGrid, pose: RigidPose | None = None) -> tuple[Volume, np.ndarray]:
     """The brain sampled on a grid after a motion; mask of the brain."""
     points = grid.world(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1))
     points = points if pose is None else pose.inverse().apply(points[None])[0]
@@ -32,14 +36,14 @@ def on_grid(grid, pose=None):
     return Volume(data, grid.affine, "phantom"), data > 100
 
 
-def pose_deg(rotation, translation_mm):
+def pose_deg(rotation: Sequence[float], translation_mm: Sequence[float]) -> RigidPose:
     return RigidPose.from_rotvec(np.deg2rad([rotation]), [translation_mm])
 
 
 @pytest.mark.parametrize(
     ("rotation_deg", "translation_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
 )
-def test_a_known_motion_is_found(rotation_deg, translation_mm):
+def test_a_known_motion_is_found(rotation_deg: tuple[int, int, int], translation_mm: tuple[int, int, int]) -> None:
     reference, mask = on_grid(GRID)
     pose = pose_deg(rotation_deg, translation_mm)
     moved, _ = on_grid(VolumeGrid.isotropic((-52, -60, -50), (56, 60, 48), 1.7), pose)
@@ -51,7 +55,7 @@ def test_a_known_motion_is_found(rotation_deg, translation_mm):
     assert found.rotation_deg == pytest.approx(np.linalg.norm(rotation_deg), abs=0.3)
 
 
-def test_same_input_same_result():
+def test_same_input_same_result() -> None:
     reference, mask = on_grid(GRID)
     moved, _ = on_grid(GRID, pose_deg((5, 2, -3), (2, 1, -2)))
     first, second = (align_rigid(moved, reference, mask).volume_from_reference for _ in range(2))
@@ -59,13 +63,13 @@ def test_same_input_same_result():
     np.testing.assert_array_equal(first.translation_mm, second.translation_mm)
 
 
-def test_resampling_on_the_same_grid_changes_nothing():
+def test_resampling_on_the_same_grid_changes_nothing() -> None:
     volume, _ = on_grid(GRID)
     np.testing.assert_array_equal(resample(volume, GRID), volume.data)
 
 
 @pytest.mark.parametrize("flip", [(), (0,), (0, 1), (2,)])
-def test_resampling_follows_the_header(flip):
+def test_resampling_follows_the_header(flip: tuple[int, ...]) -> None:
     volume, mask = on_grid(GRID)
     affine = GRID.affine.copy()
     for axis in flip:
@@ -75,7 +79,7 @@ def test_resampling_follows_the_header(flip):
     np.testing.assert_allclose(resample(flipped, GRID)[mask], volume.data[mask], atol=0.2)  # of 1000
 
 
-def test_resampling_agrees_with_scipy_on_an_oblique_grid():
+def test_resampling_agrees_with_scipy_on_an_oblique_grid() -> None:
     volume, _ = on_grid(GRID)
     pose = pose_deg((10, -20, 30), (3, 4, -5))
     affine = np.eye(4)
@@ -88,12 +92,16 @@ def test_resampling_agrees_with_scipy_on_an_oblique_grid():
     np.testing.assert_allclose(resample(volume, grid)[inner], expected[inner], atol=0.5)  # of 1000
 
 
-def test_compare_with_and_without_alignment(rng):
+def test_compare_with_and_without_alignment(rng: np.random.Generator) -> None:
     reference, mask = on_grid(GRID)
     moved, _ = on_grid(GRID, pose_deg((6, 3, -4), (3, 2, -3)))
-    noisy = Volume(moved.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved")
+    noisy = Volume(
+        moved.data / np.float32(50) + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "moved"
+    )
     headers, aligned = compare(noisy, reference, mask), compare(noisy, reference, mask, align=True)
-    still = Volume(reference.data / 50 + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still")
+    still = Volume(
+        reference.data / np.float32(50) + rng.normal(0, 0.2, GRID.shape).astype(np.float32), GRID.affine, "still"
+    )
     assert headers.alignment is None
     assert headers.scores.psnr_db < 20
     # interpolation smooths the noise a little, so the moved volume may score better than the still one
@@ -111,11 +119,9 @@ def test_compare_with_and_without_alignment(rng):
         (lambda v, r: (Volume(v.data, v.affine @ SHEAR, "v"), r), "sheared"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(spoil, message):
+def test_what_cannot_be_compared_is_refused(
+    spoil: Callable[[Volume, Volume], tuple[Volume, Volume]], message: str
+) -> None:
     reference, mask = on_grid(GRID)
     with pytest.raises(InputError, match=message):
         compare(*spoil(reference, reference), mask)
-
-
-SHEAR = np.eye(4)
-SHEAR[0, 1] = 0.2

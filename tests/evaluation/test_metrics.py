@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
@@ -10,7 +12,7 @@ from g3r.evaluation.metrics import PSNR_CAP_DB, fit_intensity, score
 
 
 @pytest.fixture
-def head(rng):
+def head(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A smooth positive ball-shaped volume of 700 at most, and its mask."""
     axes = np.meshgrid(*(np.linspace(-1, 1, n) for n in (44, 50, 40)), indexing="ij")
     radius = np.sqrt(sum(a**2 for a in axes))
@@ -19,7 +21,7 @@ def head(rng):
     return np.where(mask, texture, 0.0).astype(np.float32), mask
 
 
-def plain(volume, reference, mask):
+def plain(volume: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
     """The definition, recomputed over the whole arrays without any shortcut."""
     truth = reference.astype(float) / np.percentile(reference[mask].astype(float), 99.9)
     design = np.stack([volume[mask].astype(float), np.ones(mask.sum())], axis=1)
@@ -37,7 +39,9 @@ def plain(volume, reference, mask):
 
 
 @pytest.mark.parametrize("noise", [1.0, 20.0, 120.0])
-def test_agrees_with_a_plain_recomputation(head, rng, noise):
+def test_agrees_with_a_plain_recomputation(
+    head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator, noise: float
+) -> None:
     reference, mask = head
     volume = (0.02 * (reference + rng.normal(0, noise, reference.shape)) + 3).astype(np.float32)
     found = score(volume, reference, mask)
@@ -45,7 +49,7 @@ def test_agrees_with_a_plain_recomputation(head, rng, noise):
         assert getattr(found, name) == pytest.approx(value, rel=1e-5), name
 
 
-def test_identical_volumes_reach_the_cap(head):
+def test_identical_volumes_reach_the_cap(head: tuple[np.ndarray, np.ndarray]) -> None:
     reference, mask = head
     found = score(reference, reference, mask)
     assert found.psnr_db == PSNR_CAP_DB
@@ -56,7 +60,9 @@ def test_identical_volumes_reach_the_cap(head):
 
 
 @pytest.mark.parametrize("noise_share", [0.01, 0.05])
-def test_known_noise_gives_known_psnr(head, rng, noise_share):
+def test_known_noise_gives_known_psnr(
+    head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator, noise_share: float
+) -> None:
     reference, mask = head
     data_range = np.percentile(reference[mask], 99.9)
     volume = reference + rng.normal(0, noise_share * data_range, reference.shape)
@@ -68,7 +74,9 @@ def test_known_noise_gives_known_psnr(head, rng, noise_share):
 
 
 @pytest.mark.parametrize("gain", [1e-6, 1.0, -2.0, 1e6])
-def test_scale_and_offset_do_not_count(head, rng, gain):
+def test_scale_and_offset_do_not_count(
+    head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator, gain: float
+) -> None:
     reference, mask = head
     volume = reference + rng.normal(0, 30, reference.shape)
     plain_scores, scaled = score(volume, reference, mask), score(gain * volume + 5 * gain, reference, mask)
@@ -76,7 +84,7 @@ def test_scale_and_offset_do_not_count(head, rng, gain):
     assert scaled.ssim == pytest.approx(plain_scores.ssim, abs=1e-8)
 
 
-def test_outside_of_the_mask_does_not_count(head, rng):
+def test_outside_of_the_mask_does_not_count(head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> None:
     reference, mask = head
     volume = reference + rng.normal(0, 30, reference.shape)
     elsewhere = np.where(mask, volume, 1e5)
@@ -85,14 +93,14 @@ def test_outside_of_the_mask_does_not_count(head, rng):
     assert score(elsewhere, reference, mask) == score(volume, reference, mask)
 
 
-def test_mask_at_the_border(head, rng):
+def test_mask_at_the_border(head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> None:
     reference, mask = head
     reference, mask = reference[12:, :, 8:30] + 100, mask[12:, :, 8:30]
     volume = reference + rng.normal(0, 30, reference.shape)
     assert score(volume, reference, mask).ssim == pytest.approx(plain(volume, reference, mask)["ssim"], rel=1e-9)
 
 
-def test_constant_volume(head):
+def test_constant_volume(head: tuple[np.ndarray, np.ndarray]) -> None:
     reference, mask = head
     found = score(np.full_like(reference, 7), reference, mask)
     assert (found.gain, found.ncc) == (0, 0)
@@ -100,13 +108,13 @@ def test_constant_volume(head):
     assert found.psnr_db == pytest.approx(expected, abs=1e-6)
 
 
-def test_thin_volume_has_scores(rng):
+def test_thin_volume_has_scores(rng: np.random.Generator) -> None:
     reference = rng.uniform(1, 2, (9, 9, 3))
     found = score(reference + 0.1 * rng.normal(size=reference.shape), reference, np.ones_like(reference, bool))
     assert np.isfinite([found.psnr_db, found.ssim, found.ncc]).all()
 
 
-def test_fit_is_the_least_squares_one(head, rng):
+def test_fit_is_the_least_squares_one(head: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> None:
     reference, mask = head
     volume = 3 * reference + rng.normal(0, 50, reference.shape)
     expected = np.polyfit(volume[mask].astype(float), reference[mask].astype(float), 1)
@@ -122,7 +130,9 @@ def test_fit_is_the_least_squares_one(head, rng):
         (lambda v, r, m: (v, -r, m), "percentile"),
     ],
 )
-def test_what_cannot_be_scored_is_refused(head, change, message):
+def test_what_cannot_be_scored_is_refused(
+    head: tuple[np.ndarray, np.ndarray], change: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]], message: str
+) -> None:
     reference, mask = head
     with pytest.raises(ValueError, match=message):
         score(*change(reference, reference, mask))

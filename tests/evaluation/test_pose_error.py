@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError
-from g3r.evaluation.pose_error import PoseTable, read_poses, slice_points, target_registration_error
+from g3r.evaluation.pose_error import PoseTable, SliceKey, read_poses, slice_points, target_registration_error
 from g3r.geometry import RigidPose
 
 
 @pytest.fixture
-def points(rng):
+def points(rng: np.random.Generator) -> dict[SliceKey, np.ndarray]:
     """Two stacks of ten slices, 40 points each."""
     layout = {}
     for stack in range(2):
@@ -23,11 +25,11 @@ def points(rng):
     return layout
 
 
-def random_poses(rng, n, degrees, mm):
+def random_poses(rng: np.random.Generator, n: int, degrees: float, mm: float) -> RigidPose:
     return RigidPose.from_rotvec(np.deg2rad(rng.normal(0, degrees, (n, 3))), rng.normal(0, mm, (n, 3)))
 
 
-def test_a_common_motion_does_not_count(points, rng):
+def test_a_common_motion_does_not_count(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = random_poses(rng, len(keys), 8, 4)
     common = random_poses(rng, 1, 30, 20)
@@ -36,7 +38,7 @@ def test_a_common_motion_does_not_count(points, rng):
     assert (found.n_slices, found.n_missing) == (20, 0)
 
 
-def test_known_shift_of_few_slices(points, rng):
+def test_known_shift_of_few_slices(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = random_poses(rng, len(keys), 8, 4)
     shift = np.zeros((20, 3))
@@ -48,7 +50,7 @@ def test_known_shift_of_few_slices(points, rng):
     assert found.mean_mm == pytest.approx(1.5, abs=0.1)
 
 
-def test_missing_and_foreign_slices(points, rng):
+def test_missing_and_foreign_slices(points: dict[SliceKey, np.ndarray], rng: np.random.Generator) -> None:
     keys = tuple(points)
     true = PoseTable(keys, random_poses(rng, len(keys), 8, 4))
     some = PoseTable(((9, 9), *keys[:15]), true.pose.take([0, *range(15)]))
@@ -58,7 +60,7 @@ def test_missing_and_foreign_slices(points, rng):
         target_registration_error(points, true, PoseTable(((9, 9),), RigidPose.identity(1)))
 
 
-def test_tables_are_read(tmp_path, rng):
+def test_tables_are_read(tmp_path: Path, rng: np.random.Generator) -> None:
     pose = random_poses(rng, 2, 8, 4)
     rows = np.c_[pose.rotvec_rad(), pose.translation_mm]
     text = "stack\tslice\trx\try\trz\ttx\tty\ttz\treason\n"
@@ -82,7 +84,7 @@ def test_tables_are_read(tmp_path, rng):
         read_poses(tmp_path / "nowhere.tsv")
 
 
-def test_points_come_from_slices_with_enough_mask(tmp_path):
+def test_points_come_from_slices_with_enough_mask(tmp_path: Path) -> None:
     mask = np.zeros((12, 10, 3), np.uint8)
     mask[2:10, 1:9, 1] = 1
     mask[3:5, 3:5, 2] = 1  # four pixels: nobody can place it

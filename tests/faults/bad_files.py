@@ -87,7 +87,7 @@ def with_values(value: float, dtype: type = np.float32) -> Callable[[], np.ndarr
     """The good image with a value in its middle."""
 
     def make() -> np.ndarray:
-        data = image().astype(dtype)
+        data: np.ndarray = image().astype(dtype)
         data[12, 10, 4] = value
         return data
 

@@ -22,7 +22,7 @@ MAX_WAITING_SECONDS = 60.0
 MAX_BYTES = 500_000_000
 """By which a refusal may raise the peak of memory: far under what the files claim."""
 
-Main = Callable[[Sequence[str]], int]
+Main = Callable[[list[str]], int]
 
 
 class TooSlowError(BaseException):

@@ -23,7 +23,7 @@ def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[type, Callab
 
     folder = tmp_path_factory.mktemp("warm")
     with pytest.MonkeyPatch.context() as patch:
-        loaders = {}
+        loaders: dict[type, Callable[..., object]] = {}
         for kind in (Prior, PoseModel):
             loaders[kind] = functools.cache(kind.load)
             patch.setattr(kind, "load", loaders[kind])

@@ -34,7 +34,7 @@ def run(request: dict) -> dict:
                     resource.setrlimit(resource.RLIMIT_FSIZE, (request["file_bytes"], resource.RLIM_INFINITY))
                 code = g3r.cli.infer.main(request["arguments"])
             except SystemExit as end:
-                code = end.code
+                code = int(end.code or 0)
             except KeyboardInterrupt:  # before the command listened
                 code = 130
             finally:

@@ -119,7 +119,7 @@ BAD: dict[str, tuple[Maker, str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_prior(name: str, tmp_path: Path, tally: Tally):
+def test_a_bad_prior(name: str, tmp_path: Path, tally: Tally) -> None:
     make, says = BAD[name]
     stack, bad = write(tmp_path / "stack.nii.gz"), tmp_path / "bad.safetensors"
     make(bad)
@@ -130,7 +130,7 @@ def test_a_bad_prior(name: str, tmp_path: Path, tally: Tally):
 
 
 @pytest.mark.parametrize("name", ["missing", "text", "half of it", "another program's"])
-def test_a_bad_pose_network(name: str, tmp_path: Path, tally: Tally):
+def test_a_bad_pose_network(name: str, tmp_path: Path, tally: Tally) -> None:
     stack, bad = write(tmp_path / "stack.nii.gz"), tmp_path / "bad.safetensors"
     BAD[name][0](bad)
     with tally.case() as case:
@@ -149,7 +149,7 @@ WAYS: dict[str, Callable[[Path, Canary], object]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_program_is_not_run(way: str, tmp_path: Path, tally: Tally):
+def test_a_program_is_not_run(way: str, tmp_path: Path, tally: Tally) -> None:
     canary, path = Canary(tmp_path / "ran"), tmp_path / "bad.pt"
     WAYS[way](path, canary)
     with tally.case() as case:
@@ -164,7 +164,7 @@ def test_a_program_is_not_run(way: str, tmp_path: Path, tally: Tally):
         case.refused()
 
 
-def test_the_canary_sings(tmp_path: Path):
+def test_the_canary_sings(tmp_path: Path) -> None:
     """Unpickled without care, the files above do run their program: the tests would see it."""
     canary, path = Canary(tmp_path / "ran"), tmp_path / "bad.pt"
     WAYS["archive"](path, canary)

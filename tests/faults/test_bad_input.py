@@ -27,7 +27,7 @@ def stack(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
-def test_a_bad_stack(name: str, stack: Path, tmp_path: Path, tally: Tally):
+def test_a_bad_stack(name: str, stack: Path, tmp_path: Path, tally: Tally) -> None:
     """Alone, and as the second of two: the other one is not blamed."""
     make, says = BAD_STACKS[name]
     (tmp_path / "bad files").mkdir()
@@ -42,7 +42,7 @@ def test_a_bad_stack(name: str, stack: Path, tmp_path: Path, tally: Tally):
 
 
 @pytest.mark.parametrize("name", BAD_MASKS)
-def test_a_bad_mask(name: str, stack: Path, tmp_path: Path, tally: Tally):
+def test_a_bad_mask(name: str, stack: Path, tmp_path: Path, tally: Tally) -> None:
     make, says = BAD_MASKS[name]
     (tmp_path / "masks").mkdir()
     bad = make(tmp_path / "masks")
@@ -85,7 +85,7 @@ PAIRS = (
 
 
 @pytest.mark.parametrize("name", PAIRS)
-def test_stacks_that_do_not_go_together(name: str, stack: Path, tmp_path: Path, tally: Tally):
+def test_stacks_that_do_not_go_together(name: str, stack: Path, tmp_path: Path, tally: Tally) -> None:
     stacks, names, says = pairs(tmp_path)[name]
     with tally.case() as case:
         outcome = run(main, ["--stacks", *stacks, "--output", tmp_path / "out"], tmp_path)
@@ -137,7 +137,7 @@ OUTPUTS: dict[str, tuple[Callable[[Path], Path], str]] = {
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
-def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, monkeypatch: pytest.MonkeyPatch):
+def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, monkeypatch: pytest.MonkeyPatch) -> None:
     make, says = OUTPUTS[name]
     folder = make(tmp_path)
     if name == "cannot be written" and os.access(folder.parent, os.W_OK):  # to root everything is open
@@ -150,7 +150,7 @@ def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, mo
 
 
 @pytest.mark.parametrize("role", ["stack", "mask", "link"])
-def test_an_input_is_never_in_the_way_of_an_output(role: str, tmp_path: Path, tally: Tally):
+def test_an_input_is_never_in_the_way_of_an_output(role: str, tmp_path: Path, tally: Tally) -> None:
     """With --force a folder may be replaced, but not what is read from it."""
     stack = write(tmp_path / ("volume.nii.gz" if role == "stack" else "stack.nii.gz"))
     mask = write(tmp_path / ("mask.nii.gz" if role == "mask" else "brain.nii.gz"), ball())
@@ -187,7 +187,7 @@ VALUES = {
 @pytest.mark.parametrize("option", VALUES)
 def test_a_value_without_meaning(
     option: str, stack: Path, tmp_path: Path, tally: Tally, monkeypatch: pytest.MonkeyPatch
-):
+) -> None:
     monkeypatch.chdir(tmp_path)
     name, value = option.split()
     with tally.case() as case:
@@ -225,7 +225,7 @@ USAGE = [
 
 
 @pytest.mark.parametrize("words", USAGE, ids=" ".join)
-def test_wrong_usage(words: list[str], tmp_path: Path, tally: Tally):
+def test_wrong_usage(words: list[str], tmp_path: Path, tally: Tally) -> None:
     """Options are judged before files: those named here do not exist."""
     two = ["--stacks", "a.nii", "b.nii", "--output", "out"]
     whole = words if not words or words[0] in ("--output", "--stacks") else [*two, *words]

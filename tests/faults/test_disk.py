@@ -48,7 +48,7 @@ def last_line(output: str) -> str:
 @pytest.mark.faults
 def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
     case: SmallCase, killed: Killed, small_disk: Path, tally: Tally
-):
+) -> None:
     codes = []
     for size in SIZES:
         with tally.case() as one:
@@ -67,8 +67,8 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
                 assert names(small_disk) <= {"out.unfinished"}
                 assert not (small_disk / "out.unfinished" / "new").exists()
                 # somebody makes room
-                line = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
-                subprocess.run(line, check=True, capture_output=True)
+                remount = ["mount", "-o", f"remount,size={ENOUGH}", str(small_disk)]
+                subprocess.run(remount, check=True, capture_output=True)
                 assert killed(case.arguments(out, "--resume"))["code"] == 0
                 assert names(small_disk) == {"out"}
                 one.refused()
@@ -78,7 +78,7 @@ def test_a_full_disk_is_named_and_a_larger_one_gives_the_result(
 
 
 @pytest.mark.faults
-def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally):
+def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally) -> None:
     for file_bytes in (2_000, 20_000, 60_000, 100_000, 300_000):  # what the command says goes to a file, too
         with tally.case() as one:
             ended = killed(case.arguments(tmp_path / "out"), file_bytes=file_bytes)
@@ -90,7 +90,7 @@ def test_a_limit_on_the_size_of_files(case: SmallCase, killed: Killed, tmp_path:
 
 def test_a_write_that_fails_leaves_the_earlier_result(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+) -> None:
     """As on a disk that is full when the last file is written."""
     out = tmp_path / "out"
     out.mkdir()
@@ -117,7 +117,7 @@ def test_a_write_that_fails_leaves_the_earlier_result(
 
 def test_stages_that_cannot_be_kept_do_not_end_a_run(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+) -> None:
     def full(*arguments: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -130,7 +130,7 @@ def test_stages_that_cannot_be_kept_do_not_end_a_run(
 
 def test_stages_give_way_where_only_that_makes_room(
     case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
-):
+) -> None:
     from g3r.run.output_folder import OutputFolder
 
     with OutputFolder(tmp_path / "out") as run:
@@ -152,13 +152,13 @@ def test_stages_give_way_where_only_that_makes_room(
         (errno.EACCES, "Permission denied); choose another --output"),
     ],
 )
-def test_what_is_said_of_a_file_that_could_not_be_written(tmp_path: Path, number: int, expected: str):
+def test_what_is_said_of_a_file_that_could_not_be_written(tmp_path: Path, number: int, expected: str) -> None:
     error = cannot_be_written(tmp_path / "no" / "file", OSError(number, os.strerror(number)), 2_000_000)
     assert expected in str(error)
 
 
 @pytest.mark.faults
-def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally: Tally):
+def test_a_memory_limit_ends_in_one_line(case: SmallCase, tmp_path: Path, tally: Tally) -> None:
     """ulimit -v, from far too little to enough."""
     codes = []
     for megabytes in (120, 200, 300, 450, 600, 800, 1000, 1100, 1200, 3000):
@@ -222,7 +222,8 @@ def test_a_run_killed_while_files_move_onto_a_mount_point(
     out.mkdir()
     for name in (*result, "notes"):
         (out / name).write_text("old")
-    rename, done = os.rename, []
+    rename = os.rename
+    done: list[Path] = []
 
     def killed(source: Path, target: Path) -> None:
         if len(done) == moved:

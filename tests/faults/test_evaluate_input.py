@@ -23,7 +23,7 @@ def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
 @pytest.mark.parametrize("role", ["volume", "reference", "mask"])
-def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally):
+def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally) -> None:
     make, says = BAD_STACKS[name]
     files = {"volume": write(tmp_path / "v.nii"), "reference": write(tmp_path / "r.nii", image(1))}
     files["mask"] = write(tmp_path / "m.nii", ball())
@@ -38,7 +38,7 @@ def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally):
 
 
 @pytest.mark.parametrize("name", BAD_MASKS)
-def test_evaluate_with_a_bad_mask(name: str, tmp_path: Path, tally: Tally):
+def test_evaluate_with_a_bad_mask(name: str, tmp_path: Path, tally: Tally) -> None:
     make, says = BAD_MASKS[name]
     reference = write(tmp_path / "stack.nii.gz", image(1))
     (tmp_path / "masks").mkdir()
@@ -66,7 +66,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Tally):
+def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Tally) -> None:
     volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
     table = tmp_path / "poses.tsv"
     if TABLES[name] is not None:
@@ -77,7 +77,7 @@ def test_evaluate_with_a_bad_table_of_poses(name: str, tmp_path: Path, tally: Ta
         case.refused()
 
 
-def test_evaluate_writes_nowhere_else(tmp_path: Path, tally: Tally):
+def test_evaluate_writes_nowhere_else(tmp_path: Path, tally: Tally) -> None:
     volume, mask = write(tmp_path / "v.nii"), write(tmp_path / "m.nii", ball())
     for option in ("--json", "--sections"):
         with tally.case() as case:

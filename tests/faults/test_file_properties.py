@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from nibabel.arrayproxy import ArrayProxy
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import save_volume
@@ -63,7 +64,7 @@ def written_and_read(stack: Stack, folder: Path, order: tuple[int, ...], ending:
 
 @given(stacks(), st.permutations(range(3)), st.sampled_from([".nii", ".nii.gz"]))
 @settings(quick, max_examples=100)
-def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int], ending: str):
+def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int], ending: str) -> None:
     """Values and masks to the bit, positions to the rounding of float32, whichever axis the slices are on."""
     with tally.case(), TemporaryDirectory() as folder:
         back = written_and_read(stack, Path(folder), tuple(order), ending)
@@ -82,14 +83,16 @@ def test_a_stack_survives_its_file(tally: Tally, stack: Stack, order: list[int],
 
 @given(stacks(), st.sampled_from(["<i2", "<u2", "<u1"]))
 @settings(quick, max_examples=50)
-def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack: Stack, dtype: str):
+def test_whole_numbers_with_a_scaling_are_right_to_rounding(tally: Tally, stack: Stack, dtype: str) -> None:
     """As scanners store them: within half a step of the slope that nibabel chooses."""
     with tally.case(), TemporaryDirectory() as folder:
         path = Path(folder) / "image.nii.gz"
         written = nib.Nifti1Image(stack.image, stack.affine)
         written.set_data_dtype(np.dtype(dtype))
         nib.save(written, path)
-        slope = abs(float(nib.load(path).dataobj.slope))
+        stored = nib.Nifti1Image.from_filename(path).dataobj
+        assert isinstance(stored, ArrayProxy)
+        slope = abs(float(stored.slope))
         save_volume(path.with_name("mask.nii"), stack.mask, stack.affine)
         back = load_stack(path, path.with_name("mask.nii"), stack.thickness_mm)
         largest = float(np.abs(stack.image).max())
@@ -141,7 +144,7 @@ def dry_run(fields: dict[str, list[float]], ending: str, role: str, tally: Tally
 @pytest.mark.usefixtures("networks_once")
 @given(headers, st.sampled_from([".nii", ".nii.gz"]), st.sampled_from(["stack", "mask"]))
 @settings(quick, max_examples=150)
-def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], ending: str, role: str):
+def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], ending: str, role: str) -> None:
     dry_run(fields, ending, role, tally)
 
 
@@ -149,5 +152,7 @@ def test_a_dry_run_of_any_header(tally: Tally, fields: dict[str, list[float]], e
 @pytest.mark.usefixtures("networks_once")
 @given(headers, st.sampled_from([".nii", ".nii.gz"]), st.sampled_from(["stack", "mask"]))
 @settings(quick, max_examples=1000)
-def test_a_dry_run_of_any_header_at_length(tally: Tally, fields: dict[str, list[float]], ending: str, role: str):
+def test_a_dry_run_of_any_header_at_length(
+    tally: Tally, fields: dict[str, list[float]], ending: str, role: str
+) -> None:
     dry_run(fields, ending, role, tally)

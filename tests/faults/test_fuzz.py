@@ -17,7 +17,7 @@ SEED = 20_261
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_few_hundred_cases(kind: str, tmp_path: Path, tally: Tally):
+def test_a_few_hundred_cases(kind: str, tmp_path: Path, tally: Tally) -> None:
     counts = run_cases(kind, FEW, SEED, tmp_path)
     assert not counts["failures"], "\n".join(counts["failures"])
     assert counts["survived"] + counts["refused"] == counts["tried"] == FEW
@@ -28,7 +28,7 @@ def test_a_few_hundred_cases(kind: str, tmp_path: Path, tally: Tally):
 
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", KINDS)
-def test_ten_thousand_cases_with_bounded_memory(kind: str, tally: Tally):
+def test_ten_thousand_cases_with_bounded_memory(kind: str, tally: Tally) -> None:
     """In a process of its own: a crash of the interpreter, a hang or a lack of memory would end it."""
     line = [sys.executable, "-m", "tests.faults.fuzz", kind, str(MANY), str(SEED + 1)]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=400, cwd=Path(__file__).parents[2])

@@ -34,7 +34,7 @@ def moments(n: int, killed: Killed, case: SmallCase, folder: Path, seed: int) ->
 @pytest.mark.faults
 def test_kill_9_leaves_a_whole_result_or_none_and_the_next_run_clears_up(
     case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally
-):
+) -> None:
     out, resumed = tmp_path / "out", 0
     for number, moment in enumerate(moments(N_KILLS, killed, case, tmp_path, 1)):
         with tally.case():
@@ -61,7 +61,7 @@ def test_kill_9_leaves_a_whole_result_or_none_and_the_next_run_clears_up(
 @pytest.mark.faults
 def test_kill_9_while_a_result_is_replaced_leaves_the_old_or_the_new_one(
     case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally
-):
+) -> None:
     out = tmp_path / "out"
     for moment in moments(N_KILLS // 3, killed, case, tmp_path, 2):
         with tally.case():
@@ -88,7 +88,7 @@ def is_whole_but_for_notes(folder: Path, case: SmallCase) -> bool:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_at_any_moment_gives_nothing_a_marked_volume_or_the_whole(
     case: SmallCase, killed: Killed, tmp_path: Path, tally: Tally, number: signal.Signals, code: int
-):
+) -> None:
     out = tmp_path / "out"
     for moment in moments(N_SIGNALS // 2, killed, case, tmp_path, 3):
         with tally.case():

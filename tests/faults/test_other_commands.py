@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -30,7 +31,7 @@ def everything_is_imported() -> None:
 
 
 @pytest.mark.parametrize("name", BAD_STACKS)
-def test_simulate(name: str, tmp_path: Path, tally: Tally):
+def test_simulate(name: str, tmp_path: Path, tally: Tally) -> None:
     if name in USABLE_AS_A_VOLUME:
         pytest.skip("usable as a volume, and slicing it takes seconds")
     make, says = BAD_STACKS[name]
@@ -68,7 +69,7 @@ def test_simulate(name: str, tmp_path: Path, tally: Tally):
         "--stacks=many",
     ],
 )
-def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tally: Tally):
+def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tally: Tally) -> None:
     with tally.case() as case:
         source = [] if option.startswith("--phantom") else ["--phantom", "22"]
         outcome = run(simulate.main, [*source, option, "--output", tmp_path / "out"], tmp_path)
@@ -78,8 +79,8 @@ def test_simulate_with_a_value_without_meaning(option: str, tmp_path: Path, tall
         case.refused()
 
 
-SAID = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
-RUNS = {
+SAID: dict[str, Any] = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
+RUNS: dict[str, Any] = {
     "missing": None,
     "empty": b"",
     "text": b"weights\n",
@@ -99,7 +100,7 @@ RUNS = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_export(name: str, tmp_path: Path, tally: Tally):
+def test_export(name: str, tmp_path: Path, tally: Tally) -> None:
     path, content = tmp_path / "last.ckpt", RUNS[name]
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -112,7 +113,7 @@ def test_export(name: str, tmp_path: Path, tally: Tally):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"thickness_mm": "thick"}', b'{"thickness": []}'])
-def test_bench_of_a_broken_case(content: bytes | None, tmp_path: Path, tally: Tally):
+def test_bench_of_a_broken_case(content: bytes | None, tmp_path: Path, tally: Tally) -> None:
     folder = tmp_path / "case"
     folder.mkdir()
     if content is not None:
@@ -137,7 +138,7 @@ REAL = {
 
 @pytest.mark.faults
 @pytest.mark.parametrize("command", REAL)
-def test_as_a_process(command: str, tmp_path: Path, tally: Tally):
+def test_as_a_process(command: str, tmp_path: Path, tally: Tally) -> None:
     """The exit code that a shell sees, and no more than five seconds of a processor."""
     write(tmp_path / "good.nii")
     (tmp_path / "bad.nii.gz").write_bytes(b"no image\n")

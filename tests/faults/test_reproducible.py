@@ -27,7 +27,7 @@ def same_files(one: Path, other: Path) -> bool:
     return all((one / name).read_bytes() == (other / name).read_bytes() for name in SAME)
 
 
-def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: Path, tally: Tally):
+def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: Path, tally: Tally) -> None:
     with tally.case():
         assert case.run(tmp_path / "one") == 0
         line = [sys.executable, "-m", "g3r.cli.infer", *case.arguments(tmp_path / "two")]
@@ -42,9 +42,9 @@ def test_the_same_bytes_again_and_in_another_process(case: SmallCase, tmp_path: 
 @pytest.mark.parametrize(("threads", "further"), [("1", ("--no-prior",)), ("2", ("--space", "scanner", "--seed", "5"))])
 def test_options_then_config_then_config_of_that(
     case: SmallCase, tmp_path: Path, tally: Tally, threads: str, further: tuple[str, ...]
-):
+) -> None:
     """With all of registration, with and without the prior network, each in a process of its own."""
-    if int(threads) > int(numba.config.NUMBA_NUM_THREADS):
+    if int(threads) > int(numba.config.NUMBA_NUM_THREADS):  # type: ignore[attr-defined]
         pytest.skip("a machine of one core")
     files = ["--stacks", *case.files("stack"), "--masks", *case.files("mask"), "--quiet"]
     runs = {
@@ -65,7 +65,7 @@ def test_options_then_config_then_config_of_that(
 @pytest.mark.parametrize("seconds", [1.0, 8.0])
 def test_a_run_with_a_time_budget_can_be_run_again_without_its_clock(
     case: SmallCase, tmp_path: Path, tally: Tally, seconds: float
-):
+) -> None:
     """The loops stop where they stopped then: run.json has the fractions of all their steps."""
     files = ["--stacks", *case.files("stack"), "--masks", *case.files("mask"), "--quiet", "--threads", "1"]
     options = ["--no-prior", "--resolution", "2", "--thickness", "4", "--time-budget", str(seconds)]
@@ -79,7 +79,7 @@ def test_a_run_with_a_time_budget_can_be_run_again_without_its_clock(
         assert same_files(tmp_path / "first", tmp_path / "again")
 
 
-def test_run_json_says_what_is_needed_and_no_paths(case: SmallCase, tmp_path: Path):
+def test_run_json_says_what_is_needed_and_no_paths(case: SmallCase, tmp_path: Path) -> None:
     assert case.run(tmp_path / "out") == 0
     text = (tmp_path / "out" / "run.json").read_text()
     assert str(case.folder) not in text
@@ -96,7 +96,7 @@ def test_run_json_says_what_is_needed_and_no_paths(case: SmallCase, tmp_path: Pa
 
 def test_other_inputs_are_told_and_noted(
     case: SmallCase, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally
-):
+) -> None:
     with tally.case():
         stacks = case.files("stack")
         arguments = case.arguments(tmp_path / "out")
@@ -123,7 +123,7 @@ def test_other_inputs_are_told_and_noted(
 )
 def test_options_that_the_config_decides_are_refused(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
-):
+) -> None:
     with pytest.raises(SystemExit) as caught:
         case.run(tmp_path / "out", *options)
     assert caught.value.code == 2
@@ -152,7 +152,7 @@ def spoilt(text: str) -> dict[str, str]:
 
 def test_a_bad_config_is_refused_in_one_line(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+) -> None:
     path = tmp_path / "bad.json"
     for what, text in spoilt(case.config.read_text()).items():
         with tally.case() as one:
@@ -164,7 +164,7 @@ def test_a_bad_config_is_refused_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_files_are_told_by_their_bytes(tmp_path: Path):
+def test_files_are_told_by_their_bytes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert FileHash.of(tmp_path / "a") == FileHash("a", known)
@@ -172,6 +172,6 @@ def test_files_are_told_by_their_bytes(tmp_path: Path):
         FileHash.of(tmp_path / "absent")
 
 
-def test_fractions_of_the_pace_survive_json():
+def test_fractions_of_the_pace_survive_json() -> None:
     values = np.random.default_rng(0).uniform(size=1000).tolist()
     assert json.loads(json.dumps(values)) == values

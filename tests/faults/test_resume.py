@@ -44,7 +44,7 @@ def kept(case: SmallCase, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("n_stages", range(6))
 def test_the_same_bytes_from_any_number_of_finished_stages(
     case: SmallCase, kept: Path, tmp_path: Path, tally: Tally, n_stages: int
-):
+) -> None:
     with tally.case():
         shutil.copytree(kept, tmp_path / "out.unfinished")
         for stage in STAGES[n_stages:]:
@@ -60,7 +60,7 @@ def test_the_same_bytes_from_any_number_of_finished_stages(
 @pytest.mark.parametrize("n_bytes", [0, 100, 20_000])
 def test_a_stage_that_was_cut_off_is_made_again(
     case: SmallCase, kept: Path, tmp_path: Path, tally: Tally, n_bytes: int
-):
+) -> None:
     with tally.case():
         shutil.copytree(kept, tmp_path / "out.unfinished")
         path = tmp_path / "out.unfinished" / "stages" / "fit-to-prior.npz"
@@ -73,8 +73,14 @@ def test_a_stage_that_was_cut_off_is_made_again(
 
 @pytest.mark.parametrize(("key", "n_stages"), [("seed", 5), ("distillation", 5)])
 def test_stages_of_another_run_are_refused_by_name(
-    case: SmallCase, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally, key, n_stages
-):
+    case: SmallCase,
+    kept: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+    key: str,
+    n_stages: int,
+) -> None:
     with tally.case() as one:
         shutil.copytree(kept, tmp_path / "out.unfinished")
         record = json.loads(case.config.read_text())
@@ -87,7 +93,7 @@ def test_stages_of_another_run_are_refused_by_name(
         one.refused()
 
 
-def test_without_resume_a_run_begins_anew(case: SmallCase, kept: Path, tmp_path: Path, tally: Tally):
+def test_without_resume_a_run_begins_anew(case: SmallCase, kept: Path, tmp_path: Path, tally: Tally) -> None:
     with tally.case():
         shutil.copytree(kept, tmp_path / "out.unfinished")
         assert case.run(tmp_path / "out") == 0
@@ -98,7 +104,7 @@ def test_without_resume_a_run_begins_anew(case: SmallCase, kept: Path, tmp_path:
 
 def test_nothing_of_a_living_run_is_touched(
     case: SmallCase, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+) -> None:
     with tally.case() as one, OutputFolder(tmp_path / "out") as living:
         (living.staging / "stages").mkdir()
         (living.staging / "stages" / "registration.npz").write_text("mine")
@@ -109,7 +115,7 @@ def test_nothing_of_a_living_run_is_touched(
         one.refused()
 
 
-def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tally):
+def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tally) -> None:
     code = (
         "import sys, time\nfrom g3r.run.output_folder import OutputFolder\n"
         "run = OutputFolder(sys.argv[1]).__enter__()\nprint('in', flush=True)\ntime.sleep(60)"
@@ -128,7 +134,7 @@ def test_the_lock_goes_with_a_process_however_it_ends(tmp_path: Path, tally: Tal
         assert names(tmp_path) == set()
 
 
-def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, tally: Tally):
+def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, tally: Tally) -> None:
     out, unfinished = tmp_path / "out", tmp_path / "out.unfinished"
     with tally.case():  # killed between two renames: the earlier result comes back
         (unfinished / "backup").mkdir(parents=True)
@@ -148,7 +154,7 @@ def test_an_exchange_that_was_cut_short_is_undone_or_finished(tmp_path: Path, ta
         assert names(tmp_path) == {"out"}
 
 
-def test_a_link_as_output_stays_a_link(case: SmallCase, tmp_path: Path, tally: Tally):
+def test_a_link_as_output_stays_a_link(case: SmallCase, tmp_path: Path, tally: Tally) -> None:
     with tally.case():
         (tmp_path / "there").mkdir()
         (tmp_path / "out").symlink_to(tmp_path / "there")
@@ -158,7 +164,7 @@ def test_a_link_as_output_stays_a_link(case: SmallCase, tmp_path: Path, tally: T
         assert names(tmp_path) == {"out", "there"}
 
 
-def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path):
+def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     pose = RigidPose.from_rotvec(rng.normal(size=(3, 3)), rng.normal(size=(3, 3)))
     cloud = GaussianCloud.of([torch.randn(4, n) for n in (3, 3, 4)] + [torch.randn(4)], np.ones(3))
@@ -181,14 +187,14 @@ def test_a_stage_comes_back_from_its_file_bit_by_bit(tmp_path: Path):
     assert names(tmp_path) == {"one.npz"}
 
 
-def test_stages_draw_their_own_numbers():
+def test_stages_draw_their_own_numbers() -> None:
     stages = (Stage.FIT_TO_PRIOR, Stage.FIT_TO_PRIOR, Stage.FIT_TO_SLICES)
     first, again, other = (stage_rng(3, stage).random() for stage in stages)
     assert first == again != other
     assert stage_rng(4, Stage.FIT_TO_PRIOR).random() != first
 
 
-def test_seconds_of_a_stage_are_those_that_it_took(tmp_path: Path):
+def test_seconds_of_a_stage_are_those_that_it_took(tmp_path: Path) -> None:
     def work() -> float:
         time.sleep(0.03)
         return 1.0

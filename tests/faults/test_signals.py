@@ -40,8 +40,8 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def test_before_there_is_a_volume_nothing_is_written(
-    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+    case: SmallCase, interrupt_at: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+) -> None:
     with tally.case():
         interrupt_at("registration", 0)
         assert case.run(tmp_path / "deep" / "out") == 130
@@ -51,8 +51,14 @@ def test_before_there_is_a_volume_nothing_is_written(
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_in_the_fit_the_cloud_so_far_is_the_volume(
-    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally, number, code
-):
+    case: SmallCase,
+    interrupt_at: Callable[..., None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+    number: signal.Signals,
+    code: int,
+) -> None:
     with tally.case():
         out = tmp_path / "out"
         interrupt_at("fit to slices", 20, number)
@@ -83,7 +89,9 @@ def test_in_the_fit_the_cloud_so_far_is_the_volume(
         assert names(tmp_path) == {"out", "whole.nii.gz"}
 
 
-def test_before_the_fit_to_slices_the_prior_is_the_volume(case: SmallCase, interrupt_at, tmp_path: Path, tally: Tally):
+def test_before_the_fit_to_slices_the_prior_is_the_volume(
+    case: SmallCase, interrupt_at: Callable[..., None], tmp_path: Path, tally: Tally
+) -> None:
     with tally.case():
         out = tmp_path / "out"
         interrupt_at("fit to prior", 3)
@@ -95,8 +103,8 @@ def test_before_the_fit_to_slices_the_prior_is_the_volume(case: SmallCase, inter
 
 
 def test_a_partial_result_is_replaced_only_when_told(
-    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+    case: SmallCase, interrupt_at: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+) -> None:
     with tally.case() as one:
         interrupt_at("fit to slices", 5)
         assert case.run(tmp_path / "out") == 130
@@ -106,8 +114,8 @@ def test_a_partial_result_is_replaced_only_when_told(
 
 
 def test_a_second_signal_ends_at_once(
-    case: SmallCase, interrupt_at, tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
-):
+    case: SmallCase, interrupt_at: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], tally: Tally
+) -> None:
     with tally.case():
         interrupt_at("fit to slices", 5, times=2)
         assert case.run(tmp_path / "out") == 130
@@ -118,7 +126,9 @@ def test_a_second_signal_ends_at_once(
         assert names(tmp_path) == {"out"}
 
 
-def test_signals_are_handled_as_before_afterwards(case: SmallCase, interrupt_at, tmp_path: Path):
+def test_signals_are_handled_as_before_afterwards(
+    case: SmallCase, interrupt_at: Callable[..., None], tmp_path: Path
+) -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     interrupt_at("fit to slices", 5)
     case.run(tmp_path / "out")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,16 +17,19 @@ import torch
 from g3r.errors import InputError
 from tests.tally import Tally
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 pytest.importorskip("torchio", reason="the training extra is not installed")
 
-from data_synth.prior_data import StackSynthesisDataModule  # noqa: E402
-from g3r.training.annealed_module import WholeCheckpoints  # noqa: E402
-from g3r.training.prior_module import PriorModule  # noqa: E402
+import lightning.pytorch as lightning
 
-NETWORK = {"channels": [4, 4], "units": [1, 1], "tail_channels": 2, "warmup_steps": 2}
+from data_synth.prior_data import StackSynthesisDataModule
+from g3r.prior.config import PriorNetworkConfig
+from g3r.training.annealed_module import WholeCheckpoints
+from g3r.training.prior_module import PriorModule
+
+NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2)
 # ten patches an epoch in batches of three: one is left over each time
-DATA = {
+DATA: dict[str, Any] = {
     "spacing_mm": 2.0,
     "patch_size": 24,
     "patches_per_subject": 2,
@@ -45,7 +49,9 @@ class Losses(lightning.Callback):
         self.found: dict[int, float] = {}
         self.end_at = end_at
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: object, batch_idx: int
+    ) -> None:
         self.found[trainer.global_step] = float(outputs["loss"])
         if trainer.global_step == self.end_at:
             raise ZeroDivisionError
@@ -69,7 +75,7 @@ def trained(folder: Path, end_at: int | None = None, resume: Path | None = None)
         plugins=[WholeCheckpoints()],
     )
     try:
-        module, data = PriorModule(**NETWORK), StackSynthesisDataModule(**DATA)
+        module, data = PriorModule(NETWORK, warmup_steps=2), StackSynthesisDataModule(**DATA)
         trainer.fit(module, data, ckpt_path=resume, weights_only=True if resume else None)
     except ZeroDivisionError:
         assert end_at is not None
@@ -82,7 +88,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[int, float]:
 
 
 @pytest.mark.faults
-def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path: Path):
+def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path: Path) -> None:
     assert len(whole) == 3 * N_EPOCHS
     assert trained(tmp_path) == whole
 
@@ -91,7 +97,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 @pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
-):
+) -> None:
     with tally.case():
         begun = trained(tmp_path, end_at)
         assert begun == {step: whole[step] for step in range(1, end_at + 1)}
@@ -100,7 +106,7 @@ def test_a_training_that_ended_goes_on_at_the_same_losses(
         assert resumed == {step: loss for step, loss in whole.items() if step > last_epoch}
 
 
-def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally):
+def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally) -> None:
     path, keeper = tmp_path / "last.ckpt", WholeCheckpoints()
     keeper.save_checkpoint({"a": torch.ones(3)}, path)
 
@@ -124,7 +130,7 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
 
 CONFIG = """
 seed_everything: 5
-model: {channels: [4, 4], units: [1, 1], tail_channels: 2, warmup_steps: 2}
+model: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
@@ -163,8 +169,8 @@ def losses(folder: Path) -> dict[int, float]:
 
 
 @pytest.mark.faults
-def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: Path, tally: Tally):
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+def test_the_command_killed_again_and_again_ends_with_the_same_losses(tmp_path: Path, tally: Tally) -> None:
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     done = subprocess.run(command(tmp_path / "whole"), check=False, **quiet)
     assert done.returncode == 0, done.stderr
     folder, last = tmp_path / "killed", tmp_path / "killed" / "kept" / "last.ckpt"

@@ -158,7 +158,7 @@ AS_GOOD = ("one frame", "frames of one", "gzip members", "NIfTI-2", "big-endian"
 
 
 @pytest.mark.parametrize("name", STACKS)
-def test_an_odd_stack(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally):
+def test_an_odd_stack(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally) -> None:
     make, remark = STACKS[name]
     path = make(tmp_path)
     with tally.case(), caplog.at_level(logging.WARNING):
@@ -177,7 +177,7 @@ def test_an_odd_stack(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixtur
             np.testing.assert_allclose(stack.image, image(), atol=2.1 if name == "uint8" else 0.6)
 
 
-def test_a_negative_slope_is_applied(tmp_path: Path, tally: Tally):
+def test_a_negative_slope_is_applied(tmp_path: Path, tally: Tally) -> None:
     with tally.case():
         stack = load_stack(STACKS["int16 with a negative slope"][0](tmp_path))
         np.testing.assert_allclose(stack.image, image(), atol=0.06)
@@ -198,7 +198,7 @@ MASKS: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], str]] = {
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally):
+def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tally: Tally) -> None:
     data, affine = MASKS[name][0]()
     stack, mask = write(tmp_path / "stack.nii.gz"), write(tmp_path / "mask.nii.gz", data, affine)
     with tally.case(), caplog.at_level(logging.WARNING):
@@ -210,7 +210,7 @@ def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tal
         np.testing.assert_array_equal(load_stack(stack, mask).mask, expected)
 
 
-def test_twelve_stacks(tmp_path: Path, tally: Tally):
+def test_twelve_stacks(tmp_path: Path, tally: Tally) -> None:
     paths = [write(tmp_path / f"{n}.nii.gz", image(n), moved(n, 0, 0)) for n in range(12)]
     with tally.case():
         outcome = run(main, ["--stacks", *paths, "--output", tmp_path / "out", "--dry-run"], tmp_path)
@@ -219,7 +219,7 @@ def test_twelve_stacks(tmp_path: Path, tally: Tally):
 
 
 @pytest.mark.parametrize("kind", ["new", "deep", "empty", "spaces and more ä", "earlier result"])
-def test_an_output(kind: str, tmp_path: Path, tally: Tally):
+def test_an_output(kind: str, tmp_path: Path, tally: Tally) -> None:
     folder = tmp_path / "a" / "b" / "c" if kind == "deep" else tmp_path / kind
     options: list[str] = []
     if kind in ("empty", "earlier result"):
@@ -232,11 +232,20 @@ def test_an_output(kind: str, tmp_path: Path, tally: Tally):
         assert run(main, line, tmp_path).code == 0
 
 
-def test_names_that_are_no_text_as_a_process(tmp_path: Path, tally: Tally):
+def test_names_that_are_no_text_as_a_process(tmp_path: Path, tally: Tally) -> None:
     """Bytes that are no UTF-8, in the stack's name and the output's, with an ASCII terminal."""
     name = os.fsencode(tmp_path) + b"/kopf-\xe4\xff.nii.gz"
     Path(os.fsdecode(name)).write_bytes(write(tmp_path / "a.nii.gz").read_bytes())
-    line = [sys.executable, "-m", "g3r.cli.infer", "--stacks", name, "--output", name + b".out", "--dry-run"]
+    line: list[str | bytes] = [
+        sys.executable,
+        "-m",
+        "g3r.cli.infer",
+        "--stacks",
+        name,
+        "--output",
+        name + b".out",
+        "--dry-run",
+    ]
     environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
     with tally.case():
         done = subprocess.run(line, capture_output=True, check=False, env=environment)

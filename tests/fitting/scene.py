@@ -1,5 +1,7 @@
 """A scene of a few dozen Gaussians in a ball, its volume and its slices."""
 
+from typing import Any
+
 import numpy as np
 
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
@@ -48,7 +50,7 @@ def fit(
     prior: VolumeTarget | None = None,
     gain: np.ndarray | None = None,
     settings: SliceStageSettings | None = None,
-    **options,
+    **options: Any,
 ) -> SliceFit:
     """Stage 2 from seeds in a volume, with 40 steps unless the settings or options say otherwise."""
     ones = np.ones(len(slices))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
+from g3r.fitting.adaptive_stage import AdaptiveSettings, Densification, fit_adaptive
 from g3r.fitting.prior_stage import PriorStageSettings
+from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
 
 GRID = VolumeGrid.isotropic([-14.0] * 3, [14.0] * 3, 1.0)
@@ -18,14 +19,16 @@ STAGE = PriorStageSettings(n_steps=15, scale_weight=0.0)
 QUICK = AdaptiveSettings(bound=0.08, round_steps=15, n_rounds=5)
 
 
-def fitted(bound: float = 0.08, volume=SHEETS, mask=BALL, finest_mm: float = 2.0):
+def fitted(
+    bound: float = 0.08, volume: np.ndarray = SHEETS, mask: np.ndarray = BALL, finest_mm: float = 2.0
+) -> tuple[GaussianCloud, Densification]:
     settings = replace(QUICK, bound=bound)
     return fit_adaptive(
         volume, mask, GRID, finest_spacing_mm=finest_mm, settings=settings, stage=STAGE, rng=np.random.default_rng(3)
     )
 
 
-def test_tighter_bounds_need_more_gaussians_and_leave_less():
+def test_tighter_bounds_need_more_gaussians_and_leave_less() -> None:
     loose, rough = fitted(0.15)
     tight, fine = fitted(0.06)
     assert len(loose) < len(tight)
@@ -36,7 +39,7 @@ def test_tighter_bounds_need_more_gaussians_and_leave_less():
         assert len(cloud) == done.n_seeded + done.n_added - done.n_dropped - done.n_merged
 
 
-def test_gaussians_are_added_where_the_structure_is():
+def test_gaussians_are_added_where_the_structure_is() -> None:
     """A volume with structure in its upper half has more Gaussians there than a flat one."""
     counts = []
     for volume in (SHEETS, np.full(GRID.shape, 0.6, np.float32)):
@@ -46,20 +49,20 @@ def test_gaussians_are_added_where_the_structure_is():
     assert counts[0] > 1.5 * counts[1]
 
 
-def test_same_seed_same_cloud():
+def test_same_seed_same_cloud() -> None:
     first, second = fitted()[0], fitted()[0]
     for a, b in zip(first.parameters, second.parameters, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
-def test_a_constant_needs_few():
+def test_a_constant_needs_few() -> None:
     """Next to nothing: a few at the rim, where the coarse lattice ends in steps."""
     cloud, done = fitted(volume=np.full(GRID.shape, 0.7, np.float32))
     assert len(cloud) < 100
     assert done.share_over_bound == 0
 
 
-def test_masks_of_nothing_and_of_one_voxel():
+def test_masks_of_nothing_and_of_one_voxel() -> None:
     with pytest.raises(ValueError, match="foreground is empty"):
         fitted(mask=np.zeros_like(BALL))
     with pytest.raises(ValueError, match="bound"):

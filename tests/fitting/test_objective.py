@@ -21,6 +21,7 @@ from g3r.gaussians.overlap import OverlapFinder
 from g3r.gaussians.render import CUTOFF_SIGMA
 from tests.fitting.scene import BALL, GRID, fit, make_slices, seeded, true_volume
 from tests.gaussians.scenes import cloud_of
+from tests.gradients import gradient_of
 
 SETTINGS = SliceStageSettings(scale_weight=0.3, bias_field_ridge=0.05, pose_prior_mm=2.0)
 STRENGTH = 0.4
@@ -52,7 +53,7 @@ class Scene:
             "bias_field": (rng.normal(0, 0.2, (3, 5)), 8e-3),
         }
         self.parameters = FitParameters(cloud, LearningRates(), blocks)
-        self.prior = VolumeTarget.of(0.9 * volume, (BALL * 0.7).astype(np.float32), GRID)
+        self.prior = VolumeTarget.of(np.float32(0.9) * volume, (BALL * 0.7).astype(np.float32), GRID)
         self.chosen = np.array([1, 5, 9, 14])
         self.unknowns = SliceParameters(self.slices, np.ones(n), self.parameters)
         self.term = ImageTerm.of(
@@ -88,8 +89,8 @@ class Scene:
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
         """The same in float64 through the dense reference and autograd, term by term as Eq. 9 has them."""
         leaves = {name: torch.tensor(v).double().requires_grad_() for name, v in self.parameters.value.items()}
-        cloud = GaussianCloud(
-            *[leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
+        cloud = GaussianCloud.of(
+            [leaves[n] for n in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")], self.parameters.origin_mm
         )
         log_gain = leaves["log_gain"] - leaves["log_gain"].mean()
         twist = torch.cat([leaves["rotation"], leaves["translation"]], 1)
@@ -110,11 +111,11 @@ class Scene:
         moved = leaves["translation"].square().sum(1) + (radius * leaves["rotation"]).square().sum(1)
         loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
         loss.backward()
-        return loss.item(), {name: leaf.grad.numpy() for name, leaf in leaves.items()}
+        return loss.item(), {name: gradient_of(leaf).numpy() for name, leaf in leaves.items()}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume: np.ndarray, seed: int):
+def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume: np.ndarray, seed: int) -> None:
     scene = Scene(volume, seed, cutoff_sigma=6.0)
     expected, expected_gradient = scene.oracle()
     assert scene.evaluate() == pytest.approx(expected, rel=1e-5)
@@ -124,7 +125,7 @@ def test_value_and_gradients_are_those_of_autograd_through_the_reference(volume:
         assert np.linalg.norm(found - gradient) < 2e-3 * np.linalg.norm(gradient), name
 
 
-def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
+def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray) -> None:
     scene = Scene(volume, 2, cutoff_sigma=6.0)
     scene.evaluate()
     image = scene.image.mean
@@ -146,7 +147,7 @@ def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray):
         assert (values[0] - values[1]) / 2 == pytest.approx(slope, rel=0.03), name
 
 
-def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray):
+def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray) -> None:
     scene = Scene(volume, 4)
     cloud = scene.parameters.cloud()
     value = render(cloud, scene.prior.planes).numpy()
@@ -155,7 +156,7 @@ def test_the_kink_of_a_pixel_that_fits_has_no_gradient(volume: np.ndarray):
     assert all((g == 0).all() for g in parameters.gradient.values())
 
 
-def test_where_nothing_counts_the_term_is_zero(volume: np.ndarray):
+def test_where_nothing_counts_the_term_is_zero(volume: np.ndarray) -> None:
     scene = Scene(volume, 5)
     term = ImageTerm.of(scene.prior.planes, scene.prior.value, 0 * scene.prior.weight)
     assert alone(scene.parameters, term) == 0
@@ -170,7 +171,7 @@ def alone(parameters: FitParameters, term: ImageTerm) -> float:
     return image
 
 
-def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
+def test_no_pair_is_missed_while_things_move(volume: np.ndarray) -> None:
     """The list in use always holds every pair within the cut-off, and it is not made anew at every step."""
     scene = Scene(volume, 6)
     for _ in range(12):
@@ -188,8 +189,8 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray):
     assert scene.objective.n_searches < 6
 
 
-def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray):
-    if numba.config.NUMBA_NUM_THREADS < 2:
+def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray) -> None:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
         pytest.skip("numba was started with one thread")
     before, found = numba.get_num_threads(), []
     try:
@@ -206,8 +207,8 @@ def test_loss_and_gradients_of_one_and_two_threads_agree(volume: np.ndarray):
         assert np.linalg.norm(gradient - two_gradient[name]) <= 1e-5 * np.linalg.norm(gradient), name
 
 
-def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: np.ndarray):
-    if numba.config.NUMBA_NUM_THREADS < 2:
+def test_a_short_fit_with_one_and_with_two_threads_gives_the_same_image(volume: np.ndarray) -> None:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
         pytest.skip("numba was started with one thread")
     slices = make_slices()
     prior = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
@@ -225,7 +226,7 @@ def one_gaussian() -> GaussianCloud:
     return cloud_of(np.zeros((1, 3)), np.zeros((1, 3)), [[1.0, 0, 0, 0]], [2.0])
 
 
-def test_a_step_is_that_of_torch_adam():
+def test_a_step_is_that_of_torch_adam() -> None:
     rng = np.random.default_rng(8)
     rates = LearningRates()
     parameters = FitParameters(one_gaussian(), rates, {"extra": (rng.normal(size=(5, 2)), 0.01)})
@@ -247,7 +248,7 @@ def test_a_step_is_that_of_torch_adam():
         np.testing.assert_allclose(parameters.value[name], leaf.numpy(), rtol=2e-5, atol=2e-6)
 
 
-def test_a_step_is_about_as_long_as_its_rate_says():
+def test_a_step_is_about_as_long_as_its_rate_says() -> None:
     rates = LearningRates()
     parameters = FitParameters(one_gaussian(), rates)
     for gradient in parameters.gradient.values():
@@ -260,7 +261,7 @@ def test_a_step_is_about_as_long_as_its_rate_says():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_loss_that_is_not_finite_stops_the_fit(bad: float):
+def test_a_loss_that_is_not_finite_stops_the_fit(bad: float) -> None:
     parameters = FitParameters(one_gaussian(), LearningRates())
     with pytest.raises(NumericalError, match="not finite") as caught:
         parameters.step(bad, 1.0)
@@ -268,14 +269,14 @@ def test_a_loss_that_is_not_finite_stops_the_fit(bad: float):
     assert torch.equal(parameters.cloud().amplitude, one_gaussian().amplitude)
 
 
-def test_a_gradient_that_is_not_finite_stops_the_fit():
+def test_a_gradient_that_is_not_finite_stops_the_fit() -> None:
     parameters = FitParameters(one_gaussian(), LearningRates())
     parameters.gradient["mean_mm"][0, 1] = np.nan
     with pytest.raises(NumericalError, match="not finite"):
         parameters.step(1.0, 1.0)
 
 
-def test_pixels_that_are_not_finite_stop_the_fit(volume: np.ndarray):
+def test_pixels_that_are_not_finite_stop_the_fit(volume: np.ndarray) -> None:
     slices = make_slices()
     value = slices.value.copy()
     value[np.flatnonzero(slices.mask)[5]] = np.nan

@@ -1,6 +1,7 @@
 """Both stages on a scene of a few dozen Gaussians, and the reconstructor's invariances."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def volume_error(cloud: GaussianCloud, volume: np.ndarray) -> float:
     return float(np.abs(found - volume)[BALL].mean())
 
 
-def test_stage_1_comes_close_to_the_volume(volume: np.ndarray):
+def test_stage_1_comes_close_to_the_volume(volume: np.ndarray) -> None:
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     calls: list[tuple[int, int]] = []
     settings = PriorStageSettings(n_steps=30)
@@ -38,14 +39,14 @@ def test_stage_1_comes_close_to_the_volume(volume: np.ndarray):
     assert not any(p.requires_grad for p in cloud.parameters)
 
 
-def test_stage_1_without_steps_still_solves_for_the_peaks(volume: np.ndarray):
+def test_stage_1_without_steps_still_solves_for_the_peaks(volume: np.ndarray) -> None:
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     cloud, history = fit_prior(seeded(volume), target, PriorStageSettings(n_steps=0), np.random.default_rng(0))
     assert history == []
     assert volume_error(cloud, volume) < 0.6 * volume_error(seeded(volume), volume)
 
 
-def test_a_volume_target_is_cropped_to_its_weight_and_taken_by_planes(volume: np.ndarray):
+def test_a_volume_target_is_cropped_to_its_weight_and_taken_by_planes(volume: np.ndarray) -> None:
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     assert target.planes.n_pixels < volume.size
     assert target.weight.sum() == BALL.sum()
@@ -63,7 +64,7 @@ def test_a_volume_target_is_cropped_to_its_weight_and_taken_by_planes(volume: np
         VolumeTarget.of(volume, 0 * volume, GRID)
 
 
-def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray):
+def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray) -> None:
     blurred = 0.8 * volume + 0.1
     result = fit(blurred, make_slices())
     image = [entry["image"] for entry in result.history]
@@ -74,14 +75,14 @@ def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray):
     assert (result.weight > 0.5).all()
 
 
-def test_with_poses_off_no_slice_moves(volume: np.ndarray):
+def test_with_poses_off_no_slice_moves(volume: np.ndarray) -> None:
     slices = make_slices()
     result = fit(volume, slices, optimise_poses=False, n_steps=10)
     np.testing.assert_array_equal(result.slices.planes.rotation, slices.planes.rotation)
     np.testing.assert_array_equal(result.slices.planes.center_mm, slices.planes.center_mm)
 
 
-def test_poses_that_are_right_hardly_move_and_wrong_ones_come_nearer(volume: np.ndarray):
+def test_poses_that_are_right_hardly_move_and_wrong_ones_come_nearer(volume: np.ndarray) -> None:
     slices = make_slices()
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     right = fit(volume, slices, target)
@@ -96,7 +97,7 @@ def test_poses_that_are_right_hardly_move_and_wrong_ones_come_nearer(volume: np.
     assert (left < 0.7 * np.linalg.norm(shift)).all()
 
 
-def test_gains_are_recovered(volume: np.ndarray):
+def test_gains_are_recovered(volume: np.ndarray) -> None:
     log_gain = np.random.default_rng(1).normal(0, 0.08, 24)
     gain = np.exp(log_gain - log_gain.mean())
     result = fit(volume, make_slices(gain), n_steps=80, optimise_poses=False)
@@ -106,16 +107,16 @@ def test_gains_are_recovered(volume: np.ndarray):
     assert np.log(result.gain).mean() == pytest.approx(0, abs=1e-5)
 
 
-def test_a_single_slice_keeps_its_gain(volume: np.ndarray):
+def test_a_single_slice_keeps_its_gain(volume: np.ndarray) -> None:
     slices = make_slices().take([3])
     result = fit(volume, slices, gain=np.array([1.3]), n_steps=5)
     assert result.gain[0] == pytest.approx(1.3, rel=1e-6)
 
 
-def test_distillation_fades_and_holds_what_no_slice_sees(volume: np.ndarray):
+def test_distillation_fades_and_holds_what_no_slice_sees(volume: np.ndarray) -> None:
     slices = make_slices().take(np.arange(3, 5))  # two slices through the middle of one stack
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
-    options = {"n_steps": 30, "optimise_poses": False}
+    options: dict[str, Any] = {"n_steps": 30, "optimise_poses": False}
     held = fit(volume, slices, target, distillation=AnnealedWeight(1.0, 0.2), **options)
     weights = [entry["distillation_weight"] for entry in held.history]
     assert weights[0] == 1.0
@@ -127,7 +128,7 @@ def test_distillation_fades_and_holds_what_no_slice_sees(volume: np.ndarray):
     torch.testing.assert_close(off.cloud.amplitude, free.cloud.amplitude)
 
 
-def test_a_spoilt_slice_is_down_weighted(volume: np.ndarray):
+def test_a_spoilt_slice_is_down_weighted(volume: np.ndarray) -> None:
     slices = make_slices()
     bad = slices.planes.plane_id() == 4
     value = slices.value.copy()
@@ -137,14 +138,14 @@ def test_a_spoilt_slice_is_down_weighted(volume: np.ndarray):
     assert np.delete(result.weight, 4).min() > 0.5
 
 
-def test_the_same_seed_gives_the_same_fit(volume: np.ndarray):
+def test_the_same_seed_gives_the_same_fit(volume: np.ndarray) -> None:
     target = VolumeTarget.of(volume, BALL.astype(np.float32), GRID)
     one, two = (fit(volume, make_slices(), target, n_steps=12) for _ in range(2))
     torch.testing.assert_close(one.cloud.mean_mm, two.cloud.mean_mm, rtol=0, atol=0)
     assert one.history == two.history
 
 
-def test_the_prior_weighs_by_the_residual_over_its_error_and_never_more_than_a_pixel():
+def test_the_prior_weighs_by_the_residual_over_its_error_and_never_more_than_a_pixel() -> None:
     settings = SliceStageSettings(distillation=AnnealedWeight(0.5, 0.05), prior_error=0.05)
     assert prior_strength(settings, 0.0, 0.001) == 0.5
     assert prior_strength(settings, 1.0, 0.001) == pytest.approx(0.05)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
@@ -20,13 +21,26 @@ FRAMES = np.stack(
 """Rotations of three orthogonal stacks."""
 
 
-def cloud_of(mean, log_scale, quaternion, amplitude, origin=(0.0, 0, 0), dtype=np.float32) -> GaussianCloud:
+def cloud_of(
+    mean: ArrayLike,
+    log_scale: ArrayLike,
+    quaternion: ArrayLike,
+    amplitude: ArrayLike,
+    origin: ArrayLike = (0.0, 0, 0),
+    dtype: type[np.floating] = np.float32,
+) -> GaussianCloud:
     """A cloud from arrays."""
     arrays = (mean, log_scale, quaternion, amplitude)
     return GaussianCloud.of([torch.from_numpy(np.array(array, dtype)) for array in arrays], np.array(origin))
 
 
-def make_cloud(seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0, -30.0, 20.0)) -> GaussianCloud:
+def make_cloud(
+    seed: int,
+    n: int,
+    sigma: tuple[float, float] = (0.8, 2.0),
+    spread_mm: float = 2.5,
+    origin: ArrayLike = (40.0, -30.0, 20.0),
+) -> GaussianCloud:
     """Random Gaussians around an origin, float64."""
     rng = np.random.default_rng(seed)
     return cloud_of(
@@ -39,7 +53,9 @@ def make_cloud(seed: int, n: int, sigma=(0.8, 2.0), spread_mm=2.5, origin=(40.0,
     )
 
 
-def make_planes(seed: int, n: int = 3, shape=(7, 6), psf: float = 1.0, origin=(40.0, -30.0, 20.0)) -> Planes:
+def make_planes(
+    seed: int, n: int = 3, shape: tuple[int, int] = (7, 6), psf: float = 1.0, origin: ArrayLike = (40.0, -30.0, 20.0)
+) -> Planes:
     """Random planes near an origin; `psf` scales the variances."""
     rng = np.random.default_rng(seed)
     spacing = rng.uniform(0.7, 1.1, (n, 2))
@@ -52,7 +68,7 @@ def make_planes(seed: int, n: int = 3, shape=(7, 6), psf: float = 1.0, origin=(4
     )
 
 
-def stack_planes(n: int, spacing_mm: float, side: int, origin=(0.0, 0, 0)) -> Planes:
+def stack_planes(n: int, spacing_mm: float, side: int, origin: ArrayLike = (0.0, 0, 0)) -> Planes:
     """Three orthogonal stacks of n gapless planes about an origin, pixels of 1 mm."""
     rotation = np.repeat(FRAMES, n, axis=0)
     offset = np.tile((np.arange(n) - (n - 1) / 2) * spacing_mm, 3)
@@ -90,6 +106,6 @@ def images(cloud: GaussianCloud, planes: Planes) -> Iterator[tuple[np.ndarray, f
     yield render(single(cloud), planes, cutoff_sigma=6.0).numpy(), 3e-6
 
 
-def assert_same_images(a: tuple[GaussianCloud, Planes], b: tuple[GaussianCloud, Planes]):
+def assert_same_images(a: tuple[GaussianCloud, Planes], b: tuple[GaussianCloud, Planes]) -> None:
     for (first, tolerance), (second, _) in zip(images(*a), images(*b), strict=True):
         assert np.abs(first - second).max() < tolerance * max(1.0, np.abs(first).max())

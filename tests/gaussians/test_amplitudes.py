@@ -25,7 +25,7 @@ def scene(seed: int = 0) -> tuple[GaussianCloud, Planes]:
     return cloud, stack_planes(7, 2.2, 18, cloud.origin_mm)
 
 
-def test_the_adjoint_of_the_system():
+def test_the_adjoint_of_the_system() -> None:
     cloud, planes = scene()
     rng = np.random.default_rng(1)
     system = AmplitudeSystem(cloud, planes, gain=rng.uniform(0.5, 2, len(planes)))
@@ -35,7 +35,7 @@ def test_the_adjoint_of_the_system():
     assert abs(image @ pixels - amplitude @ back) < 1e-5 * np.linalg.norm(image) * np.linalg.norm(pixels)
 
 
-def test_the_system_is_the_renderer():
+def test_the_system_is_the_renderer() -> None:
     cloud, planes = scene()
     gain = np.linspace(0.5, 2, len(planes))
     expected = render(cloud, planes, log_gain=torch.tensor(np.log(gain)))
@@ -43,7 +43,7 @@ def test_the_system_is_the_renderer():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_projections_that_may_not_be_held_are_made_again():
+def test_projections_that_may_not_be_held_are_made_again() -> None:
     cloud, planes = scene()
     whole = AmplitudeSystem(cloud, planes)
     parted = AmplitudeSystem(cloud, planes, projection_bytes=5000)
@@ -58,7 +58,7 @@ def test_projections_that_may_not_be_held_are_made_again():
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])
-def test_known_amplitudes_are_recovered(damping: float):
+def test_known_amplitudes_are_recovered(damping: float) -> None:
     cloud, planes = scene()
     gain = np.linspace(0.5, 2, len(planes))
     target = AmplitudeSystem(cloud, planes, gain=gain).forward(cloud.amplitude.numpy())
@@ -70,7 +70,7 @@ def test_known_amplitudes_are_recovered(damping: float):
     assert torch.equal(found.mean_mm, cloud.mean_mm)
 
 
-def test_more_iterations_never_fit_worse():
+def test_more_iterations_never_fit_worse() -> None:
     cloud, planes = scene()
     rng = np.random.default_rng(2)
     target = (render(cloud, planes).numpy() + rng.normal(0, 0.1, planes.n_pixels)).astype(np.float32)
@@ -87,7 +87,7 @@ def test_more_iterations_never_fit_worse():
     assert errors[-1] < 0.1 * errors[0]
 
 
-def test_pixels_of_weight_zero_do_not_count():
+def test_pixels_of_weight_zero_do_not_count() -> None:
     cloud, planes = scene()
     target = render(cloud, planes).numpy()
     weight = np.ones(planes.n_pixels, np.float32)
@@ -98,7 +98,7 @@ def test_pixels_of_weight_zero_do_not_count():
     assert (found.amplitude - cloud.amplitude).abs().max() < 5e-3
 
 
-def test_what_no_pixel_sees_stays():
+def test_what_no_pixel_sees_stays() -> None:
     cloud, planes = scene()
     away = Planes(
         rotation=planes.rotation,
@@ -119,13 +119,13 @@ def test_what_no_pixel_sees_stays():
     assert not torch.equal(found.amplitude, cloud.amplitude)
 
 
-def test_no_gaussian_at_all():
+def test_no_gaussian_at_all() -> None:
     cloud, planes = scene()
     ones = np.ones(planes.n_pixels, np.float32)
     assert len(solve_amplitudes(cloud.take(torch.zeros(0, dtype=torch.long)), planes, ones, ones)) == 0
 
 
-def test_strong_damping_holds_the_amplitudes():
+def test_strong_damping_holds_the_amplitudes() -> None:
     cloud, planes = scene()
     ones = np.ones(planes.n_pixels, np.float32)
     change = [

@@ -1,5 +1,7 @@
 """The file of a cloud, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from g3r.gaussians import GaussianCloud
 from tests.gaussians.scenes import make_cloud, single
 
 
-def test_save_and_load(tmp_path):
+def test_save_and_load(tmp_path: Path) -> None:
     cloud = single(make_cloud(21, 12, origin=(1e4 + 1e-7, 0, -3)))
     cloud.save(tmp_path / "cloud.npz")
     assert [path.name for path in tmp_path.iterdir()] == ["cloud.npz"]
@@ -20,7 +22,7 @@ def test_save_and_load(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["missing", "text", "cut off", "array", "other npz"])
-def test_what_is_no_cloud_is_refused(tmp_path, kind: str):
+def test_what_is_no_cloud_is_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "cloud.npz"
     if kind == "text":
         path.write_text("hello")
@@ -36,7 +38,7 @@ def test_what_is_no_cloud_is_refused(tmp_path, kind: str):
         GaussianCloud.load(path)
 
 
-def test_shapes_that_do_not_belong_together_are_refused():
+def test_shapes_that_do_not_belong_together_are_refused() -> None:
     cloud = make_cloud(23, 3)
     with pytest.raises(ValueError, match="amplitude has shape"):
         cloud.with_amplitude(torch.zeros(2))

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
@@ -29,7 +30,9 @@ GRID = VolumeGrid((40, 42, 38), AFFINE)
 ALL = np.ones(GRID.shape, bool)
 
 
-def gaussians(mean, sigma, amplitude, rotation=None) -> GaussianCloud:
+def gaussians(
+    mean: ArrayLike, sigma: ArrayLike, amplitude: ArrayLike, rotation: Rotation | None = None
+) -> GaussianCloud:
     mean = np.atleast_2d(np.asarray(mean, float))
     n = len(mean)
     rotation = Rotation.identity(n) if rotation is None else rotation
@@ -42,7 +45,7 @@ def shown(cloud: GaussianCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("amplitude", [0.6, -0.3])
-def test_an_extremum_is_found_with_its_place_shape_and_height(amplitude: float):
+def test_an_extremum_is_found_with_its_place_shape_and_height(amplitude: float) -> None:
     turn = Rotation.from_rotvec([[0.4, -0.7, 0.2]])
     true = gaussians([[1.1, -2.0, 0.5]], [2.6, 1.8, 1.1], [amplitude], turn)
     extrema = find_extrema(shown(true), ALL, GRID, 1.2, 0.5)
@@ -55,13 +58,13 @@ def test_an_extremum_is_found_with_its_place_shape_and_height(amplitude: float):
     assert abs(float(thin @ torch.from_numpy(turn.as_matrix()[0][:, 2]).float())) > 0.95
 
 
-def test_a_residual_of_zero_has_no_extrema():
+def test_a_residual_of_zero_has_no_extrema() -> None:
     extrema = find_extrema(np.zeros(GRID.shape, np.float32), ALL, GRID, 1.2, 0.5)
     assert len(extrema) == 0
     assert len(extrema.cloud(GRID, GRID.center_mm)) == 0
 
 
-def test_local_rms_of_a_constant_is_the_constant_and_zero_outside():
+def test_local_rms_of_a_constant_is_the_constant_and_zero_outside() -> None:
     mask = ALL.copy()
     mask[:10] = False
     rms = local_rms(np.where(mask, -0.2, 5.0).astype(np.float32), mask, GRID, 1.5)
@@ -69,7 +72,7 @@ def test_local_rms_of_a_constant_is_the_constant_and_zero_outside():
     assert not rms[~mask].any()
 
 
-def test_density_is_exceeded_at_their_own_spacing_and_not_at_half_of_it():
+def test_density_is_exceeded_at_their_own_spacing_and_not_at_half_of_it() -> None:
     axis = np.arange(-12, 12.1, 2.0)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     lattice = gaussians(points, 1.2, np.ones(len(points)))
@@ -80,7 +83,9 @@ def test_density_is_exceeded_at_their_own_spacing_and_not_at_half_of_it():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1), tolerance=st.floats(1e-4, 3.0))
-def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolerance(seed, tolerance):
+def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolerance(
+    seed: int, tolerance: float
+) -> None:
     """The integral of the squared change, as the voxels see it, for one Gaussian and for one pair."""
     rng = np.random.default_rng(seed)
     one = gaussians(rng.uniform(-3, 3, (1, 3)), rng.uniform(1.0, 2.2, (1, 3)), rng.uniform(0.02, 0.5, 1))
@@ -98,17 +103,17 @@ def test_a_dropped_or_merged_gaussian_changes_the_volume_by_less_than_the_tolera
             torch.testing.assert_close(fewer.amplitude, cloud.amplitude)
 
 
-def test_duplicates_become_one_and_opposites_stay():
-    duplicates = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
+def test_duplicates_become_one_and_opposites_stay() -> None:
+    duplicates = gaussians([[0.0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, 0.2])
     merged = with_duplicates_merged(duplicates, 0.05)
     assert len(merged) == 1
     assert float(merged.mean_mm[0, 0]) == pytest.approx(0.1, abs=1e-5)
     assert np.abs(shown(duplicates) - shown(merged)).max() < 0.01
-    opposite = gaussians([[0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
+    opposite = gaussians([[0.0, 0, 0], [0.3, 0, 0]], 1.5, [0.4, -0.2])
     assert len(with_duplicates_merged(opposite, 0.05)) == 2
 
 
-def test_clouds_of_none_or_one_pass_through():
+def test_clouds_of_none_or_one_pass_through() -> None:
     one = gaussians([[0, 0, 0]], 1.5, [1.0])
     none = one.take(torch.zeros(1, dtype=torch.bool))
     assert len(with_duplicates_merged(one, 1.0)) == 1

@@ -11,7 +11,7 @@ from g3r.geometry import RigidPose
 from tests.gaussians.scenes import assert_same_images, images, make_cloud, make_planes, single
 
 
-def test_moving_the_whole_world_changes_nothing():
+def test_moving_the_whole_world_changes_nothing() -> None:
     cloud, planes = make_cloud(5, 10), make_planes(5)
     motion = RigidPose.from_rotvec([[0.7, -1.1, 0.4]], [[12.0, -30, 8]])
     turn = Rotation.from_matrix(motion.rotation[0])
@@ -27,14 +27,14 @@ def test_moving_the_whole_world_changes_nothing():
     assert_same_images((cloud, planes), (moved, planes.moved(motion)))
 
 
-def test_the_order_of_gaussians_does_not_matter():
+def test_the_order_of_gaussians_does_not_matter() -> None:
     cloud, planes = make_cloud(6, 30), make_planes(6)
     assert_same_images(
         (cloud, planes), (cloud.take(torch.randperm(30, generator=torch.Generator().manual_seed(0))), planes)
     )
 
 
-def test_q_and_minus_q_and_their_length_do_not_matter():
+def test_q_and_minus_q_and_their_length_do_not_matter() -> None:
     cloud, planes = make_cloud(7, 10), make_planes(7)
     for factor in (-1.0, 3.7, -1e-3):
         other = GaussianCloud(
@@ -43,13 +43,13 @@ def test_q_and_minus_q_and_their_length_do_not_matter():
         assert_same_images((cloud, planes), (other, planes))
 
 
-def test_the_origin_is_only_a_number():
+def test_the_origin_is_only_a_number() -> None:
     cloud, planes = make_cloud(8, 10), make_planes(8)
     other = GaussianCloud(cloud.mean_mm + 3.0, *cloud.parameters[1:], cloud.origin_mm - 3.0)
     assert_same_images((cloud, planes), (other, planes))
 
 
-def test_ten_metres_from_the_origin_no_digit_is_lost():
+def test_ten_metres_from_the_origin_no_digit_is_lost() -> None:
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
     away = GaussianCloud(*cloud.parameters, far)
@@ -64,7 +64,7 @@ def test_ten_metres_from_the_origin_no_digit_is_lost():
         assert np.abs(first - second).max() < 1e-6 * np.abs(first).max()
 
 
-def test_intensities_scale_with_the_amplitudes():
+def test_intensities_scale_with_the_amplitudes() -> None:
     cloud, planes = single(make_cloud(10, 10)), make_planes(10)
     plain = render(cloud, planes)
     for factor in (1e-6, 1e6, -1.0):
@@ -77,7 +77,7 @@ def test_intensities_scale_with_the_amplitudes():
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-def test_gain_and_twist_are_what_they_say(backend: str):
+def test_gain_and_twist_are_what_they_say(backend: str) -> None:
     cloud, planes = make_cloud(11, 10), make_planes(11)
     cloud = cloud if backend == "reference" else single(cloud)
     rng = np.random.default_rng(11)

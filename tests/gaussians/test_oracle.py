@@ -50,7 +50,7 @@ def quadrature(cloud: GaussianCloud, planes: Planes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_both_backends_agree_with_quadrature(seed: int):
+def test_both_backends_agree_with_quadrature(seed: int) -> None:
     cloud, planes = make_cloud(seed, 4), make_planes(seed + 10, n=2, shape=(4, 3))
     expected = quadrature(cloud, planes)
     scale = np.abs(expected).max()
@@ -64,14 +64,14 @@ def test_both_backends_agree_with_quadrature(seed: int):
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-def test_the_printed_attenuation_is_off_by_the_factor_of_the_design(backend: str):
+def test_the_printed_attenuation_is_off_by_the_factor_of_the_design(backend: str) -> None:
     """0.53 at sigma 1 mm, 0.8 mm pixels, 3 mm slices; quadrature sides with the exact form."""
     one = cloud_of(np.zeros((1, 3)), np.zeros((1, 3)), [[1.0, 0, 0, 0]], [1.0])
     planes = Planes(
         rotation=np.eye(3)[None],
         center_mm=np.zeros((1, 3)),
-        spacing_mm=[[0.8, 0.8]],
-        shape=[[1, 1]],
+        spacing_mm=np.array([[0.8, 0.8]]),
+        shape=np.array([[1, 1]]),
         psf_var_mm2=psf_variance_mm2([[0.8, 0.8]], np.array([3.0])),
     )
     exact = render(one, planes, backend=backend).item()
@@ -81,7 +81,7 @@ def test_the_printed_attenuation_is_off_by_the_factor_of_the_design(backend: str
 
 
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-def test_without_psf_a_plane_samples_the_volume(backend: str):
+def test_without_psf_a_plane_samples_the_volume(backend: str) -> None:
     cloud, planes = make_cloud(3, 8), make_planes(3, psf=0.0, shape=(20, 15))
     expected = volume_at(cloud, planes.pixel_world_mm())
     if backend == "reference":
@@ -91,7 +91,7 @@ def test_without_psf_a_plane_samples_the_volume(backend: str):
         assert np.abs(found - expected).max() < 3e-6 * np.abs(expected).max()
 
 
-def test_a_volume_is_its_planes():
+def test_a_volume_is_its_planes() -> None:
     cloud = make_cloud(4, 8)
     affine = np.diag([-1.0, 1.2, 0.9, 1])
     affine[:3, 3] = cloud.origin_mm + np.array([4, -5, -4])
@@ -101,7 +101,7 @@ def test_a_volume_is_its_planes():
     np.testing.assert_allclose(render(cloud, volume_planes(grid), backend="reference"), expected, atol=1e-12)
 
 
-def test_one_gaussian_and_one_pixel():
+def test_one_gaussian_and_one_pixel() -> None:
     cloud, planes = make_cloud(14, 1), make_planes(14, n=1, shape=(1, 1))
     assert_same_images((cloud, planes), (cloud, planes))
     assert render(cloud, planes, backend="reference").item() == pytest.approx(quadrature(cloud, planes)[0], rel=1e-8)

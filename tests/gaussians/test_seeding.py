@@ -19,7 +19,7 @@ INDEX = np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij")
 BALL = ((INDEX - (np.array(GRID.shape) - 1) / 2) ** 2).sum(-1) < 17**2
 
 
-def test_seeds_lie_in_the_mask_and_are_as_many_as_asked_for():
+def test_seeds_lie_in_the_mask_and_are_as_many_as_asked_for() -> None:
     for spacing in (2.0, 3.0):
         cloud = seed_cloud(np.ones(GRID.shape, np.float32), BALL, GRID, spacing)
         world = cloud.mean_mm.double().numpy() + cloud.origin_mm
@@ -29,7 +29,7 @@ def test_seeds_lie_in_the_mask_and_are_as_many_as_asked_for():
 
 
 @pytest.mark.parametrize("spacing", [2.0, 3.0])
-def test_a_constant_comes_out_flat(spacing: float):
+def test_a_constant_comes_out_flat(spacing: float) -> None:
     volume = np.full(GRID.shape, 0.7, np.float32)
     cloud = seed_cloud(volume, BALL, GRID, spacing)
     sigma = cloud.log_scale.exp()
@@ -40,7 +40,7 @@ def test_a_constant_comes_out_flat(spacing: float):
     assert np.abs(found[middle] - 0.7).max() < 0.03 * 0.7
 
 
-def test_seeds_are_flat_across_an_edge():
+def test_seeds_are_flat_across_an_edge() -> None:
     """At a step along the grid's third axis the smallest sigma points across it, in world axes."""
     volume = (INDEX[..., 2] > 18.5).astype(np.float32)
     cloud = seed_cloud(volume, BALL, GRID, 2.0)
@@ -58,12 +58,12 @@ def test_seeds_are_flat_across_an_edge():
     torch.testing.assert_close(log_scale.mean(1).exp(), torch.full((int(edge.sum()),), 1.2).double(), rtol=1e-4, atol=0)
 
 
-def test_an_empty_foreground_is_refused():
+def test_an_empty_foreground_is_refused() -> None:
     with pytest.raises(ValueError, match="foreground is empty"):
         seed_cloud(np.ones(GRID.shape, np.float32), np.zeros(GRID.shape, bool), GRID, 2.0)
 
 
-def test_a_foreground_of_one_voxel_is_no_error():
+def test_a_foreground_of_one_voxel_is_no_error() -> None:
     mask = np.zeros(GRID.shape, bool)
     mask[20, 20, 20] = True
     cloud = seed_cloud(np.ones(GRID.shape, np.float32), mask, GRID, 2.0)

@@ -1,5 +1,7 @@
 """Voxel grids: index and world, the box that they cover, refusals."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,7 +28,7 @@ AXES = {
 
 @pytest.mark.parametrize("origin", [(-40.0, 30.0, 12.5), (1e4, -1e4, 1e4)])
 @pytest.mark.parametrize("name", AXES)
-def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, float]):
+def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, float]) -> None:
     grid = VolumeGrid((30, 41, 17), affine_of(AXES[name], (0.7, 0.8, 3.3), origin))
     index = np.random.default_rng(0).uniform(-5, 45, (200, 3))
     world = grid.world(index)
@@ -39,7 +41,7 @@ def test_world_and_index_are_inverse(name: str, origin: tuple[float, float, floa
 
 @pytest.mark.parametrize("spacing", [0.5, 0.8, 3.0])
 @pytest.mark.parametrize("margin", [0.0, 5.0])
-def test_isotropic_covers_its_box_and_little_more(spacing: float, margin: float):
+def test_isotropic_covers_its_box_and_little_more(spacing: float, margin: float) -> None:
     low, high = np.array([-31.2, -40.05, 7.0]), np.array([28.3, 41.0, 7.3])
     grid = VolumeGrid.isotropic(low, high, spacing, margin)
     first, last = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
@@ -50,7 +52,7 @@ def test_isotropic_covers_its_box_and_little_more(spacing: float, margin: float)
     np.testing.assert_allclose(grid.center_mm, (low + high) / 2, atol=1e-12)
 
 
-def test_isotropic_of_a_point_is_one_voxel():
+def test_isotropic_of_a_point_is_one_voxel() -> None:
     grid = VolumeGrid.isotropic([1, 2, 3], [1, 2, 3], 0.8)
     assert grid.shape == (1, 1, 1)
     np.testing.assert_allclose(grid.world([0, 0, 0]), [1, 2, 3])
@@ -67,23 +69,23 @@ def test_isotropic_of_a_point_is_one_voxel():
         ((3, 3, 3), np.array([[1.0, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "singular"),
     ],
 )
-def test_what_is_no_grid_is_refused(shape, affine, message):
+def test_what_is_no_grid_is_refused(shape: Any, affine: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         VolumeGrid(shape, affine)
 
 
-def test_small_voxels_are_not_taken_for_singular():
+def test_small_voxels_are_not_taken_for_singular() -> None:
     assert VolumeGrid((3, 3, 3), np.diag([1e-4, 1e-4, 1e-4, 1])).voxel_volume_mm3 == pytest.approx(1e-12)
 
 
-def test_a_moved_grid_has_its_voxels_where_the_motion_puts_them():
+def test_a_moved_grid_has_its_voxels_where_the_motion_puts_them() -> None:
     grid = VolumeGrid((3, 4, 5), affine_of(AXES["LAS"], (0.8, 1.0, 2.0), (4.0, -3.0, 2.0)))
     motion = RigidPose.from_rotvec([[0.3, -0.2, 0.1]], [[5.0, 6.0, -7.0]])
     index = np.array([[0.0, 0, 0], [2, 3, 4]])
     np.testing.assert_allclose(grid.moved(motion).world(index), motion.apply(grid.world(index)[None])[0], atol=1e-12)
 
 
-def test_a_bounding_box_holds_the_mask_and_its_grid_the_same_places():
+def test_a_bounding_box_holds_the_mask_and_its_grid_the_same_places() -> None:
     mask = np.zeros((7, 9, 5), bool)
     mask[2:5, 4, 1:3] = True
     mask[3, 6, 1] = True
@@ -99,7 +101,7 @@ def test_a_bounding_box_holds_the_mask_and_its_grid_the_same_places():
         bounding_box(np.zeros((3, 3, 3), bool))
 
 
-def test_a_map_read_on_another_grid_is_trilinear_and_known_outside(rng: np.random.Generator):
+def test_a_map_read_on_another_grid_is_trilinear_and_known_outside(rng: np.random.Generator) -> None:
     source = VolumeGrid.isotropic((0, 0, 0), (9, 9, 9), 1.0)
     data = np.add.outer(np.add.outer(np.arange(10.0), 2 * np.arange(10)), 3 * np.arange(10))
     target = VolumeGrid.isotropic((2, 2, 2), (12, 5, 5), 0.5)

@@ -13,13 +13,13 @@ def poses(seed: int, n: int) -> RigidPose:
     return RigidPose(Rotation.random(n, rng=rng).as_matrix(), rng.normal(0, 50, (n, 3)))
 
 
-def test_composition_applies_the_right_one_first():
+def test_composition_applies_the_right_one_first() -> None:
     a, b = poses(0, 4), poses(1, 4)
     points = np.random.default_rng(2).normal(0, 100, (4, 7, 3))
     np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-11)
 
 
-def test_a_single_motion_is_broadcast_on_either_side():
+def test_a_single_motion_is_broadcast_on_either_side() -> None:
     one, many = poses(3, 1), poses(4, 5)
     points = np.random.default_rng(5).normal(0, 100, (5, 2, 3))
     np.testing.assert_allclose(
@@ -30,14 +30,14 @@ def test_a_single_motion_is_broadcast_on_either_side():
     )
 
 
-def test_inverse_undoes():
+def test_inverse_undoes() -> None:
     pose = poses(6, 8)
     for round_trip in (pose @ pose.inverse(), pose.inverse() @ pose):
         np.testing.assert_allclose(round_trip.rotation, RigidPose.identity(8).rotation, atol=1e-14)
         np.testing.assert_allclose(round_trip.translation_mm, 0, atol=1e-12)
 
 
-def test_rotations_stay_orthonormal_over_many_compositions():
+def test_rotations_stay_orthonormal_over_many_compositions() -> None:
     step = poses(7, 1)
     pose = RigidPose.identity(1)
     for _ in range(500):
@@ -47,7 +47,7 @@ def test_rotations_stay_orthonormal_over_many_compositions():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 1.0, np.pi - 1e-7, np.pi])
-def test_rotation_vector_round_trip(angle: float):
+def test_rotation_vector_round_trip(angle: float) -> None:
     axis = np.array([[1.0, 0, 0], [0, -1, 0], [0.6, 0, 0.8], [1, 2, -2]])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     pose = RigidPose.from_rotvec(angle * axis, np.zeros((4, 3)))
@@ -59,7 +59,7 @@ def test_rotation_vector_round_trip(angle: float):
         np.testing.assert_allclose(back, angle * axis, atol=1e-14, rtol=1e-9)
 
 
-def test_rotation_matrix_keeps_leading_axes():
+def test_rotation_matrix_keeps_leading_axes() -> None:
     vectors = np.random.default_rng(8).normal(size=(2, 5, 3))
     assert rotation_matrix(vectors).shape == (2, 5, 3, 3)
     np.testing.assert_array_equal(rotation_matrix(vectors)[1, 3], rotation_matrix(vectors[1, 3]))
@@ -78,17 +78,17 @@ def test_rotation_matrix_keeps_leading_axes():
         (np.eye(3)[None], np.zeros((2, 3)), "translation_mm"),
     ],
 )
-def test_what_is_no_motion_is_refused(rotation, translation, message):
+def test_what_is_no_motion_is_refused(rotation: np.ndarray, translation: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RigidPose(rotation, translation)
 
 
-def test_no_motions_at_all_are_fine():
+def test_no_motions_at_all_are_fine() -> None:
     none = RigidPose.identity(0)
     assert len(none @ none.inverse()) == 0
 
 
-def test_orthonormal_gives_the_nearest_proper_rotation():
+def test_orthonormal_gives_the_nearest_proper_rotation() -> None:
     rng = np.random.default_rng(9)
     rotation = Rotation.random(20, rng=rng).as_matrix()
     found = orthonormal(rotation + rng.normal(0, 1e-3, rotation.shape))
@@ -98,7 +98,7 @@ def test_orthonormal_gives_the_nearest_proper_rotation():
     np.testing.assert_allclose(np.linalg.det(mirrored), 1, atol=1e-12)
 
 
-def test_fit_rigid_recovers_a_known_motion():
+def test_fit_rigid_recovers_a_known_motion() -> None:
     rng = np.random.default_rng(10)
     truth, source = poses(11, 1), rng.normal(0, 30, (40, 3))
     found = fit_rigid(source, truth.apply(source[None])[0])
@@ -106,7 +106,7 @@ def test_fit_rigid_recovers_a_known_motion():
     np.testing.assert_allclose(found.translation_mm, truth.translation_mm, atol=1e-10)
 
 
-def test_fit_rigid_leaves_out_points_of_weight_zero():
+def test_fit_rigid_leaves_out_points_of_weight_zero() -> None:
     rng = np.random.default_rng(12)
     truth, source = poses(13, 1), rng.normal(0, 30, (40, 3))
     target = truth.apply(source[None])[0]
@@ -116,7 +116,7 @@ def test_fit_rigid_leaves_out_points_of_weight_zero():
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
 
 
-def test_fit_rigid_of_points_in_a_plane_is_no_mirror_image():
+def test_fit_rigid_of_points_in_a_plane_is_no_mirror_image() -> None:
     rng = np.random.default_rng(14)
     truth = poses(15, 1)
     source = np.concatenate([rng.normal(0, 30, (40, 2)), np.zeros((40, 1))], axis=1)
@@ -124,7 +124,7 @@ def test_fit_rigid_of_points_in_a_plane_is_no_mirror_image():
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
 
 
-def test_fit_rigid_robust_is_not_tilted_by_points_that_went_astray(rng: np.random.Generator):
+def test_fit_rigid_robust_is_not_tilted_by_points_that_went_astray(rng: np.random.Generator) -> None:
     truth = RigidPose.from_rotvec([[0.2, -0.4, 0.3]], [[5.0, -3, 9]])
     source = rng.normal(0, 30, (200, 3))
     target = truth.apply(source[None])[0]
@@ -139,7 +139,7 @@ def test_fit_rigid_robust_is_not_tilted_by_points_that_went_astray(rng: np.rando
     np.testing.assert_allclose(exact.translation_mm, truth.translation_mm, atol=1e-9)
 
 
-def test_rows_are_replaced_and_records_joined():
+def test_rows_are_replaced_and_records_joined() -> None:
     poses = RigidPose.from_rotvec(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
     changed = poses.with_rows(np.array([0, 2]), RigidPose.identity(2))
     np.testing.assert_array_equal(changed.translation_mm[[0, 2]], 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ CHANGES: dict[str, tuple[float, RigidPose | None]] = {
 }
 
 
-def volume_changes() -> list[dict[str, float | str]]:
+def volume_changes() -> list[dict[str, Any]]:
     """For each change: how far the head is from that of the plain reconstruction, over its 99th percentile.
 
     Both clouds are rendered at the same points of the head, which move with the world. Beside it stands the

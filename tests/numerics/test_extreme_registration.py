@@ -15,6 +15,7 @@ from g3r.registration import RegistrationSettings
 from g3r.registration.similarity import correlation
 from g3r.registration.slice_rounds import refine_slices
 from tests.numerics.fits import slices_of_small_head
+from tests.tally import Tally
 
 ROUNDS = RegistrationSettings(n_rounds=3, steps_per_round=2, finest_voxel_mm=1.6)
 
@@ -48,7 +49,7 @@ CASES: dict[str, Callable[[], Slices]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_slices_of_any_kind_end_in_finite_poses(name: str, tally):
+def test_slices_of_any_kind_end_in_finite_poses(name: str, tally: Tally) -> None:
     slices = CASES[name]()
     with tally.case():
         found = refine_slices(slices, ROUNDS)
@@ -61,7 +62,7 @@ def test_slices_of_any_kind_end_in_finite_poses(name: str, tally):
             assert np.median(moved) < 1.5
 
 
-def test_ten_metres_make_no_difference(tally):
+def test_ten_metres_make_no_difference(tally: Tally) -> None:
     with tally.case():
         near, far = refine_slices(plain(), ROUNDS), refine_slices(far_away(), ROUNDS)
         back = far.slices.planes.center_mm - [1e4, -1e4, 1e4]
@@ -70,7 +71,7 @@ def test_ten_metres_make_no_difference(tally):
 
 
 @pytest.mark.parametrize("loss", [0.0, 1e-30, 1.0, 1e30])
-def test_equal_slices_are_trusted_alike(loss: float, tally):
+def test_equal_slices_are_trusted_alike(loss: float, tally: Tally) -> None:
     with tally.case():
         assert (slice_weights(np.full(9, loss)) == 1).all()
         one_bad = slice_weights(np.array([loss] * 9 + [loss * 100 + 1e-3]))
@@ -79,7 +80,7 @@ def test_equal_slices_are_trusted_alike(loss: float, tally):
         assert (one_bad[:9] == 1).all()
 
 
-def test_a_correlation_without_variance_is_zero(tally):
+def test_a_correlation_without_variance_is_zero(tally: Tally) -> None:
     with tally.case():
         y, m = np.full(50, 3.0), np.linspace(0, 1, 50)
         moments = np.array([[50, y.sum(), m.sum(), (y * y).sum(), (m * m).sum(), (y * m).sum()], np.zeros(6)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,9 +23,10 @@ from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
 from tests.numerics.fits import fit_at, slices_of_small_head, step_size_rows, times, volume_changes
 from tests.numerics.scenes import head_scene, single
+from tests.tally import Tally
 
 
-def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options) -> SliceFit:
+def fit(cloud: GaussianCloud, slices: Slices, prior: VolumeTarget | None = None, **options: Any) -> SliceFit:
     ones = np.ones(len(slices))
     settings = SliceStageSettings(**({"n_steps": 25, "reweight_every": 10} | options))
     return fit_slices(
@@ -77,9 +79,9 @@ DEGENERATE = {
     "one pixel": lambda: (seeded(), with_mask([100])),
     "no pixel": lambda: (seeded(), with_mask(slice(0, 0))),
     "slices in one place": lambda: (seeded(), turned_on_themselves()),
-    "one Gaussian": lambda: (seeded().take([40]), slices_of_small_head()[0]),
-    "no Gaussian": lambda: (seeded().take([]), slices_of_small_head()[0]),
-    "identical Gaussians": lambda: (seeded().take([40] * 30), slices_of_small_head()[0]),
+    "one Gaussian": lambda: (seeded().take(torch.tensor([40])), slices_of_small_head()[0]),
+    "no Gaussian": lambda: (seeded().take(torch.arange(0)), slices_of_small_head()[0]),
+    "identical Gaussians": lambda: (seeded().take(torch.tensor([40] * 30)), slices_of_small_head()[0]),
     "Gaussians as large as the head": lambda: (grown(seeded(), 3.0), slices_of_small_head()[0]),
     "Gaussians far below a pixel": lambda: (grown(seeded(), -4.5), slices_of_small_head()[0]),
     "Gaussians beside the slices": lambda: (shifted(seeded(), 300.0), slices_of_small_head()[0]),
@@ -97,7 +99,7 @@ def shifted(cloud: GaussianCloud, by_mm: float) -> GaussianCloud:
 
 @pytest.mark.parametrize("amplitudes_first", [True, False])
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_fits_end_in_finite_numbers(name: str, amplitudes_first: bool, tally):
+def test_degenerate_fits_end_in_finite_numbers(name: str, amplitudes_first: bool, tally: Tally) -> None:
     cloud, slices = DEGENERATE[name]()
     with tally.case():
         result = fit(cloud, slices, n_steps=15, amplitude_iterations=6 if amplitudes_first else 0)
@@ -105,7 +107,7 @@ def test_degenerate_fits_end_in_finite_numbers(name: str, amplitudes_first: bool
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
-def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally):
+def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally: Tally) -> None:
     _, grid, _, mask = slices_of_small_head()
     cloud = single(head_scene(np.zeros(3)).cloud)
     from g3r.acquisition.planes import volume_from_pixels, volume_planes
@@ -126,7 +128,7 @@ def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally
 
 
 @pytest.mark.parametrize("factor", [10.0, 100.0])
-def test_steps_that_are_too_large_are_taken_back(factor: float, tally, caplog):
+def test_steps_that_are_too_large_are_taken_back(factor: float, tally: Tally, caplog: pytest.LogCaptureFixture) -> None:
     plain = fit_at(1.0, n_steps=40)
     slices = slices_of_small_head()[0]
     with tally.case():
@@ -143,19 +145,19 @@ def test_steps_that_are_too_large_are_taken_back(factor: float, tally, caplog):
     assert residual(rash) < 1.5 * residual(plain)
 
 
-def test_without_the_safeguard_they_end_worse_or_not_at_all():
+def test_without_the_safeguard_they_end_worse_or_not_at_all() -> None:
     with pytest.raises(NumericalError):
         fit_at(100.0, guarded=False)
 
 
-def test_a_fit_that_goes_well_takes_the_same_steps_with_the_safeguard():
+def test_a_fit_that_goes_well_takes_the_same_steps_with_the_safeguard() -> None:
     with_it, without = fit_at(1.0, n_steps=25), fit_at(1.0, guarded=False, n_steps=25)
     assert with_it.history == without.history
     for a, b in zip(with_it.cloud.parameters, without.cloud.parameters, strict=True):
         assert torch.equal(a, b)
 
 
-def test_stage_1_steps_back_as_well(monkeypatch, caplog):
+def test_stage_1_steps_back_as_well(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     _, grid, _, mask = slices_of_small_head()
     from g3r.acquisition.planes import volume_from_pixels, volume_planes
 
@@ -181,7 +183,7 @@ def one_gaussian() -> FitParameters:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 100.0])
-def test_a_bad_loss_brings_the_best_state_back_with_shorter_steps(bad: float):
+def test_a_bad_loss_brings_the_best_state_back_with_shorter_steps(bad: float) -> None:
     parameters = one_gaussian()
     parameters.gradients[:] = 1.0
     guard = DivergenceGuard(parameters, level=1.0)
@@ -200,7 +202,7 @@ def test_a_bad_loss_brings_the_best_state_back_with_shorter_steps(bad: float):
     assert shorter == pytest.approx(divergence_guard.SHORTER * np.abs(parameters.values - best).max(), rel=1e-4)
 
 
-def test_a_bad_gradient_after_good_steps_goes_back_and_one_at_the_start_is_an_error():
+def test_a_bad_gradient_after_good_steps_goes_back_and_one_at_the_start_is_an_error() -> None:
     parameters = one_gaussian()
     guard = DivergenceGuard(parameters, level=1.0)
     best = parameters.values.copy()
@@ -213,7 +215,7 @@ def test_a_bad_gradient_after_good_steps_goes_back_and_one_at_the_start_is_an_er
         DivergenceGuard(parameters, level=1.0).step(0.5, 1.0)
 
 
-def test_a_fit_ends_at_its_best_state_if_it_never_came_back_to_it():
+def test_a_fit_ends_at_its_best_state_if_it_never_came_back_to_it() -> None:
     parameters = one_gaussian()
     parameters.gradients[:] = 1.0
     guard = DivergenceGuard(parameters, level=1.0)
@@ -225,7 +227,7 @@ def test_a_fit_ends_at_its_best_state_if_it_never_came_back_to_it():
     assert np.array_equal(parameters.values, best)
 
 
-def test_a_small_rise_is_no_reason_to_go_back():
+def test_a_small_rise_is_no_reason_to_go_back() -> None:
     parameters = one_gaussian()
     guard = DivergenceGuard(parameters, level=1.0)
     assert guard.step(0.010, 1.0)
@@ -239,7 +241,7 @@ def test_a_small_rise_is_no_reason_to_go_back():
 
 
 @pytest.mark.parametrize("tau", [(0.8, 0.2), (-0.1, 0.5), (0.5, 1.1), (math.nan, 0.5), (0.5, math.inf)])
-def test_annealing_outside_or_reversed_is_refused(tau: tuple[float, float], tally):
+def test_annealing_outside_or_reversed_is_refused(tau: tuple[float, float], tally: Tally) -> None:
     with tally.refusal():
         AnnealedWeight(0.5, 0.1, *tau)
     with pytest.raises(InputError, match="tau_1"):
@@ -247,7 +249,7 @@ def test_annealing_outside_or_reversed_is_refused(tau: tuple[float, float], tall
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.5, 1.0])
-def test_annealing_in_one_step_fits(tau: float, tally):
+def test_annealing_in_one_step_fits(tau: float, tally: Tally) -> None:
     _, grid, guess, mask = slices_of_small_head()
     prior = VolumeTarget.of(guess, mask.astype(np.float32), grid)
     with tally.case():
@@ -265,7 +267,7 @@ def test_annealing_in_one_step_fits(tau: float, tally):
 
 
 @pytest.mark.numerics
-def test_the_table_of_step_sizes(tally):
+def test_the_table_of_step_sizes(tally: Tally) -> None:
     rows = step_size_rows()
     for row in rows:
         if row["guarded"]:
@@ -280,7 +282,7 @@ def test_the_table_of_step_sizes(tally):
 
 
 @pytest.mark.numerics
-def test_the_table_of_changes_that_change_nothing(tally):
+def test_the_table_of_changes_that_change_nothing(tally: Tally) -> None:
     rows = {row["change"]: row for row in volume_changes()}
     plain = rows["none"]["error"]
     for name, row in rows.items():

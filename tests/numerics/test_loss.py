@@ -8,6 +8,7 @@ away from what is rendered, so that central differences of 1e-5 stay on one side
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from g3r.fitting.slice_parameters import slice_blocks
 from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
 from tests.numerics.scenes import head_scene, single
+from tests.tally import Tally
 
 CLOUD = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
 STEP = 1e-5
@@ -169,7 +171,7 @@ class CompleteLoss:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.numerics)])
-def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int, tally):
+def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int, tally: Tally) -> None:
     complete = CompleteLoss(seed)
     value, entry = complete.loss.evaluate(FRACTION)
     assert {"image", "distillation", "distillation_weight"} <= set(entry)
@@ -184,16 +186,17 @@ def test_every_gradient_of_the_complete_loss_is_the_finite_difference(seed: int,
             assert np.abs(found - exact).max() <= 1e-4 * np.abs(exact).max(), name
 
 
-def test_a_wrong_term_would_be_seen(tally):
+def test_a_wrong_term_would_be_seen(tally: Tally) -> None:
     """Each term, left out of the float64 loss, changes some gradient by far more than the tolerance."""
     complete = CompleteLoss(0)
     complete.loss.evaluate(FRACTION)
-    for name, change in {
+    changes: dict[str, dict[str, Any]] = {
         "scale": {"scale_weight": 0.0},
         "poses": {"pose_prior_mm": 1e9},
         "bias field": {"bias_field_ridge": 0.0},
         "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
-    }.items():
+    }
+    for name, change in changes.items():
         before = {n: g.copy() for n, g in complete.parameters.gradient.items()}
         complete.loss_with(replace(SETTINGS, **change)).evaluate(FRACTION)
         moved = [

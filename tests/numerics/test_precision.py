@@ -12,12 +12,14 @@ from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_f
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from tests.gradients import gradient_of
 from tests.numerics.scenes import head_scene, single
+from tests.tally import Tally
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("backend", ["reference", "numba"])
-def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype, tally):
+def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype, tally: Tally) -> None:
     scene = head_scene()
 
     def pixels_and_gradients(mixed: bool) -> list[torch.Tensor]:
@@ -27,7 +29,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
         with torch.autocast("cpu", dtype, enabled=mixed):  # backward passes belong outside of it
             pixels = render(cloud, scene.planes, twist=twist, backend=backend)
         pixels.square().sum().backward()
-        return [pixels.detach(), *(leaf.grad for leaf in (*leaves, twist))]
+        return [pixels.detach(), *(gradient_of(leaf) for leaf in (*leaves, twist))]
 
     plain = pixels_and_gradients(False)
     with tally.case():
@@ -36,7 +38,7 @@ def test_the_renderer_does_not_notice_autocast(backend: str, dtype: torch.dtype,
             assert torch.equal(a, b)
 
 
-def test_a_renderer_under_autocast_would_be_wrong():
+def test_a_renderer_under_autocast_would_be_wrong() -> None:
     """The naive formula under the same autocast: why the reference switches it off."""
     from tests.numerics.oracles import naive_render
 
@@ -47,7 +49,7 @@ def test_a_renderer_under_autocast_would_be_wrong():
     assert not (found - exact).abs().max() < 1e-3 * exact.max()
 
 
-def test_poses_under_autocast_are_those_without(tally):
+def test_poses_under_autocast_are_those_without(tally: Tally) -> None:
     torch.manual_seed(0)
     network = PoseNetwork(PoseNetworkConfig(channels=(4, 8, 8), width=16, n_blocks=1, n_heads=2)).eval()
     network.set_template(torch.rand(2, 6, 6, 6))
@@ -73,7 +75,7 @@ def test_poses_under_autocast_are_those_without(tally):
                     assert torch.equal(one, other)
 
 
-def test_points_and_rotations_of_training_keep_float32(tally):
+def test_points_and_rotations_of_training_keep_float32(tally: Tally) -> None:
     rng = torch.Generator().manual_seed(0)
     matrix, points = torch.randn(5, 3, 3, generator=rng), 25 * torch.randn(4, 3, generator=rng)
     rotation, shift = nearest_rotation(matrix), torch.randn(5, 3, generator=rng)
@@ -92,7 +94,7 @@ def moved_points_plainly(rotation: torch.Tensor, shift: torch.Tensor, points: to
 
 
 @pytest.mark.parametrize("density", [0.0, 1.0, 1e6])
-def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally):
+def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally: Tally) -> None:
     """Rounding reaches the residual alone; where slices are dense the gate passes a twentieth of it."""
     torch.manual_seed(0)
     config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False)

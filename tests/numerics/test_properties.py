@@ -16,6 +16,7 @@ from g3r.geometry.rigid import fit_rigid
 from tests.numerics.errors import shape_tolerance
 from tests.numerics.fast_backends import BACKENDS
 from tests.numerics.scenes import Scene, cloud_of, single
+from tests.tally import Tally
 
 QUICK = settings(
     max_examples=40,
@@ -53,7 +54,9 @@ def scenes(draw: st.DrawFn) -> tuple[Scene, float]:
 
 @given(scenes(), st.sampled_from(["numba", "objective", "amplitudes", "reference32"]))
 @QUICK
-def test_random_scenes_agree_with_the_reference(tally, scene_and_ratio, backend: str):
+def test_random_scenes_agree_with_the_reference(
+    tally: Tally, scene_and_ratio: tuple[Scene, float], backend: str
+) -> None:
     scene, ratio = scene_and_ratio
     weight = torch.tensor(np.random.default_rng(0).normal(size=scene.planes.n_pixels))
     expected, exact_gradient = BACKENDS["reference64"](scene.cloud, scene.planes, weight)
@@ -72,7 +75,9 @@ def test_random_scenes_agree_with_the_reference(tally, scene_and_ratio, backend:
 
 @given(scenes(), st.floats(-3, 3), st.integers(0, 2**32 - 1))
 @QUICK
-def test_images_are_linear_in_the_peaks(tally, scene_and_ratio, factor: float, seed: int):
+def test_images_are_linear_in_the_peaks(
+    tally: Tally, scene_and_ratio: tuple[Scene, float], factor: float, seed: int
+) -> None:
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     other = cloud.with_amplitude(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
@@ -88,7 +93,9 @@ def test_images_are_linear_in_the_peaks(tally, scene_and_ratio, factor: float, s
 
 @given(scenes())
 @QUICK
-def test_least_squares_never_leaves_the_numbers_nor_fits_worse(tally, scene_and_ratio):
+def test_least_squares_never_leaves_the_numbers_nor_fits_worse(
+    tally: Tally, scene_and_ratio: tuple[Scene, float]
+) -> None:
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     target = np.random.default_rng(1).normal(size=scene.planes.n_pixels).astype(np.float32)
@@ -125,7 +132,7 @@ def size_mm(*all_poses: RigidPose) -> float:
 
 @given(poses())
 @QUICK
-def test_a_pose_and_its_inverse_are_nothing(tally, pose: RigidPose):
+def test_a_pose_and_its_inverse_are_nothing(tally: Tally, pose: RigidPose) -> None:
     with tally.case():
         nothing = RigidPose.identity(len(pose))
         assert_near(pose @ pose.inverse(), nothing, size_mm(pose))
@@ -136,7 +143,9 @@ def test_a_pose_and_its_inverse_are_nothing(tally, pose: RigidPose):
 
 @given(poses(), poses(), poses(), st.integers(0, 2**32 - 1))
 @QUICK
-def test_composition_is_associative_and_is_applying_one_after_the_other(tally, a, b, c, seed: int):
+def test_composition_is_associative_and_is_applying_one_after_the_other(
+    tally: Tally, a: RigidPose, b: RigidPose, c: RigidPose, seed: int
+) -> None:
     a, b, c = (pose.take([0]) for pose in (a, b, c))
     points = np.random.default_rng(seed).normal(0, 100, (1, 7, 3))
     with tally.case():
@@ -149,7 +158,7 @@ def test_composition_is_associative_and_is_applying_one_after_the_other(tally, a
 
 @given(poses())
 @QUICK
-def test_rotation_vectors_come_back(tally, pose: RigidPose):
+def test_rotation_vectors_come_back(tally: Tally, pose: RigidPose) -> None:
     with tally.case():
         vector = pose.rotvec_rad()
         assert (np.linalg.norm(vector, axis=1) <= np.pi + 1e-12).all()
@@ -160,7 +169,7 @@ def test_rotation_vectors_come_back(tally, pose: RigidPose):
 
 @given(poses(), st.integers(0, 2**32 - 1))
 @QUICK
-def test_the_motion_of_points_is_found_again(tally, pose: RigidPose, seed: int):
+def test_the_motion_of_points_is_found_again(tally: Tally, pose: RigidPose, seed: int) -> None:
     pose = pose.take([0])
     points = np.random.default_rng(seed).normal(0, 40, (30, 3))
     with tally.case():
@@ -171,7 +180,7 @@ def test_the_motion_of_points_is_found_again(tally, pose: RigidPose, seed: int):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300))
 @QUICK
-def test_long_chains_stay_rotations(tally, seed: int, length: int):
+def test_long_chains_stay_rotations(tally: Tally, seed: int, length: int) -> None:
     rng = np.random.default_rng(seed)
     with tally.case():
         pose = RigidPose.identity(1)
@@ -182,7 +191,7 @@ def test_long_chains_stay_rotations(tally, seed: int, length: int):
 
 @given(st.sampled_from(["scale", "shear", "mirror", "nan", "shape"]), st.floats(1e-4, 10))
 @QUICK
-def test_what_is_no_pose_is_refused(tally, kind: str, size: float):
+def test_what_is_no_pose_is_refused(tally: Tally, kind: str, size: float) -> None:
     rotation = np.eye(3)[None].copy()
     if kind == "scale":
         rotation *= 1 + size

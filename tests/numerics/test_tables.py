@@ -19,6 +19,7 @@ from tests.numerics.errors import (
     shape_tolerance,
     size_rows,
 )
+from tests.tally import Tally
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "numerics.md"
 FLOAT32 = ("reference float32", "numba")
@@ -40,7 +41,7 @@ def assert_written(name: str, table: str, factor: float = 4.0) -> None:
         assert a == b or max(a, b) <= factor * min(a, b) or max(a, b) < 1e-9, (name, a, b)
 
 
-def test_values_by_axis_ratio(tally):
+def test_values_by_axis_ratio(tally: Tally) -> None:
     rows = shape_rows()
     for row in rows:
         with tally.case():
@@ -55,7 +56,7 @@ def test_values_by_axis_ratio(tally):
 
 
 @pytest.mark.numerics
-def test_gradients_by_axis_ratio(tally):
+def test_gradients_by_axis_ratio(tally: Tally) -> None:
     rows = gradient_rows()
     for row in rows:
         for name in ("centre", "shape", "amplitude", "turn", "shift", "gain"):
@@ -64,7 +65,7 @@ def test_gradients_by_axis_ratio(tally):
     assert_written("gradient", numerics.gradient_table(rows), 8.0)
 
 
-def test_values_by_size_and_thickness(tally):
+def test_values_by_size_and_thickness(tally: Tally) -> None:
     rows = size_rows()
     for row in rows:
         for name, error in row.items():
@@ -76,7 +77,7 @@ def test_values_by_size_and_thickness(tally):
     assert_written("size", numerics.size_table(rows))
 
 
-def test_what_samples_show_of_gaussians_below_a_pixel(tally):
+def test_what_samples_show_of_gaussians_below_a_pixel(tally: Tally) -> None:
     rows = pixel_rows()
     for row in rows:
         for name in ("volume", "slices"):
@@ -92,7 +93,7 @@ def test_what_samples_show_of_gaussians_below_a_pixel(tally):
     assert_written("pixel", numerics.pixel_table(rows), 1.01)
 
 
-def test_a_comb_of_samples_by_poissons_formula():
+def test_a_comb_of_samples_by_poissons_formula() -> None:
     for sigma in (0.2, 0.5, 1.0):
         for phase in (0.0, 0.2, 0.5):
             m = np.arange(1, 30)
@@ -100,7 +101,7 @@ def test_a_comb_of_samples_by_poissons_formula():
             assert comb(sigma, phase) == pytest.approx(poisson, rel=1e-12)
 
 
-def test_values_by_distance_from_the_origin(tally):
+def test_values_by_distance_from_the_origin(tally: Tally) -> None:
     rows = distance_rows()
     for row in rows:
         with tally.case():
@@ -113,13 +114,13 @@ def test_values_by_distance_from_the_origin(tally):
 
 
 @pytest.mark.parametrize("name", numerics.TABLES)
-def test_the_document_has_every_table(name: str):
+def test_the_document_has_every_table(name: str) -> None:
     lines = written(name).splitlines()
     assert len(lines) >= 4
     assert all(line.startswith("|") for line in lines)
 
 
-def test_the_command_writes_a_table_between_its_markers(tmp_path: Path, capsys):
+def test_the_command_writes_a_table_between_its_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = tmp_path / "numerics.md"
     document.write_text("before\n<!-- numerics-distance:begin -->\nold\n<!-- numerics-distance:end -->\nafter\n")
     options = ["--only", "distance", "--docs", str(document), "--output", str(tmp_path / "out")]

@@ -7,7 +7,7 @@ import numpy as np
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose
 from g3r.output.record import inactive_terms
-from g3r.planning.presets import PRESETS
+from g3r.planning.presets import PRESETS, ReconstructionSettings
 
 
 def slices_of(stacks: list[int]) -> Slices:
@@ -32,21 +32,23 @@ def slices_of(stacks: list[int]) -> Slices:
     )
 
 
-def terms(slices: Slices, settings=PRESETS["balanced"], counts=None) -> dict[str, str]:
+def terms(
+    slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"], counts: dict[str, float] | None = None
+) -> dict[str, str]:
     return {one.term: one.reason for one in inactive_terms(slices, settings, counts or {})}
 
 
-def test_two_stacks_of_slices_determine_everything():
+def test_two_stacks_of_slices_determine_everything() -> None:
     assert terms(slices_of([0, 0, 1, 1])) == {}
 
 
-def test_a_single_slice_has_neither_gain_nor_bias_field():
+def test_a_single_slice_has_neither_gain_nor_bias_field() -> None:
     found = terms(slices_of([0]))
     assert set(found) == {"gain of the slice", "bias field"}
     assert "amplitudes" in found["gain of the slice"]
 
 
-def test_settings_and_a_missing_prior_are_named():
+def test_settings_and_a_missing_prior_are_named() -> None:
     base = PRESETS["balanced"]
     still = replace(
         base, use_prior=False, slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_bias_field=False)
@@ -57,7 +59,7 @@ def test_settings_and_a_missing_prior_are_named():
     assert "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
 
 
-def test_the_bound_says_why_there_are_no_more_gaussians():
+def test_the_bound_says_why_there_are_no_more_gaussians() -> None:
     counts = {"bound": 0.03, "share_over_bound": 0.05, "finest_spacing_mm": 2.4}
     reason = terms(slices_of([0, 1]), counts=counts)["finer Gaussians"]
     assert "0.03" in reason

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,29 +16,29 @@ SHAPE = (40, 50, 30)
 AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
 
 
-def ball(at=(20, 25, 15), radius=4):
+def ball(at: tuple[int, int, int] = (20, 25, 15), radius: int = 4) -> np.ndarray:
     index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), -1)
     return (((index - np.array(at)) ** 2).sum(-1) < radius**2).astype(np.float32)
 
 
-def pixels(path):
+def pixels(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("L")).astype(float)
 
 
-def columns(image):
+def columns(image: np.ndarray) -> list[np.ndarray]:
     """The three panels of a one-row picture, found by thirds of equal mm scale (widths 80, 80, 100 mm)."""
     left, right = 0.06 * image.shape[1], 0.92 * image.shape[1]
     edges = left + (right - left) * np.cumsum([0, 80, 80, 100]) / 260
     return [image[int(0.15 * len(image)) : int(0.85 * len(image)), int(a) : int(b)] for a, b in pairwise(edges)]
 
 
-def side(panel):
+def side(panel: np.ndarray) -> tuple[bool, bool]:
     """Where the bright spot lies: (left of the middle, above the middle)."""
     rows, cols = np.nonzero(panel > 200)
     return cols.mean() < panel.shape[1] / 2, rows.mean() < panel.shape[0] / 2
 
 
-def test_radiological_sides(tmp_path):
+def test_radiological_sides(tmp_path: Path) -> None:
     # bright in the right, anterior, superior part; big enough to be met by all three central planes
     save_sections(tmp_path / "a.png", {"volume": ball((27, 33, 20), 13) * 100}, AFFINE)
     axial, coronal, sagittal = columns(pixels(tmp_path / "a.png"))
@@ -47,7 +48,7 @@ def test_radiological_sides(tmp_path):
 
 
 @pytest.mark.parametrize("flip", [(0,), (0, 1), (2,)])
-def test_the_header_decides_and_not_the_array(tmp_path, flip):
+def test_the_header_decides_and_not_the_array(tmp_path: Path, flip: tuple[int] | tuple[int, int]) -> None:
     data = ball((27, 33, 20), 13) * 100
     affine = AFFINE.copy()
     for axis in flip:
@@ -60,14 +61,14 @@ def test_the_header_decides_and_not_the_array(tmp_path, flip):
     np.testing.assert_allclose(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"), atol=1)
 
 
-def test_permuted_axes(tmp_path):
+def test_permuted_axes(tmp_path: Path) -> None:
     data = ball((27, 33, 20), 13) * 100
     save_sections(tmp_path / "a.png", {"v": data}, AFFINE)
     save_sections(tmp_path / "b.png", {"v": data.transpose(2, 0, 1)}, AFFINE[:, [2, 0, 1, 3]])
     np.testing.assert_allclose(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"), atol=1)
 
 
-def test_a_row_per_volume_and_a_bar_for_maps(tmp_path):
+def test_a_row_per_volume_and_a_bar_for_maps(tmp_path: Path) -> None:
     volumes = {"coarse": ball(), "density": 3 * ball(radius=9), "volume": ball(radius=9)}
     save_sections(tmp_path / "three.png", volumes, AFFINE, ball(radius=10), title="three rows")
     save_sections(tmp_path / "one.png", {"volume": ball()}, AFFINE, ball(radius=10))
@@ -77,17 +78,17 @@ def test_a_row_per_volume_and_a_bar_for_maps(tmp_path):
 
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e-30, 1e30, np.nan])
-def test_constant_volumes_are_drawn(tmp_path, value):
+def test_constant_volumes_are_drawn(tmp_path: Path, value: float) -> None:
     save_sections(tmp_path / "a.png", {"volume": np.full(SHAPE, value)}, AFFINE, np.zeros(SHAPE))
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
-def test_one_voxel(tmp_path):
+def test_one_voxel(tmp_path: Path) -> None:
     save_sections(tmp_path / "a.png", {"volume": np.ones((1, 1, 1))}, AFFINE)
     assert (tmp_path / "a.png").exists()
 
 
-def test_wrong_shapes_are_refused(tmp_path):
+def test_wrong_shapes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="one 3D grid"):
         save_sections(tmp_path / "a.png", {"a": ball(), "b": ball()[1:]}, AFFINE)
     with pytest.raises(ValueError, match="one 3D grid"):

@@ -12,7 +12,7 @@ from g3r.evaluation.compare import compare
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "psnr_db"), [("sta30-none", 29.0), ("sta30-moderate", 26.0)])
-def test_quality_with_the_default_preset(shared_data: Path, tmp_path: Path, case: str, psnr_db: float):
+def test_quality_with_the_default_preset(shared_data: Path, tmp_path: Path, case: str, psnr_db: float) -> None:
     folder = shared_data / "cases" / case
     if not folder.is_dir():
         pytest.skip(f"{case} is not among the test data")

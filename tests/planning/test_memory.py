@@ -66,7 +66,7 @@ def unlimited(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 def volume_in(folder: Path) -> np.ndarray:
-    return np.asarray(nib.load(folder / "volume.nii.gz").dataobj)
+    return np.asarray(nib.Nifti1Image.from_filename(folder / "volume.nii.gz").dataobj)
 
 
 @pytest.mark.parametrize(
@@ -81,22 +81,22 @@ def volume_in(folder: Path) -> np.ndarray:
         ("0.5t", 500_000 * MB),
     ],
 )
-def test_sizes_as_people_write_them(text: str, size: int):
+def test_sizes_as_people_write_them(text: str, size: int) -> None:
     assert parsed_size(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "G", "-2G", "2Gi", "2 4G", "0", "0.1", "1e9", "nan", "inf", "2P"])
-def test_what_is_no_size(text: str):
+def test_what_is_no_size(text: str) -> None:
     with pytest.raises(ValueError, match="expected a number of bytes"):
         parsed_size(text)
 
 
-def test_sizes_for_people_are_rounded_up():
+def test_sizes_for_people_are_rounded_up() -> None:
     assert [gigabytes(n) for n in (1, 1.1e9, 1.101e9, 2.345e10)] == ["0.01 GB", "1.10 GB", "1.11 GB", "23.45 GB"]
     assert parsed_size(gigabytes(987_654_321)) >= 987_654_321  # what is said can be typed
 
 
-def test_more_of_anything_needs_more(slices: Slices):
+def test_more_of_anything_needs_more(slices: Slices) -> None:
     def peak(**changed: object) -> int:
         return estimate_memory(slices, replace(DRAFT, **changed), 1, PROCESS).peak  # type: ignore[arg-type]
 
@@ -112,7 +112,7 @@ def test_more_of_anything_needs_more(slices: Slices):
     assert threads[2] == threads[3]  # scattering takes four at most
 
 
-def test_without_a_limit_nothing_changes(slices: Slices):
+def test_without_a_limit_nothing_changes(slices: Slices) -> None:
     plan = plan_memory(slices, DRAFT, None, process_bytes=PROCESS)
     assert plan.settings == DRAFT
     assert (plan.changes, plan.at_once) == ([], False)
@@ -121,7 +121,7 @@ def test_without_a_limit_nothing_changes(slices: Slices):
     assert same.changes == []
 
 
-def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices):
+def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices) -> None:
     free = plan_memory(slices, DRAFT, None, process_bytes=PROCESS).estimate.peak
     refused = []
     for limit in range(free, PROCESS - 10 * MB, -10 * MB):
@@ -141,7 +141,7 @@ def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices)
     assert all("choose a coarser --resolution" in line for line in refused if "--no-prior" not in line)
 
 
-def test_records_are_given_up_where_the_fit_needs_most(slices: Slices):
+def test_records_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
     """Many Gaussians: the records of their pairs lead."""
     many = replace(DRAFT, gaussian_spacing_pixels=0.3, use_prior=False)
     free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
@@ -161,7 +161,7 @@ def fixed_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("fixed_process")
-def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def stated(*more: str) -> str:
         assert infer.main([*arguments(subject, tmp_path / "out", *more), "--dry-run", "--quiet"]) == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "of memory" in line]
@@ -175,7 +175,9 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
     assert not (tmp_path / "out").exists()
 
 
-def test_a_small_limit_is_refused_in_one_line(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_small_limit_is_refused_in_one_line(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     given = arguments(subject, tmp_path / "out")
     assert infer.main([*given, "--max-memory", "200M"]) == 3
     said = capsys.readouterr()
@@ -189,9 +191,10 @@ def test_a_small_limit_is_refused_in_one_line(subject: Path, tmp_path: Path, cap
     assert "expected a number of bytes" in capsys.readouterr().err
 
 
-def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRun, np.ndarray]):
+def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRun, np.ndarray]) -> None:
     run, _ = unlimited
     said = run.record.memory
+    assert said is not None
     assert said.limit_bytes is None
     assert said.changes == []
     assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
@@ -199,13 +202,15 @@ def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRu
 
 def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path
-):
+) -> None:
     run, volume = unlimited
+    assert run.record.memory is not None
     limit = round(0.93 * run.record.memory.stated_bytes)
     output = tmp_path / "out"
     less = run_infer(arguments(subject, output, *QUIETLY, "--max-memory", str(limit)), output)
     assert less.peak_bytes < limit
     said = less.record.memory
+    assert said is not None
     assert said.limit_bytes == limit
     assert said.stated_bytes <= limit
     assert said.changes
@@ -214,18 +219,23 @@ def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     assert difference.max() < 1e-3 * volume.max()
 
 
-def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path):
-    limit = round(0.93 * unlimited[0].record.memory.stated_bytes)
+def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path) -> None:
+    needs = unlimited[0].record.memory
+    assert needs is not None
+    limit = round(0.93 * needs.stated_bytes)
     output = tmp_path / "out"
     given = arguments(subject, output, "--time-budget", "0.1", "--threads", "1", "--quiet")
     run = run_infer([*given, "--max-memory", str(limit)], output)
     assert run.peak_bytes < limit
-    assert run.record.memory.stated_bytes <= limit
-    assert run.record.memory.changes
-    assert run.record.time_budget.seconds == 0.1
+    said, budget = run.record.memory, run.record.time_budget
+    assert said is not None
+    assert budget is not None
+    assert said.stated_bytes <= limit
+    assert said.changes
+    assert budget.seconds == 0.1
 
 
-def test_a_time_budget_keeps_what_was_planned(slices: Slices):
+def test_a_time_budget_keeps_what_was_planned(slices: Slices) -> None:
     planned = replace(
         PRESETS["accurate"],
         use_prior=False,

@@ -36,24 +36,24 @@ def budget(seconds: float, settings: ReconstructionSettings = SETTINGS) -> TimeB
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_budget_is_a_positive_number(seconds: float):
+def test_a_budget_is_a_positive_number(seconds: float) -> None:
     with pytest.raises(ValueError, match="expected a positive number"):
         TimeBudget.of(SETTINGS, seconds)
 
 
-def test_what_was_spent_before_counts():
+def test_what_was_spent_before_counts() -> None:
     assert 6.5 < TimeBudget.of(SETTINGS, 10.0, spent_s=3.0).deadline.remaining_s <= 7.0
 
 
 @pytest.mark.parametrize(("late_s", "missed"), [(-1.0, False), (2.9, False), (3.1, True)])
-def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool):
+def test_a_tenth_and_two_seconds_over_is_missed(late_s: float, missed: bool) -> None:
     clock = Clock()
     one = TimeBudget(settings=SETTINGS, deadline=Deadline.after(10.0, clock), given_s=10.0)
     clock.now += 10.0 + late_s
     assert one.missed is missed
 
 
-def test_more_time_never_means_a_shorter_registration():
+def test_more_time_never_means_a_shorter_registration() -> None:
     order = list(REGISTRATION_FROM_S)
     chosen = []
     for seconds in (1, 10, 21, 22, 39, 40, 100, 120, 1000):
@@ -65,7 +65,7 @@ def test_more_time_never_means_a_shorter_registration():
     assert chosen[-1] == len(order) - 1
 
 
-def test_registration_keeps_the_space_and_the_seed_that_were_asked_for():
+def test_registration_keeps_the_space_and_the_seed_that_were_asked_for() -> None:
     registration = replace(SETTINGS.registration, standard_orientation=False, seed=7)
     one = budget(60.0, replace(SETTINGS, registration=registration))
     deadline = one.for_registration()
@@ -74,7 +74,7 @@ def test_registration_keeps_the_space_and_the_seed_that_were_asked_for():
     assert 0 < deadline.remaining_s < 60
 
 
-def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is():
+def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is() -> None:
     budgets = [budget(seconds) for seconds in (0.1, 10, 20, 40, 1e4)]
     for one in budgets:
         one.for_prior(1.0)
@@ -84,12 +84,12 @@ def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is():
     assert views[-1] == PRESETS["accurate"].prior_views
 
 
-def test_presets_cost_more_one_after_the_other():
+def test_presets_cost_more_one_after_the_other() -> None:
     seconds = [fit_seconds(preset, 0.05, 2.5) for preset in PRESETS.values()]
     assert seconds == sorted(seconds)
 
 
-def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list[Stack]):
+def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list[Stack]) -> None:
     result = GaussianReconstructor(settings=SETTINGS).reconstruct(stacks, plan=TimeBudget.of(SETTINGS, 0.01))
     assert np.isfinite(result.volume).all()
     assert result.volume[result.mask].mean() > 0
@@ -100,11 +100,12 @@ def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list
     assert len(result.record.loss["fit to slices"]) == 1
 
 
-def test_with_time_enough_every_step_is_made(stacks: list[Stack]):
+def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
     """The registration is given, so that the test is quick."""
     reconstructor = GaussianReconstructor(settings=SETTINGS)
     registration = reconstructor.register_stacks(stacks)
     result = reconstructor.reconstruct(stacks, registration, plan=TimeBudget.of(SETTINGS, 600.0))
+    assert result.record.time_budget is not None
     assert result.record.time_budget.fit == "accurate"
     assert len(result.record.loss["fit to slices"]) == PRESETS["accurate"].slice_stage.n_steps
     assert result.record.settings.adaptive is not None

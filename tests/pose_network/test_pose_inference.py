@@ -24,7 +24,7 @@ SHAPE = (2, 9, 9, 9)
 
 
 @pytest.fixture(scope="module")
-def network():
+def network() -> PoseNetwork:
     torch.manual_seed(3)
     network = PoseNetwork(PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)).eval()
     for part in (network.transformer, network.refining_transformer):
@@ -34,11 +34,11 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def model(network):
+def model(network: PoseNetwork) -> PoseModel:
     return PoseModel(network=network, weeks=(25.0, 31.0), training_data="nothing")
 
 
-def blob_stack(rotation, seed, shape=(50, 46, 12)):
+def blob_stack(rotation: np.ndarray, seed: int, shape: tuple[int, int, int] = (50, 46, 12)) -> Stack:
     """A stack of an egg with a bright spot, turned in the scanner."""
     rng = np.random.default_rng(seed)
     affine = np.eye(4)
@@ -77,25 +77,25 @@ def assert_same(one: RigidPose, other: RigidPose, tolerance_mm: float) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [(0, 0, 90), (180, 0, 0), (20, -50, 130)])
-def test_moving_all_headers_changes_nothing(model, slices, angle_deg):
+def test_moving_all_headers_changes_nothing(model: PoseModel, slices: Slices, angle_deg: tuple[int, int, int]) -> None:
     motion = RigidPose.from_rotvec(np.deg2rad([angle_deg]), np.array([[30.0, -200.0, 7.0]]))
     before = model.predict(slices)
     assert len(before) == len(slices)
     assert_same(before, model.predict(moved_headers(slices, motion)), 1e-3)
 
 
-def test_present_poses_do_not_matter(model, slices):
+def test_present_poses_do_not_matter(model: PoseModel, slices: Slices) -> None:
     other = slices.with_pose(RigidPose.identity(len(slices)))
     assert_same(model.predict(slices), model.predict(other), 1e-6)
 
 
-def test_the_order_does_not_matter(model, slices):
+def test_the_order_does_not_matter(model: PoseModel, slices: Slices) -> None:
     order = np.random.default_rng(0).permutation(len(slices))
     before = model.predict(slices).take(order)
     assert_same(before, model.predict(slices.take(order)), 1e-2)  # sums in another order
 
 
-def test_numbers_of_stacks_do_not_matter(model, slices):
+def test_numbers_of_stacks_do_not_matter(model: PoseModel, slices: Slices) -> None:
     renamed = Slices(
         planes=slices.planes,
         value=slices.value,
@@ -108,13 +108,13 @@ def test_numbers_of_stacks_do_not_matter(model, slices):
     assert_same(model.predict(slices), model.predict(renamed), 1e-3)
 
 
-def test_cropping_does_not_matter(model, slices):
+def test_cropping_does_not_matter(model: PoseModel, slices: Slices) -> None:
     """The pose is that of the slice's own frame, wherever the cropping put its centre."""
     planes = slices.planes
     parts = [slice(*planes.offset[k : k + 2]) for k in range(len(slices))]
     width = planes.shape[:, 1]
 
-    def padded(values):
+    def padded(values: np.ndarray) -> np.ndarray:
         blank = [np.zeros(2 * n, values.dtype) for n in width]  # two rows more on one side, not in the mask
         return np.concatenate([np.concatenate([values[at], b]) for at, b in zip(parts, blank, strict=True)])
 
@@ -129,7 +129,9 @@ def test_cropping_does_not_matter(model, slices):
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_a_slice_turned_over_is_the_same_slice(network, slices, view):
+def test_a_slice_turned_over_is_the_same_slice(
+    network: PoseNetwork, slices: Slices, view: tuple[int, int, int]
+) -> None:
     """Other signs of a slice's own axes: the same pixels, so the same place."""
     images = slice_images(slices, 3.0, 40)
     flips = tuple(slice(None, None, sign) for sign in view[:2])
@@ -144,7 +146,7 @@ def test_a_slice_turned_over_is_the_same_slice(network, slices, view):
     assert_same(one @ turn, other, 1e-2)
 
 
-def test_mean_pose_leaves_one_wrong_view_aside(rng):
+def test_mean_pose_leaves_one_wrong_view_aside(rng: np.random.Generator) -> None:
     true = RigidPose(Rotation.random(7, random_state=0).as_matrix(), rng.normal(0, 20, (7, 3)))
     views = [RigidPose.from_rotvec(rng.normal(0, 0.02, (7, 3)), rng.normal(0, 0.5, (7, 3))) @ true for _ in range(3)]
     wrong = RigidPose.from_rotvec(np.full((7, 3), [0, 0, 2.5]), np.full((7, 3), 9.0)) @ true
@@ -155,15 +157,15 @@ def test_mean_pose_leaves_one_wrong_view_aside(rng):
     assert angle_deg.max() < 8
 
 
-def test_scale_of_intensities_does_not_matter(model, slices):
+def test_scale_of_intensities_does_not_matter(model: PoseModel, slices: Slices) -> None:
     assert_same(model.predict(slices), model.predict(slices.scaled(1000.0)), 0.01)
 
 
-def test_a_single_slice(model, slices):
+def test_a_single_slice(model: PoseModel, slices: Slices) -> None:
     assert len(model.predict(slices.take([4]))) == 1
 
 
-def test_time_is_used_if_known(network, slices):
+def test_time_is_used_if_known(network: PoseNetwork, slices: Slices) -> None:
     """Trainings know the order of acquisition of some stacks."""
     images = slice_images(slices, 3.0, 40)
     known = dataclasses.replace(images, time_rank=np.linspace(0, 1, len(slices)))
@@ -172,7 +174,7 @@ def test_time_is_used_if_known(network, slices):
     assert distance_mm.max() > 1e-3
 
 
-def test_quick_enough():
+def test_quick_enough() -> None:
     network = PoseNetwork(PoseNetworkConfig(template_shape=(6, 39, 45, 43))).eval()
     model = PoseModel(network=network, weeks=(22.0, 25.0, 28.0, 31.0, 34.0, 37.0), training_data="nothing")
     stacks = [
@@ -184,7 +186,7 @@ def test_quick_enough():
     assert time.process_time() - start < 3.0 * max(len(slices) / 130, 1)
 
 
-def test_stack_motions_ignore_a_minority(rng):
+def test_stack_motions_ignore_a_minority(rng: np.random.Generator) -> None:
     stack_id = np.repeat([0, 1], 12)
     header = RigidPose(Rotation.random(2, random_state=2).as_matrix()[stack_id], rng.normal(0, 20, (24, 3)))
     motion = RigidPose(Rotation.random(2, random_state=3).as_matrix(), rng.normal(0, 30, (2, 3)))
@@ -200,15 +202,15 @@ def test_stack_motions_ignore_a_minority(rng):
     assert angle_deg.max() < 2.0
 
 
-def test_pose_errors():
+def test_pose_errors() -> None:
     pose = RigidPose.from_rotvec(np.zeros((2, 3)), np.zeros((2, 3)))
-    other = RigidPose.from_rotvec([[0, 0, 0.1], [0, 0, 0]], [[0, 0, 0], [3, 4, 0]])
+    other = RigidPose.from_rotvec([[0, 0, 0.1], [0.0, 0, 0]], [[0, 0, 0], [3, 4, 0]])
     distance_mm, angle_deg = pose_errors(pose, other)
     np.testing.assert_allclose(distance_mm, [0.8 * 25 * np.sqrt(2) * 2 * np.sin(0.05), 5.0], rtol=1e-6)
     np.testing.assert_allclose(angle_deg, [np.rad2deg(0.1), 0.0], atol=1e-9)
 
 
-def test_inference_needs_no_training_packages():
+def test_inference_needs_no_training_packages() -> None:
     code = (
         "import sys, g3r.pose_network.inference, g3r.pose_network.network, g3r.pose_network.model\n"
         "assert not {'lightning', 'torchio', 'pytorch_lightning'} & set(sys.modules)"

@@ -1,5 +1,7 @@
 """The pose network that ships with g3r, on simulated subjects of weeks that it has never seen."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
@@ -14,11 +16,11 @@ from g3r.pose_network.model import PoseModel
 
 
 @pytest.fixture(scope="module")
-def shipped():
+def shipped() -> PoseModel:
     return PoseModel.load()
 
 
-def test_the_file_is_small_and_says_what_it_is(shipped):
+def test_the_file_is_small_and_says_what_it_is(shipped: PoseModel) -> None:
     assert SHIPPED_POSE.stat().st_size <= 6_000_000
     assert "sta30" in shipped.training_data  # among what was left out
     assert shipped.template.weeks.tolist() == [22, 25, 28, 31, 34, 37]
@@ -27,7 +29,7 @@ def test_the_file_is_small_and_says_what_it_is(shipped):
 
 
 @pytest.mark.parametrize("name", ["sta30-none", "sta30-moderate", "sta34-single"])
-def test_stacks_stand_as_they_should(shipped, shared_data, name):
+def test_stacks_stand_as_they_should(shipped: PoseModel, shared_data: Path, name: str) -> None:
     """The common motion of each stack is within 20 degrees of the truth, in the atlas frame."""
     folder = shared_data / "cases" / name
     if not folder.is_dir():

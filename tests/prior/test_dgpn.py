@@ -1,6 +1,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -9,19 +10,20 @@ from torch import nn
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.network import ResidualRefiner
+from tests.gradients import gradient_of
 from tests.prior.receptive_field import receptive_radius_voxels
 
 SMALL = PriorNetworkConfig(channels=(8, 8, 8), units=(1, 1, 1), tail_channels=4, use_sharp=False)
 
 
 @pytest.fixture
-def volumes():
+def volumes() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     v_coarse = torch.rand(2, 1, 16, 16, 16, generator=generator)
     return v_coarse, 3 * torch.rand(v_coarse.shape, generator=generator)
 
 
-def awaken(network):
+def awaken(network: DensityGatedPriorNetwork) -> DensityGatedPriorNetwork:
     """Give the zero-initialised last convolution weights, so that F does something."""
     torch.manual_seed(1)
     nn.init.normal_(network.refiner.head.weight, std=0.02)
@@ -31,33 +33,37 @@ def awaken(network):
 class Stub(nn.Module):
     """An F with known values: V + 10 M."""
 
-    def forward(self, v_coarse, m_rho, v_sharp=None):
+    def forward(self, v_coarse: torch.Tensor, m_rho: torch.Tensor, v_sharp: torch.Tensor | None = None) -> torch.Tensor:
         return v_coarse + 10 * m_rho
 
 
 @pytest.mark.parametrize(("alpha", "beta"), [(0.05, 1.0), (0.0, 0.5), (1.0, 1.0)])
-def test_equation_7_with_a_known_residual(volumes, alpha, beta):
+def test_equation_7_with_a_known_residual(
+    volumes: tuple[torch.Tensor, torch.Tensor], alpha: float, beta: float
+) -> None:
     v_coarse, m_rho = (volume.double() for volume in volumes)
     network = DensityGatedPriorNetwork(replace(SMALL, alpha=alpha, beta=beta))
-    network.refiner = Stub()
+    network.register_module("refiner", Stub())
     c = 1 - torch.exp(-m_rho)
     expected = v_coarse + (alpha * c + beta * (1 - c)) * (v_coarse + 10 * m_rho)
     torch.testing.assert_close(network(v_coarse, m_rho), expected, rtol=1e-14, atol=1e-14)
 
 
-def test_gate_can_be_left_out(volumes):
+def test_gate_can_be_left_out(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse, m_rho = volumes
     network = DensityGatedPriorNetwork(replace(SMALL, use_gate=False))
-    network.refiner = Stub()
+    network.register_module("refiner", Stub())
     torch.testing.assert_close(network(v_coarse, m_rho), 2 * v_coarse + 10 * m_rho)
 
 
-def test_training_starts_from_the_coarse_volume(volumes):
+def test_training_starts_from_the_coarse_volume(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     assert torch.equal(DensityGatedPriorNetwork(SMALL)(*volumes), volumes[0])
 
 
 @pytest.mark.parametrize("use_density", [True, False])
-def test_residual_depends_on_density_only_if_it_may(volumes, use_density):
+def test_residual_depends_on_density_only_if_it_may(
+    volumes: tuple[torch.Tensor, torch.Tensor], use_density: bool
+) -> None:
     v_coarse, m_rho = volumes
     refiner = awaken(DensityGatedPriorNetwork(replace(SMALL, use_density=use_density))).refiner
     same = torch.equal(refiner(v_coarse, m_rho), refiner(v_coarse, 0 * m_rho))
@@ -65,7 +71,7 @@ def test_residual_depends_on_density_only_if_it_may(volumes, use_density):
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 9, 13), (8, 8, 8), (3, 33, 17), (24, 1, 25)])
-def test_any_shape_works(shape):
+def test_any_shape_works(shape: tuple[int, int, int]) -> None:
     network = awaken(DensityGatedPriorNetwork(SMALL))
     v_coarse = torch.rand(1, 1, *shape)
     prior = network(v_coarse, torch.ones_like(v_coarse))
@@ -73,12 +79,12 @@ def test_any_shape_works(shape):
     assert bool(prior.isfinite().all())
 
 
-def test_one_level_works(volumes):
+def test_one_level_works(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     network = awaken(DensityGatedPriorNetwork(replace(SMALL, channels=(8,), units=(1,))))
     assert not torch.equal(network(*volumes), volumes[0])
 
 
-def test_samples_of_a_batch_do_not_see_each_other(volumes):
+def test_samples_of_a_batch_do_not_see_each_other(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse, m_rho = volumes
     network = awaken(DensityGatedPriorNetwork(SMALL))
     alone, together = network(v_coarse[:1], m_rho[:1]), network(v_coarse, m_rho)[:1]
@@ -86,17 +92,17 @@ def test_samples_of_a_batch_do_not_see_each_other(volumes):
     torch.testing.assert_close(alone, together, rtol=0, atol=2e-5)
 
 
-def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes):
+def test_density_of_0_and_1e6_gives_finite_values_and_gradients(volumes: tuple[torch.Tensor, torch.Tensor]) -> None:
     v_coarse = volumes[0].clone().requires_grad_()
     m_rho = torch.zeros_like(v_coarse)
     m_rho[:, :, :8] = 1e6
     network = awaken(DensityGatedPriorNetwork(SMALL))
     network(v_coarse, m_rho).square().sum().backward()
-    gradients = [v_coarse.grad, *[parameter.grad for parameter in network.parameters()]]
+    gradients = [gradient_of(leaf) for leaf in (v_coarse, *network.parameters())]
     assert all(bool(gradient.isfinite().all()) for gradient in gradients)
 
 
-def test_activations_keep_their_size_at_the_start():
+def test_activations_keep_their_size_at_the_start() -> None:
     """Without normalisation, the initial scale is all there is."""
     torch.manual_seed(0)
     refiner = ResidualRefiner(PriorNetworkConfig(use_sharp=False))
@@ -107,17 +113,17 @@ def test_activations_keep_their_size_at_the_start():
     assert 0.2 < min(seen) <= max(seen) < 5.0, seen
 
 
-def test_default_network_is_small_enough_to_ship():
+def test_default_network_is_small_enough_to_ship() -> None:
     n_bytes = sum(4 * parameter.numel() for parameter in DensityGatedPriorNetwork(PriorNetworkConfig()).parameters())
     assert n_bytes < 20e6
 
 
-def test_receptive_radius_is_an_upper_bound():
+def test_receptive_radius_is_an_upper_bound() -> None:
     refiner = awaken(DensityGatedPriorNetwork(SMALL)).refiner
     extent, center = 160, 80
     v_coarse = torch.rand(1, 1, extent, 8, 8).requires_grad_()
     refiner(v_coarse, torch.ones_like(v_coarse))[0, 0, center].sum().backward()
-    reached = v_coarse.grad.abs().sum((0, 1, 3, 4)).nonzero().flatten()
+    reached = gradient_of(v_coarse).abs().sum((0, 1, 3, 4)).nonzero().flatten()
     reach = max(center - int(reached.min()), int(reached.max()) - center)
     assert receptive_radius_voxels(SMALL) // 2 < reach <= receptive_radius_voxels(SMALL)
 
@@ -133,17 +139,17 @@ def test_receptive_radius_is_an_upper_bound():
         {"tail_channels": 0},
     ],
 )
-def test_networks_without_meaning_are_refused(wrong):
+def test_networks_without_meaning_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="one positive entry per level"):
         replace(SMALL, **wrong)
 
 
-def test_a_base_that_is_not_shown_is_refused():
+def test_a_base_that_is_not_shown_is_refused() -> None:
     with pytest.raises(ValueError, match="sharp_base needs use_sharp"):
         replace(SMALL, sharp_base=True)
 
 
-def test_importing_the_package_stays_light():
+def test_importing_the_package_stays_light() -> None:
     code = (
         "import sys, g3r.prior, g3r.prior.config\n"
         "assert not {'torch', 'monai', 'lightning'} & set(sys.modules)\n"

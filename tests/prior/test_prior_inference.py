@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -10,14 +12,14 @@ from g3r.prior.inference import Tiling, estimate_prior
 from tests.prior.receptive_field import receptive_radius_voxels
 
 
-def small(n_levels=1, **changes):
+def small(n_levels: int = 1, **changes: Any) -> DensityGatedPriorNetwork:
     """A network of 8 channels that sees V_coarse and M."""
-    levels = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
+    levels: dict[str, Any] = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
     return DensityGatedPriorNetwork(PriorNetworkConfig(**levels, **{"use_sharp": False, **changes})).eval()
 
 
 @pytest.fixture(scope="module")
-def network():
+def network() -> DensityGatedPriorNetwork:
     """The default network with a last layer that gives a residual of a tenth of the intensity scale."""
     torch.manual_seed(0)
     network = DensityGatedPriorNetwork(PriorNetworkConfig(use_sharp=False)).eval()
@@ -26,18 +28,20 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def volumes():
+def volumes() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     v_coarse = rng.random((250, 20, 17), dtype=np.float32)
     return v_coarse, 3 * rng.random(v_coarse.shape, dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
-def whole(network, volumes):
+def whole(network: DensityGatedPriorNetwork, volumes: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     return estimate_prior(network, *volumes)
 
 
-def test_whole_volume_is_the_network_s_output(network, volumes, whole):
+def test_whole_volume_is_the_network_s_output(
+    network: DensityGatedPriorNetwork, volumes: tuple[np.ndarray, np.ndarray], whole: np.ndarray
+) -> None:
     v_coarse, m_rho = (torch.from_numpy(volume)[None, None] for volume in volumes)
     with torch.no_grad():
         expected = network(v_coarse, m_rho)[0, 0].numpy()
@@ -46,20 +50,24 @@ def test_whole_volume_is_the_network_s_output(network, volumes, whole):
     assert 0.03 < np.std(whole - volumes[0]) < 0.3
 
 
-def test_tiles_agree_with_the_whole(network, volumes, whole):
+def test_tiles_agree_with_the_whole(
+    network: DensityGatedPriorNetwork, volumes: tuple[np.ndarray, np.ndarray], whole: np.ndarray
+) -> None:
     tiled = estimate_prior(network, *volumes, tiling=Tiling(max_whole_voxels=0, tile_voxels=48))
     # The default halo, on white noise and random weights, which look further than an image and trained ones.
     assert np.abs(tiled - whole).max() < 1e-3
 
 
-def test_tiles_are_exact_beyond_the_receptive_field(network, volumes, whole):
+def test_tiles_are_exact_beyond_the_receptive_field(
+    network: DensityGatedPriorNetwork, volumes: tuple[np.ndarray, np.ndarray], whole: np.ndarray
+) -> None:
     halo = receptive_radius_voxels(network.config)
     tiled = estimate_prior(network, *volumes, tiling=Tiling(0, tile_voxels=40, halo_voxels=halo))
     # Rounding only: other extents make the convolution add in another order.
     assert np.abs(tiled - whole).max() < 1e-5
 
 
-def test_views_do_not_prefer_a_side(volumes):
+def test_views_do_not_prefer_a_side(volumes: tuple[np.ndarray, np.ndarray]) -> None:
     """The mean over all mirror images is mirrored when the head is; whether in tiles or not."""
     torch.manual_seed(0)
     network = small(n_levels=2)
@@ -77,7 +85,7 @@ def test_views_do_not_prefer_a_side(volumes):
         estimate_prior(network, *part, n_views=9)
 
 
-def test_v_sharp_is_asked_for_and_is_the_base(volumes):
+def test_v_sharp_is_asked_for_and_is_the_base(volumes: tuple[np.ndarray, np.ndarray]) -> None:
     network = small(use_sharp=True, sharp_base=True)
     v_sharp = volumes[0][::-1].copy()
     np.testing.assert_array_equal(estimate_prior(network, *volumes, v_sharp), v_sharp)
@@ -85,39 +93,43 @@ def test_v_sharp_is_asked_for_and_is_the_base(volumes):
         estimate_prior(network, *volumes)
 
 
-def test_without_a_halo_they_do_not_agree(network, volumes, whole):
+def test_without_a_halo_they_do_not_agree(
+    network: DensityGatedPriorNetwork, volumes: tuple[np.ndarray, np.ndarray], whole: np.ndarray
+) -> None:
     """The two tests above would notice a tile that is cut off."""
     tiled = estimate_prior(network, *volumes, tiling=Tiling(0, tile_voxels=48, halo_voxels=0))
     assert np.abs(tiled - whole).max() > 1e-2
 
 
-def test_odd_tile_sizes_cover_every_voxel():
+def test_odd_tile_sizes_cover_every_voxel() -> None:
     network = small()
     v_coarse = np.random.default_rng(0).random((13, 7, 22), dtype=np.float32)
     prior = estimate_prior(network, v_coarse, 0 * v_coarse, tiling=Tiling(0, tile_voxels=5, halo_voxels=3))
     np.testing.assert_array_equal(prior, v_coarse)
 
 
-def test_inputs_in_other_layouts_and_types(network):
+def test_inputs_in_other_layouts_and_types(network: DensityGatedPriorNetwork) -> None:
     v_coarse = np.random.default_rng(0).random((9, 10, 11))
     straight = estimate_prior(network, v_coarse.astype(np.float32), np.ones((9, 10, 11), np.float32))
-    turned = estimate_prior(network, np.asfortranarray(v_coarse), np.ones((9, 10, 11)))
+    turned = estimate_prior(network, np.asfortranarray(v_coarse), np.ones((9, 10, 11)))  # type: ignore[arg-type]
     np.testing.assert_array_equal(straight, turned)
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 5), (4, 4, 0)])
-def test_shapes_that_do_not_fit(network, shape):
+def test_shapes_that_do_not_fit(
+    network: DensityGatedPriorNetwork, shape: tuple[int, int] | tuple[int, int, int]
+) -> None:
     with pytest.raises(ValueError, match="two 3D volumes of one shape"):
         estimate_prior(network, np.zeros((4, 4, 4), np.float32), np.zeros(shape, np.float32))
 
 
-def test_nan_is_reported(network):
+def test_nan_is_reported(network: DensityGatedPriorNetwork) -> None:
     v_coarse = np.full((8, 8, 8), np.nan, np.float32)
     with pytest.raises(NumericalError, match="NaN"):
         estimate_prior(network, v_coarse, np.ones_like(v_coarse))
 
 
 @pytest.mark.parametrize("wrong", [{"tile_voxels": 0}, {"halo_voxels": -1}])
-def test_tiles_without_meaning_are_refused(wrong):
+def test_tiles_without_meaning_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="a tile needs voxels"):
         Tiling(**wrong)

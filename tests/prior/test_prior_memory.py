@@ -23,7 +23,7 @@ def refiner() -> ResidualRefiner:
 
 
 @pytest.mark.parametrize("extra", [-1, 2, 3, SLAB_ROWS, SLAB_ROWS + 5, 2 * SLAB_ROWS + 1])
-def test_slabs_give_what_the_whole_gives(refiner: ResidualRefiner, extra: int):
+def test_slabs_give_what_the_whole_gives(refiner: ResidualRefiner, extra: int) -> None:
     rows = 2 * (SLAB_ROWS + extra)
     v_coarse, m_rho = torch.rand(2, 1, 1, rows, 12, 20)
     whole = refiner(v_coarse, m_rho)  # a gradient is wanted: all at once
@@ -35,7 +35,7 @@ def test_slabs_give_what_the_whole_gives(refiner: ResidualRefiner, extra: int):
     assert (slabs - whole).abs().max() < 1e-5
 
 
-def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.MonkeyPatch):
+def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = set()
     layers = refiner._at_full_resolution
 
@@ -51,7 +51,7 @@ def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.
     assert features[2] == SLAB_ROWS + 2
 
 
-def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: ResidualRefiner):
+def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: ResidualRefiner) -> None:
     """Activations overwrite their input, which nothing needs."""
     other = copy.deepcopy(refiner)
     for module in other.modules():
@@ -71,7 +71,7 @@ def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: Residua
     ("shape", "edge", "halo"),
     [((50, 64, 40), 16, 8), ((50, 64, 40), 16, 0), ((37, 20, 90), 24, 8), ((16, 16, 16), 16, 8), ((9, 9, 9), 4, 40)],
 )
-def test_tiles_have_one_shape_and_cover_everything_once(shape: tuple[int, ...], edge: int, halo: int):
+def test_tiles_have_one_shape_and_cover_everything_once(shape: tuple[int, ...], edge: int, halo: int) -> None:
     covered = torch.zeros(shape, dtype=torch.int64)
     shapes = set()
     for core, seen in _tiles(shape, edge, halo):

@@ -56,7 +56,7 @@ def headers_turned(slices: Slices, rotvec: list[float]) -> Slices:
 @pytest.mark.parametrize(("turn", "order"), [("180 x", (2, 0, 1)), ("180 z", (0, 1, 2)), ("oblique", (1, 2, 0))])
 def test_a_head_in_any_orientation_is_found_and_set_upright(
     head: Phantom, template: AtlasTemplate, turn: str, order: tuple[int, ...]
-):
+) -> None:
     rotation = Rotation.from_rotvec(TURNS[turn]).as_matrix()
     stacks = simulated(turned_phantom(head, rotation))
     slices, truth = as_slices([stacks[k] for k in order])
@@ -80,7 +80,7 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     assert upright.correlation > 0.7
 
 
-def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], template: AtlasTemplate):
+def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], template: AtlasTemplate) -> None:
     slices, _ = as_slices(still)
     settings = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=3.0)
     plain = register(slices, settings, template=template)
@@ -95,7 +95,7 @@ def test_headers_turned_as_a_whole_change_nothing(still: list[SimulatedStack], t
     assert np.linalg.norm(away, axis=1).mean() < 2
 
 
-def test_the_result_of_a_moving_head_stands_upright(moving: Moving):
+def test_the_result_of_a_moving_head_stands_upright(moving: Moving) -> None:
     """The phantom's own frame is the atlas', so that the true motions lead there."""
     found = moving.estimate.slices.world_from_header()
     common = found @ moving.truth.inverse()
@@ -107,7 +107,7 @@ def test_the_result_of_a_moving_head_stands_upright(moving: Moving):
     assert np.median(away) < 8  # the mean head's middle is not quite the phantom's
 
 
-def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTemplate):
+def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTemplate) -> None:
     slices = headers_turned(as_slices(still[:1])[0], [0, np.pi, 0])
     settings = RegistrationSettings(segments=False, finest_voxel_mm=3.0, standard_orientation=False)
     estimate = register(slices, settings, template=template)
@@ -120,7 +120,7 @@ def test_scanner_space_on_request(still: list[SimulatedStack], template: AtlasTe
 
 def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
-):
+) -> None:
     slices, _ = still_slices
     noise = np.random.default_rng(0).random(len(slices.value)).astype(np.float32)
     scattered = slices.with_pose(
@@ -137,7 +137,7 @@ def test_a_head_unlike_any_mean_head_gets_no_standard_orientation(
 
 def test_masks_of_another_size_than_any_head_are_refused(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
-):
+) -> None:
     slices, _ = still_slices
 
     def enlarged(factor: float) -> Slices:
@@ -154,7 +154,7 @@ def test_masks_of_another_size_than_any_head_are_refused(
     assert set(estimate.initialisations) == {"headers"}
 
 
-def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate):
+def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: AtlasTemplate) -> None:
     for volume_mm3 in (1e5, 4e5):
         for number in range(len(template)):
             head = fitted_template(template, number, volume_mm3)
@@ -165,7 +165,9 @@ def test_a_fitted_head_has_the_volume_asked_for_and_the_same_middle(template: At
             assert head.weeks == template.weeks[number]
 
 
-def test_near_heads_are_the_three_of_about_the_size(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate):
+def test_near_heads_are_the_three_of_about_the_size(
+    still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
+) -> None:
     slices, _ = still_slices
     one = template.volume[0]
     inside = np.argwhere(one > 0)
@@ -182,7 +184,7 @@ def test_near_heads_are_the_three_of_about_the_size(still_slices: tuple[Slices, 
     assert len(nearest_templates(slices, template)) == 2
 
 
-def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate):
+def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose], template: AtlasTemplate) -> None:
     """A mean head is preferred to noise of the same shape, whichever comes first."""
     slices, _ = still_slices
     inside = template.volume[0] > 0
@@ -198,7 +200,7 @@ def test_the_head_that_looks_alike_decides(still_slices: tuple[Slices, RigidPose
 
 def test_the_whole_head_turned_is_among_the_orientations_to_follow(
     still_slices: tuple[Slices, RigidPose], template: AtlasTemplate
-):
+) -> None:
     slices, _ = still_slices
     head = fitted_template(template, 0, head_volume_mm3(slices))
     turned = headers_turned(slices, [2.0, -1.2, 1.5])
@@ -207,7 +209,7 @@ def test_the_whole_head_turned_is_among_the_orientations_to_follow(
     assert angle_deg(first, back) < 20
 
 
-def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices: tuple[Slices, RigidPose]):
+def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices: tuple[Slices, RigidPose]) -> None:
     """Among the orientations of a stack to follow is the true one, and its runs fall into place."""
     slices, _ = still_slices
     grid = VolumeGrid(head.t2.shape, head.affine)
@@ -226,7 +228,7 @@ def test_one_stack_upside_down_is_found_in_a_volume(head: Phantom, still_slices:
     assert placed.segments.n_segments <= 3
 
 
-def test_orientations_to_follow_are_few_apart_and_best_first():
+def test_orientations_to_follow_are_few_apart_and_best_first() -> None:
     rotation = uniform_rotations(3000)
     centers = rotations_about(rotation[[100, 900, 2500]], np.zeros(3), np.zeros(3)).rotation
     agreement = np.zeros(len(rotation))

@@ -33,7 +33,7 @@ def log_ratio_spread(a: Slices, b: Slices) -> float:
     return float(np.mean([ratio[stack == s].std() for s in range(3)]))
 
 
-def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, RigidPose]):
+def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, RigidPose]) -> None:
     slices, _ = still_slices
     dark = shaded(slices, 1.0)
     before, after = (log_ratio_spread(dark, slices), log_ratio_spread(bias_corrected(dark), bias_corrected(slices)))
@@ -41,7 +41,7 @@ def test_shaded_and_unshaded_stacks_come_out_alike(still_slices: tuple[Slices, R
     assert after < 0.15 * before
 
 
-def test_slices_keep_their_gains_and_everything_else(still_slices: tuple[Slices, RigidPose]):
+def test_slices_keep_their_gains_and_everything_else(still_slices: tuple[Slices, RigidPose]) -> None:
     slices, _ = still_slices
     gain = np.exp(np.random.default_rng(0).normal(0, 0.1, len(slices)))[slices.planes.plane_id()]
     flat = bias_corrected(slices)
@@ -55,7 +55,7 @@ def test_slices_keep_their_gains_and_everything_else(still_slices: tuple[Slices,
     assert not np.shares_memory(flat.value, slices.value)
 
 
-def test_the_scanners_frame_and_the_present_poses_do_not_matter(still_slices: tuple[Slices, RigidPose]):
+def test_the_scanners_frame_and_the_present_poses_do_not_matter(still_slices: tuple[Slices, RigidPose]) -> None:
     slices, _ = still_slices
     turn = turned_about(np.zeros(3), np.array([1.0, -2.0, 0.5]), np.array([30.0, 0, -60]))
     turned = replace(slices, header_pose=turn @ slices.header_pose)
@@ -63,7 +63,7 @@ def test_the_scanners_frame_and_the_present_poses_do_not_matter(still_slices: tu
 
 
 @pytest.mark.parametrize("constant", [0.0, -1.0, 2.0])
-def test_stacks_without_contrast_stay_as_they_are(still_slices: tuple[Slices, RigidPose], constant: float):
+def test_stacks_without_contrast_stay_as_they_are(still_slices: tuple[Slices, RigidPose], constant: float) -> None:
     slices, _ = still_slices
     flat = bias_corrected(replace(slices, value=np.full_like(slices.value, constant)))
     np.testing.assert_allclose(flat.value, constant, rtol=1e-3)

@@ -15,7 +15,7 @@ from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm
 OFF = RegistrationSettings(template=False, network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=1.8)
 
 
-def test_the_whole_estimate_on_a_moving_head(moving: Moving):
+def test_the_whole_estimate_on_a_moving_head(moving: Moving) -> None:
     """Walks, jerks and stack offsets: the poses come back to a fraction of the header's error."""
     slices, estimate = moving.slices, moving.estimate
     before, after = pixel_errors_mm(slices, moving.truth), pixel_errors_mm(estimate.slices, moving.truth)
@@ -33,11 +33,12 @@ def test_the_whole_estimate_on_a_moving_head(moving: Moving):
     np.testing.assert_array_equal(estimate.slices.value, slices.value)  # bias_corrected for registration alone
 
 
-def test_the_whole_estimate_says_how_it_was_found(moving: Moving):
+def test_the_whole_estimate_says_how_it_was_found(moving: Moving) -> None:
     estimate = moving.estimate
     assert set(estimate.initialisations) == {"headers", "template", "stacks"}
     sums = {name: sum(values) for name, values in estimate.initialisations.items()}
     assert sums[estimate.initialisation] > sums["headers"]
+    assert estimate.held_out is not None
     assert len(estimate.held_out) == len(estimate.interleave) == len(estimate.n_segments) == 3
     assert min(estimate.held_out) > max(estimate.initialisations["headers"])
     assert estimate.interleave == [2, 2, 2]
@@ -46,7 +47,7 @@ def test_the_whole_estimate_says_how_it_was_found(moving: Moving):
     assert estimate.orientation.weeks in (24, 31)
 
 
-def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedStack]):
+def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedStack]) -> None:
     slices, _ = as_slices(still)
     estimate = register(slices, OFF)
     np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
@@ -58,7 +59,7 @@ def test_with_everything_off_slices_stay_at_their_headers(still: list[SimulatedS
     assert estimate.n_segments == [1, 1, 1]
 
 
-def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]):
+def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]) -> None:
     slices, _ = as_slices(still[:1])
     estimate = register(slices, RegistrationSettings())
     np.testing.assert_allclose(estimate.slices.planes.center_mm, slices.planes.center_mm, atol=1e-9)
@@ -68,7 +69,9 @@ def test_a_single_stack_is_left_as_the_header_says(still: list[SimulatedStack]):
 
 
 @pytest.mark.parametrize(("n_slices", "layer"), [(1, "template"), (2, "segments")])
-def test_stacks_of_one_or_two_slices(still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str):
+def test_stacks_of_one_or_two_slices(
+    still: list[SimulatedStack], template: AtlasTemplate, n_slices: int, layer: str
+) -> None:
     """Too few to register well, but no reason to break down."""
     slices, _ = as_slices(still)
     rows = np.concatenate([np.flatnonzero(slices.stack_id == s)[6 : 6 + n_slices] for s in (1, 2)])
@@ -81,7 +84,7 @@ def test_stacks_of_one_or_two_slices(still: list[SimulatedStack], template: Atla
         assert len(estimate.n_segments) == subject.n_stacks
 
 
-def test_proposals_are_initialisations_like_the_others(moving: Moving):
+def test_proposals_are_initialisations_like_the_others(moving: Moving) -> None:
     """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
     proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
     settings = replace(OFF, network=True)
@@ -92,7 +95,7 @@ def test_proposals_are_initialisations_like_the_others(moving: Moving):
     assert set(deaf.initialisations) == {"headers"}
 
 
-def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack]):
+def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack]) -> None:
     """Poses are only determined up to it; a few slices that went astray do not tilt it."""
     slices, _ = as_slices(still)
     motion = RigidPose.from_rotvec([[0.2, -0.3, 0.1]], [[8.0, -5, 12]])

@@ -14,7 +14,9 @@ from g3r.registration.similarity import StackSamples
 from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed, stack_moved, turned_about
 
 
-def test_true_poses_predict_better_than_wrong_ones(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+def test_true_poses_predict_better_than_wrong_ones(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+) -> None:
     """The further off, the higher the cost; the wrong stack correlates least."""
     slices, truth = still_slices
     right = held_out_score(slices, samples, truth)
@@ -30,7 +32,7 @@ def test_true_poses_predict_better_than_wrong_ones(still_slices: tuple[Slices, R
 
 def test_a_score_has_a_prediction_for_every_stack_and_slice(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
-):
+) -> None:
     slices, truth = still_slices
     scores = held_out_score(slices, samples, truth)
     assert len(scores.prediction) == 3
@@ -39,7 +41,9 @@ def test_a_score_has_a_prediction_for_every_stack_and_slice(
     assert scores.cost == pytest.approx(sum(p.cost for p in scores.prediction))
 
 
-def test_poses_pay_a_penalty_for_their_movements(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+def test_poses_pay_a_penalty_for_their_movements(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+) -> None:
     slices, truth = still_slices
     moving_poses = slices_disturbed(slices, 0.1, 0.05).world_from_header()
     assert held_out_score(slices, samples, moving_poses).cost > held_out_score(slices, samples, truth).cost + 5 * len(
@@ -47,7 +51,7 @@ def test_poses_pay_a_penalty_for_their_movements(still_slices: tuple[Slices, Rig
     )
 
 
-def test_the_true_initialisation_is_chosen(moving: Moving):
+def test_the_true_initialisation_is_chosen(moving: Moving) -> None:
     slices, truth = moving.slices, moving.truth
     initialisations = {
         "headers": RigidPose.identity(len(slices)),
@@ -61,7 +65,7 @@ def test_the_true_initialisation_is_chosen(moving: Moving):
     assert scores["truth"].cost < scores["headers"].cost
 
 
-def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]):
+def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose]) -> None:
     """A volume made without a stack does not depend on it."""
     slices, _ = still_slices
     volume, grid = volume_without(slices, 1, 3.2)
@@ -75,7 +79,7 @@ def test_a_slice_does_not_predict_itself(still_slices: tuple[Slices, RigidPose])
     assert everything.max() > 1.3 * volume.max()
 
 
-def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom):
+def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> None:
     for interleave in (1, 2, 3):
         level = MotionLevel(walk_deg=0.7, walk_mm=0.4, n_jerks=2, jerk_deg=8, jerk_mm=5)
         slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))

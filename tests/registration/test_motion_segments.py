@@ -27,7 +27,7 @@ CENTER_MM = np.array([12.0, -7.0, 40.0])
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 10_000))
-def test_the_cheapest_path_is_that_of_brute_force(n: int, n_states: int, seed: int):
+def test_the_cheapest_path_is_that_of_brute_force(n: int, n_states: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     cost, penalty = (rng.normal(size=(n, n_states)), rng.random((n_states, n_states)) * rng.choice([0.1, 1, 10]))
     path, total = cheapest_path(cost, penalty)
@@ -41,7 +41,7 @@ def test_the_cheapest_path_is_that_of_brute_force(n: int, n_states: int, seed: i
     assert tuple(path.tolist()) == best
 
 
-def test_the_distance_is_that_of_a_ball():
+def test_the_distance_is_that_of_a_ball() -> None:
     rng = np.random.default_rng(0)
     a = RigidPose(Rotation.random(3, rng=rng).as_matrix(), rng.normal(0, 20, (3, 3)))
     b = RigidPose(Rotation.random(2, rng=rng).as_matrix(), rng.normal(0, 20, (2, 3)))
@@ -55,7 +55,7 @@ def test_the_distance_is_that_of_a_ball():
     np.testing.assert_allclose(np.diag(head_distance_mm(a, a, CENTER_MM)), 0, atol=1e-5)
 
 
-def test_the_distance_does_not_depend_on_where_the_head_is():
+def test_the_distance_does_not_depend_on_where_the_head_is() -> None:
     """A turn about the head's own centre moves it by the turn alone."""
     turn = Rotation.from_rotvec([0, 0, 0.4]).as_matrix()
     near, far = (
@@ -66,7 +66,7 @@ def test_the_distance_does_not_depend_on_where_the_head_is():
     assert near > 5
 
 
-def test_time_orders_know_that_slices_are_missing():
+def test_time_orders_know_that_slices_are_missing() -> None:
     orders = time_orders(np.array([2, 3, 4, 6, 9]))
     assert {k: v.tolist() for k, v in orders.items()} == {1: [0, 1, 2, 3, 4], 2: [0, 2, 3, 1, 4], 3: [1, 3, 4, 2, 0]}
 
@@ -90,7 +90,7 @@ def planted(
 
 
 @pytest.mark.parametrize("interleave", [1, 2, 3])
-def test_planted_jerks_and_interleave_are_found(interleave: int):
+def test_planted_jerks_and_interleave_are_found(interleave: int) -> None:
     cost, truth = planted(interleave, np.repeat([1, 4, 2], [9, 7, 8]))
     segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
     np.testing.assert_array_equal(segments.choice, truth)
@@ -98,7 +98,7 @@ def test_planted_jerks_and_interleave_are_found(interleave: int):
     assert segments.n_segments == 3
 
 
-def test_the_cost_is_that_of_the_slices_and_of_the_changes():
+def test_the_cost_is_that_of_the_slices_and_of_the_changes() -> None:
     cost, truth = planted(2, np.repeat([1, 4], [12, 12]))
     segments = best_segments(cost, lattice(5), np.arange(24), CENTER_MM)
     moves = changes_in_time(lattice(5).take(truth), np.arange(24), CENTER_MM, 2)
@@ -107,7 +107,7 @@ def test_the_cost_is_that_of_the_slices_and_of_the_changes():
     assert segments.cost == pytest.approx(cost[np.arange(24), truth].sum() + transition_penalty(moves))
 
 
-def test_one_slice_that_says_little_does_not_leave_its_run():
+def test_one_slice_that_says_little_does_not_leave_its_run() -> None:
     cost, _ = planted(1, np.full(24, 2))
     cost[7] = 3.0
     cost[7, 0] = 0.0  # a spoilt slice: slightly better elsewhere
@@ -117,7 +117,7 @@ def test_one_slice_that_says_little_does_not_leave_its_run():
     assert segments.interleave == 1  # the first of equals
 
 
-def test_missing_slices_do_not_break_the_interleave():
+def test_missing_slices_do_not_break_the_interleave() -> None:
     cost, truth = planted(2, np.repeat([0, 3], [12, 12]))
     there = np.setdiff1d(np.arange(24), [0, 5, 6, 13])
     segments = best_segments(cost[there], lattice(5), there, CENTER_MM)
@@ -125,7 +125,7 @@ def test_missing_slices_do_not_break_the_interleave():
     assert segments.interleave == 2
 
 
-def test_kept_candidates_are_considered_and_others_only_where_promising():
+def test_kept_candidates_are_considered_and_others_only_where_promising() -> None:
     """One motion that is never among the best of a window can be the best compromise."""
     orders = time_orders(np.arange(24))
     windows = [order[first : first + 5] for order in orders.values() for first in range(20)]
@@ -145,7 +145,7 @@ def test_kept_candidates_are_considered_and_others_only_where_promising():
 
 @pytest.mark.parametrize("n_slices", [1, 2])
 @pytest.mark.parametrize("n_candidates", [1, 3])
-def test_very_few_slices_and_candidates(n_slices: int, n_candidates: int):
+def test_very_few_slices_and_candidates(n_slices: int, n_candidates: int) -> None:
     cost = np.arange(n_slices * n_candidates, dtype=float).reshape(n_slices, n_candidates)
     segments = best_segments(cost, lattice(n_candidates), np.arange(n_slices) + 4, CENTER_MM)
     assert (segments.choice == 0).all()
@@ -154,7 +154,7 @@ def test_very_few_slices_and_candidates(n_slices: int, n_candidates: int):
     assert moves.shape == (n_slices - 1,)
 
 
-def test_changes_cost_more_the_further_they_go_and_none_costs_nothing():
+def test_changes_cost_more_the_further_they_go_and_none_costs_nothing() -> None:
     assert transition_penalty(np.zeros(30)) == 0
     assert transition_penalty(np.zeros(0)) == 0
     penalties = [transition_penalty(np.array([0.0, d, 0])) for d in (0.01, 1.0, 4.0, 20.0, 80.0)]

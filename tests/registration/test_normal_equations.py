@@ -83,7 +83,7 @@ def jacobian(slices: Slices, gain: np.ndarray, size: float = 1e-6) -> np.ndarray
 
 
 @pytest.mark.parametrize("width", [0.05, 1e6])
-def test_gradient_and_hessian_against_finite_differences(width: float):
+def test_gradient_and_hessian_against_finite_differences(width: float) -> None:
     slices, gain = make_slices()
     equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, width)
     derivative = jacobian(slices, gain)
@@ -98,7 +98,7 @@ def test_gradient_and_hessian_against_finite_differences(width: float):
         assert np.linalg.norm(equations.hessian[k] - hessian) < 1e-4 * np.linalg.norm(hessian)
 
 
-def test_the_gradient_is_that_of_the_cauchy_loss():
+def test_the_gradient_is_that_of_the_cauchy_loss() -> None:
     slices, gain = make_slices(1)
     width, size = 0.1, 1e-5
     model = SliceModel(slices, smooth_volume(), GRID)
@@ -114,7 +114,7 @@ def test_the_gradient_is_that_of_the_cauchy_loss():
         np.testing.assert_allclose(found[:, a], down, atol=2e-3 * np.abs(found).max())
 
 
-def test_statistics_are_those_of_the_pixels():
+def test_statistics_are_those_of_the_pixels() -> None:
     slices, gain = make_slices(2)
     equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
     model = model_pixels(slices, slices.planes.pose, np.ones(len(slices)))
@@ -125,7 +125,7 @@ def test_statistics_are_those_of_the_pixels():
         assert equations.loss[k] == pytest.approx(np.log1p(((y - gain[k] * m) / 0.1) ** 2).mean(), rel=1e-4)
 
 
-def test_stride_takes_every_nth_pixel_and_residuals_match():
+def test_stride_takes_every_nth_pixel_and_residuals_match() -> None:
     slices, gain = make_slices(3)
     model = SliceModel(slices, smooth_volume(), GRID, stride=3)
     expected = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
@@ -133,7 +133,7 @@ def test_stride_takes_every_nth_pixel_and_residuals_match():
     assert model.evaluate(slices.planes, gain, 1.0).moments[:, 0].sum() == len(expected[::3])
 
 
-def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero():
+def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero() -> None:
     slices, gain = make_slices(5)
     away = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + 500))
     equations = SliceModel(away, smooth_volume(), GRID).evaluate(away.planes, gain, 0.1)
@@ -142,7 +142,7 @@ def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero():
     assert np.isfinite(equations.loss).all()
 
 
-def test_correlation_of_constants_is_zero():
+def test_correlation_of_constants_is_zero() -> None:
     n = 10.0
     moments = np.array(
         [

@@ -12,7 +12,7 @@ from g3r.registration.prior_registration import register_to_prior
 from tests.registration.moving_heads import STILL, as_slices, pixel_errors_mm, simulated
 
 
-def test_slices_that_moved_come_nearer_to_a_good_prior(head: Phantom):
+def test_slices_that_moved_come_nearer_to_a_good_prior(head: Phantom) -> None:
     slices, truth = as_slices(simulated(head, MotionLevel(walk_deg=1.2, walk_mm=0.8), n_stacks=1))
     bright = np.percentile(head.t2[head.mask], 99)
     prior = (gaussian_filter(head.t2 * head.mask, 0.8) / bright).astype(np.float32)
@@ -23,7 +23,7 @@ def test_slices_that_moved_come_nearer_to_a_good_prior(head: Phantom):
     assert gain.shape == (len(slices),)
 
 
-def test_slices_in_line_stay_there_against_a_prior_that_says_nothing_new(head: Phantom):
+def test_slices_in_line_stay_there_against_a_prior_that_says_nothing_new(head: Phantom) -> None:
     slices, _ = as_slices(simulated(head, STILL, n_stacks=1))
     grid = grid_around(slices, 1.5)
     coarse, _ = coarse_and_density(slices, grid)

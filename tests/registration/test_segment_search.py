@@ -41,7 +41,7 @@ def jerked(slices: Slices, stack: int, by: RigidPose) -> tuple[RigidPose, np.nda
     ), late
 
 
-def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
+def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving) -> None:
     slices, truth = moving.slices, moving.truth
     elsewhere = turned_about(np.zeros(3), np.array([2.0, 0.5, -1.0]), np.array([60.0, 20, -50])) @ truth
     stray = slices_disturbed(slices.with_motion(elsewhere), 30.0, 25.0).world_from_header()
@@ -63,7 +63,9 @@ def test_another_frame_is_taken_out_and_strays_do_not_tilt_it(moving: Moving):
     )
 
 
-def test_half_a_stack_is_placed_again_after_a_jerk(still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]):
+def test_half_a_stack_is_placed_again_after_a_jerk(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+) -> None:
     """A wrongly placed segment is corrected, with nothing known about which segment is wrong."""
     slices, _ = still_slices
     by = turned_about(np.zeros(3), np.deg2rad([0, 12, 8]), np.array([4.0, 3, -5]))
@@ -91,7 +93,7 @@ def test_half_a_stack_is_placed_again_after_a_jerk(still_slices: tuple[Slices, R
     assert (proposed.motion.translation_mm == 0).all(1).mean() > 0.8
 
 
-def test_a_rigid_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phantom):
+def test_a_rigid_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phantom) -> None:
     jerk = MotionLevel(n_jerks=1, jerk_deg=10.0, jerk_mm=6.0)
     slices, truth = as_slices(simulated(head, [STILL, jerk, STILL], seed=2))
     _, sizes = np.unique(truth.take(slices.stack_id == 1).translation_mm.round(6), axis=0, return_counts=True)
@@ -110,7 +112,7 @@ def test_a_rigid_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phant
 
 def test_segments_that_fit_noise_collapse_to_one_motion(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
-):
+) -> None:
     slices, truth = still_slices
     motion = slices_disturbed(slices, 0.7, 0.4).world_from_header()
     found, shared = collapse_to_rigid(slices, samples, motion, [1, 1, 1])
@@ -121,7 +123,7 @@ def test_segments_that_fit_noise_collapse_to_one_motion(
 
 def test_a_stack_that_starts_upside_down_comes_back(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
-):
+) -> None:
     slices, truth = still_slices
     start = upside_down(slices, 1)
     assert np.median(pixel_errors_mm(slices.with_motion(start), truth)[(slices.stack_id == 1)[slices.pixel_plane]]) > 20
@@ -133,7 +135,7 @@ def test_a_stack_that_starts_upside_down_comes_back(
     assert held_out_score(slices, samples, found).cost < held_out_score(slices, samples, start).cost - 100
 
 
-def test_severe_motion_is_undone(moving: Moving):
+def test_severe_motion_is_undone(moving: Moving) -> None:
     """Headers 16 mm off, four jerks of 15 degrees in each stack, slices that lost their signal."""
     before = pixel_errors_mm(moving.slices, moving.truth)
     after = pixel_errors_mm(moving.estimate.slices, moving.truth)

@@ -39,7 +39,7 @@ def few_slices(n: int = 7) -> Slices:
     )
 
 
-def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
+def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask() -> None:
     slices = few_slices()
     pixels = SearchPixels.of(slices, pixels_per_slice=60)
     assert len(pixels) == len(slices)
@@ -60,12 +60,12 @@ def test_search_pixels_are_a_lattice_of_every_slice_zero_outside_the_mask():
         assert pixels.area_mm2[k] == pytest.approx(size_mm.prod())
 
 
-def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too():
+def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too() -> None:
     planes = Planes(
         rotation=np.tile(np.eye(3), (2, 1, 1)),
         center_mm=np.zeros((2, 3)),
         spacing_mm=np.ones((2, 2)),
-        shape=[[1, 50], [20, 20]],
+        shape=np.array([[1, 50], [20, 20]]),
         psf_var_mm2=np.zeros((2, 3)),
     )
     mask = np.zeros(450, bool)
@@ -109,7 +109,7 @@ def oblique_volume(rng: np.random.Generator) -> tuple[np.ndarray, VolumeGrid]:
     return rng.random(grid.shape).astype(np.float32), VolumeGrid(grid.shape, affine)
 
 
-def test_moments_are_those_of_plain_trilinear_reading(rng: np.random.Generator):
+def test_moments_are_those_of_plain_trilinear_reading(rng: np.random.Generator) -> None:
     pixels = SearchPixels.of(few_slices())
     volume, grid = oblique_volume(rng)
     motion = perturbed(RigidPose.identity(1), CENTER_MM, 5, 30.0, 6.0, rng)
@@ -120,7 +120,7 @@ def test_moments_are_those_of_plain_trilinear_reading(rng: np.random.Generator):
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
 
-def test_outside_of_the_volume_there_is_nothing(rng: np.random.Generator):
+def test_outside_of_the_volume_there_is_nothing(rng: np.random.Generator) -> None:
     pixels = SearchPixels.of(few_slices())
     volume, grid = oblique_volume(rng)
     far = RigidPose(np.eye(3)[None], np.array([[500.0, 0, 0]]))
@@ -129,7 +129,7 @@ def test_outside_of_the_volume_there_is_nothing(rng: np.random.Generator):
     assert (found[..., 3] > 0).all()
 
 
-def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generator):
+def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generator) -> None:
     slices = few_slices()
     pixels = SearchPixels.of(slices)
     volume, grid = oblique_volume(rng)
@@ -141,7 +141,7 @@ def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generato
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.6, 0.97, 1.6, 5.0])
-def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.random.Generator):
+def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.random.Generator) -> None:
     m = rng.random((4, 50))
     y = gain * m + 0.1 * rng.normal(size=m.shape)
     moments = np.stack([np.full(4, 50.0), y.sum(1), m.sum(1), (y * y).sum(1), (m * m).sum(1), (y * m).sum(1)], axis=1)
@@ -152,7 +152,7 @@ def test_the_residual_is_the_least_over_allowed_gains(gain: float, rng: np.rando
     np.testing.assert_allclose(mean_square_residual(moments), expected, rtol=1e-4)
 
 
-def test_the_residual_of_an_empty_model_is_the_image_and_never_negative():
+def test_the_residual_of_an_empty_model_is_the_image_and_never_negative() -> None:
     moments = np.array([[10.0, 5, 0, 4, 0, 0], [10, 5, 5, 4, 4, 4 + 1e-13], [0, 0, 0, 0, 0, 0]])
     np.testing.assert_allclose(mean_square_residual(moments), [0.4, 0, 0], atol=1e-12)
     assert (mean_square_residual(moments) >= 0).all()

@@ -22,7 +22,7 @@ def true_volume(slices: Slices, voxel_mm: float = 1.5) -> tuple[np.ndarray, Volu
     return solve_volume(operator, slices.masked_value, weight, n_iterations=15), grid
 
 
-def test_slices_find_back_to_a_volume(still: list[SimulatedStack]):
+def test_slices_find_back_to_a_volume(still: list[SimulatedStack]) -> None:
     slices, truth = as_slices(still)
     volume, grid = true_volume(slices)
     start = slices_disturbed(slices, 2.0, 1.2)
@@ -39,7 +39,7 @@ def test_slices_find_back_to_a_volume(still: list[SimulatedStack]):
     assert fit.ncc[big].min() > 0.9
 
 
-def test_registration_never_makes_the_fit_worse(still: list[SimulatedStack]):
+def test_registration_never_makes_the_fit_worse(still: list[SimulatedStack]) -> None:
     slices, _ = as_slices(still)
     volume, grid = true_volume(slices)
     start = slices_disturbed(slices, 6.0, 4.0)
@@ -51,7 +51,7 @@ def test_registration_never_makes_the_fit_worse(still: list[SimulatedStack]):
     assert np.isfinite(fit.hessian).all()
 
 
-def test_a_slice_that_lost_its_way_takes_its_neighbours_place(still: list[SimulatedStack]):
+def test_a_slice_that_lost_its_way_takes_its_neighbours_place(still: list[SimulatedStack]) -> None:
     slices, truth = as_slices(still)
     volume, grid = true_volume(slices)
     lost = int(np.flatnonzero(slices.stack_id == 0)[len(np.flatnonzero(slices.stack_id == 0)) // 2])

@@ -12,7 +12,7 @@ from tests.registration.moving_heads import as_slices, pixel_errors_mm, simulate
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_stacks_come_together_from_15_degrees_and_5_mm(still: list[SimulatedStack], seed: int):
+def test_stacks_come_together_from_15_degrees_and_5_mm(still: list[SimulatedStack], seed: int) -> None:
     slices, truth = as_slices(still)
     rng = np.random.default_rng(seed)
     axis, direction = rng.normal(size=(2, 3))
@@ -37,14 +37,14 @@ def test_stacks_come_together_from_15_degrees_and_5_mm(still: list[SimulatedStac
     assert min(agreement) > 0.4  # volumes of the search are blurred
 
 
-def test_one_stack_is_left_where_it_is(still: list[SimulatedStack]):
+def test_one_stack_is_left_where_it_is(still: list[SimulatedStack]) -> None:
     slices, _ = as_slices(still[:1])
     registered, agreement = register_stacks(slices)
     assert registered is slices
     assert agreement == [1.0]
 
 
-def test_self_consistency_is_lower_with_motion(head: Phantom, still: list[SimulatedStack]):
+def test_self_consistency_is_lower_with_motion(head: Phantom, still: list[SimulatedStack]) -> None:
     moving, _ = as_slices(simulated(head, MotionLevel(walk_deg=3.0, walk_mm=2.0)))
     lying, _ = as_slices(still)
     for stack in range(3):

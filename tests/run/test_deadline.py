@@ -1,19 +1,24 @@
 """Loops that end by number or by the clock."""
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from g3r.run.deadline import Deadline, timed_steps
 
 
 class Clock:
-    def __init__(self):
+    def __init__(self) -> None:
         self.now = 100.0
 
-    def __call__(self):
+    def __call__(self) -> float:
         return self.now
 
 
-def run(n_steps, seconds, per_step, **options):
+def run(
+    n_steps: int, seconds: float, per_step: float | Callable[[int], float], **options: Any
+) -> tuple[list[tuple[int, float]], float]:
     clock, done = Clock(), []
     deadline = Deadline.after(seconds, clock)
     for step, fraction in timed_steps(n_steps, deadline, **options):
@@ -22,22 +27,22 @@ def run(n_steps, seconds, per_step, **options):
     return done, clock.now - 100.0
 
 
-def test_without_a_deadline_all_steps_are_made():
+def test_without_a_deadline_all_steps_are_made() -> None:
     assert list(timed_steps(4)) == [(0, 0.0), (1, 0.25), (2, 0.5), (3, 0.75)]
 
 
-def test_with_time_enough_all_steps_are_made():
+def test_with_time_enough_all_steps_are_made() -> None:
     done, _ = run(4, 100, 1.0)
     assert done == list(timed_steps(4))
 
 
 @pytest.mark.parametrize("seconds", [3.0, 10.0, 33.3])
-def test_the_deadline_is_kept_and_used(seconds):
+def test_the_deadline_is_kept_and_used(seconds: float) -> None:
     _done, took = run(1000, seconds, 0.5)
     assert seconds - 0.5 <= took <= seconds
 
 
-def test_the_fraction_rises_to_the_end_of_the_schedule():
+def test_the_fraction_rises_to_the_end_of_the_schedule() -> None:
     done, _ = run(1000, 20.0, 0.5)
     fractions = [fraction for _, fraction in done]
     assert fractions == sorted(fractions)
@@ -45,7 +50,7 @@ def test_the_fraction_rises_to_the_end_of_the_schedule():
     assert 0.9 < fractions[-1] < 1
 
 
-def test_steps_that_become_slower_shorten_the_schedule():
+def test_steps_that_become_slower_shorten_the_schedule() -> None:
     done, took = run(1000, 20.0, lambda step: 0.1 if step < 20 else 0.5)
     fractions = [fraction for _, fraction in done]
     assert fractions == sorted(fractions)
@@ -53,12 +58,12 @@ def test_steps_that_become_slower_shorten_the_schedule():
     assert took <= 21
 
 
-def test_a_deadline_that_has_passed_allows_the_least():
+def test_a_deadline_that_has_passed_allows_the_least() -> None:
     done, _ = run(10, -5.0, 1.0, least=3)
     assert [step for step, _ in done] == [0, 1, 2]
 
 
-def test_a_part_leaves_the_reserve():
+def test_a_part_leaves_the_reserve() -> None:
     clock = Clock()
     deadline = Deadline.after(20.0, clock)
     part = deadline.part(0.5, reserve_s=4.0)

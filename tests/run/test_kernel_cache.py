@@ -54,7 +54,9 @@ def run(environment: dict[str, str], folder: Path) -> tuple[Path, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
-def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(blocked: dict[str, str], tmp_path: Path):
+def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(
+    blocked: dict[str, str], tmp_path: Path
+) -> None:
     path, hits = run(blocked, tmp_path)
     assert path.is_relative_to(tmp_path)  # the copy, not the package under test
     assert hits == "Counter()"
@@ -65,7 +67,7 @@ def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(bloc
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
-def test_a_folder_of_somebody_else_is_not_used(blocked: dict[str, str], tmp_path: Path):
+def test_a_folder_of_somebody_else_is_not_used(blocked: dict[str, str], tmp_path: Path) -> None:
     """What lies in the cache is run as code, and anybody may make folders among the temporary files."""
     planted = tmp_path / "tmp" / f"g3r-kernels-{os.getuid()}"
     planted.mkdir()
@@ -74,14 +76,14 @@ def test_a_folder_of_somebody_else_is_not_used(blocked: dict[str, str], tmp_path
     assert list(planted.iterdir()) == []
 
 
-def test_a_folder_that_was_chosen_stays(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_folder_that_was_chosen_stays(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(_kernel_cache, "may_write", lambda folder: False)
     ensure_kernel_cache()
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path)
 
 
-def test_may_write(tmp_path: Path):
+def test_may_write(tmp_path: Path) -> None:
     assert may_write(tmp_path)
     assert may_write(tmp_path / "a" / "b")
     (tmp_path / "file").write_text("")

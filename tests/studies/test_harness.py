@@ -44,7 +44,7 @@ def squares(folder: Path) -> Study:
     )
 
 
-def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path, capsys):
+def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "page.md").write_text(PAGE)
     study, output = squares(tmp_path), ["--output", str(tmp_path / "out")]
     assert study.main(["3", "13", *output]) == InputError.exit_code
@@ -59,7 +59,7 @@ def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path, capsys):
     assert study.main(["9", *output]) == 1  # the verdict
 
 
-def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path, capsys):
+def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study, output = squares(tmp_path), ["--output", str(tmp_path / "out")]
     assert study.main(["2", "3", *output]) == 0
     before = (tmp_path / "out" / "squares.json").read_bytes()
@@ -72,7 +72,7 @@ def test_rows_of_other_settings_are_neither_mixed_nor_lost(tmp_path, capsys):
     assert study.main(["2", "3", *output, "--unit", "m", "--fresh"]) == 0
 
 
-def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path):
+def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path: Path) -> None:
     new = {"preset": "fast", "machine": {"commit": "a"}, "rows": {}}
     path = tmp_path / "record.json"
     assert resumed(path, new, set()) == new
@@ -83,14 +83,14 @@ def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path):
         resumed(path, new, set())
 
 
-def test_jobs_run_in_processes_of_their_own(tmp_path):
+def test_jobs_run_in_processes_of_their_own(tmp_path: Path) -> None:
     assert squares(tmp_path).main(["2", "3", "--jobs", "2", "--output", str(tmp_path / "out")]) == 0
     rows = json.loads((tmp_path / "out" / "squares.json").read_text())["rows"]
     assert [row["square"] for row in rows.values()] == [4, 9]
     assert os.getpid() not in {row["process"] for row in rows.values()}
 
 
-def test_subjects_that_were_looked_at_are_not_published(tmp_path, capsys):
+def test_subjects_that_were_looked_at_are_not_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "page.md").write_text(PAGE)
     words = ["2", "--development", "--docs", str(tmp_path / "page.md"), "--output", str(tmp_path)]
     assert squares(tmp_path).main(words) == InputError.exit_code
@@ -99,7 +99,7 @@ def test_subjects_that_were_looked_at_are_not_published(tmp_path, capsys):
         squares(tmp_path).main(["2", "--jobs", "0"])
 
 
-def test_cells_of_tables():
+def test_cells_of_tables() -> None:
     rows = [{"name": "a", "scores": {"V prior": 1.26}}, {"name": "b", "scores": {}}]
     text = table(rows, [("", "{name}"), ("dB", "{scores[V prior]:.1f}"), ("dB", lambda row: len(row["scores"]))])
     assert text.splitlines() == ["|  | dB | dB |", "| --- | ---: | ---: |", "| a | 1.3 | 1 |", "| b |  | 0 |"]
@@ -108,7 +108,7 @@ def test_cells_of_tables():
 
 
 @pytest.mark.parametrize("module", STUDIES)
-def test_every_study_starts(module, capsys):
+def test_every_study_starts(module: str, capsys: pytest.CaptureFixture[str]) -> None:
     found = import_module(module)
     with pytest.raises(SystemExit, match="0"):
         (found.STUDY if hasattr(found, "STUDY") else found).main(["--help"])

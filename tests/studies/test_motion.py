@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,21 +17,23 @@ from studies.motion.figure import draw_slice_errors, jerk_slices, places_in_time
 SETTINGS = {"preset": "balanced", "jobs": 1, "threads": 2}
 
 
-def test_every_subject_has_a_seed_of_its_own():
+def test_every_subject_has_a_seed_of_its_own() -> None:
     kinds = [{"turned": turned, "development": dev} for turned in (False, True) for dev in (False, True)]
     every = [one for kind in kinds for one in sweep.specs(sweep.LEVELS, 100, **kind)]
     assert len({one.seed for one in every}) == len({one.name for one in every}) == 1200
     assert sweep.specs(["severe"], 2)[1] == sweep.specs(sweep.LEVELS, 10)[21]
 
 
-def subject(level, median, p90, *, warned, psnr=None, turned=False):
+def subject(
+    level: str, median: float, p90: float, *, warned: bool, psnr: float | None = None, turned: bool = False
+) -> dict[str, Any]:
     row = {"level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90}
     row |= {"bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0, "turned": turned}
     row["orientation_deg"] = 2.0 if median < 1 else None if level == "mild" else 90.0
     return row if psnr is None else {**row, "psnr_db": psnr}
 
 
-def test_sweep_counts_who_was_warned():
+def test_sweep_counts_who_was_warned() -> None:
     rows = {
         "a": subject("severe", 0.4, 1.0, warned=False),
         "b": subject("severe", 0.6, 2.0, warned=True),
@@ -46,7 +51,7 @@ def test_sweep_counts_who_was_warned():
     assert "| mild | 1 | 9.0 | 0% | 95% | 5.00 |" in found["sweep-turned"]
 
 
-def test_sweep_with_volumes():
+def test_sweep_with_volumes() -> None:
     rows = {"a": subject("mild", 0.4, 1.0, warned=False, psnr=28.04), "b": subject("mild", 9, 9, warned=True)}
     text = sweep.tables(SETTINGS | {"full": True, "rows": rows})["sweep"]
     assert "| 35 | 28.0 |" in text
@@ -54,7 +59,7 @@ def test_sweep_with_volumes():
     assert "| 35 | none |" in text  # refused: no volume
 
 
-def test_layer_tables_leave_gaps_where_nothing_was_measured():
+def test_layer_tables_leave_gaps_where_nothing_was_measured() -> None:
     figures = {"median_mm": 0.5, "p90_mm": 1.25, "seconds": 12.3, "psnr_db": 28.0}
     cases = {
         "one": {"layers": {"headers": figures, "best start": figures}, "without": {"everything": figures}},
@@ -68,7 +73,7 @@ def test_layer_tables_leave_gaps_where_nothing_was_measured():
     assert "| two |  | 28.00 (0.50) |" in text
 
 
-def test_bias_table():
+def test_bias_table() -> None:
     row = {"volume": "v", "bias": 0.15, "shading": "estimated", "seed": 7, "median_mm": 0.5, "p90_mm": 1.0}
     row |= {"warned": False, "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}
     alone = {name: value for name, value in row.items() if name not in ("psnr_db", "ssim")}
@@ -78,12 +83,12 @@ def test_bias_table():
 
 
 @pytest.mark.parametrize("variants", [layers.WITHOUT, bias.VARIANTS, {x.name: x.options for x in layers.LAYERS}])
-def test_variants_are_settings_that_exist(variants):
+def test_variants_are_settings_that_exist(variants: dict[str, dict[str, Any]]) -> None:
     for options in variants.values():
         changed(PRESETS["balanced"], options)
 
 
-def test_jerks_are_found_in_the_order_of_time():
+def test_jerks_are_found_in_the_order_of_time() -> None:
     """Ten slices, taken 0 2 4 6 8 1 3 5 7 9; the head jumps 5 mm before slice 8."""
     place = places_in_time(10)
     assert place.tolist() == [0, 5, 1, 6, 2, 7, 3, 8, 4, 9]
@@ -95,7 +100,7 @@ def test_jerks_are_found_in_the_order_of_time():
     assert jerk_slices(PoseTable(keys, poses), points) == [[0, 4]]
 
 
-def test_figure_of_layers_known_and_new(tmp_path):
+def test_figure_of_layers_known_and_new(tmp_path: Path) -> None:
     per_slice = [[0, k, 0.1 * k] for k in range(10)]
     shown = {name: {"per_slice_mm": per_slice} for name in ("headers", "slices", "something new")}
     case = {"layers": shown, "n_slices": [10], "jerks": [[0, 4]]}

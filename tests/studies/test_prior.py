@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from studies.subjects import read_case
 SETTINGS = {"preset": "balanced", "weights": "abc", "threads": 2, "n_views": 4}
 
 
-def ablation_rows(gain=(2.0, 1.0, 0.5)):
+def ablation_rows(gain: tuple[float, float, float] = (2.0, 1.0, 0.5)) -> dict[str, dict[str, Any]]:
     """Two subjects, from 1 and 3 stacks."""
     rows = {}
     for number, (name, volume) in enumerate({"a": "crl-sta/sta24", "b": "spina-bifida/sb25-operated"}.items()):
@@ -35,7 +37,7 @@ def ablation_rows(gain=(2.0, 1.0, 0.5)):
     return rows
 
 
-def test_ablation_table_gives_mean_spread_and_paired_difference():
+def test_ablation_table_gives_mean_spread_and_paired_difference() -> None:
     text = ablation.tables(SETTINGS | {"rows": ablation_rows()})["ablation"]
     assert "| fit without prior | 21.50 ± 0.71 | 0.900 ± 0.000 |  |" in text
     assert "| with distillation | 24.50 ± 2.12 | 0.900 ± 0.000 | +3.00 ± 1.41 |" in text
@@ -46,7 +48,7 @@ def test_ablation_table_gives_mean_spread_and_paired_difference():
     assert "2 stacks" not in text
 
 
-def test_ablation_subjects_are_many_fresh_and_of_their_own():
+def test_ablation_subjects_are_many_fresh_and_of_their_own() -> None:
     published, looked_at = ablation.specs(), ablation.specs(development=True)
     assert len(published) >= 8
     assert {one.seed for one in published}.isdisjoint(one.seed for one in looked_at)
@@ -57,8 +59,8 @@ def test_ablation_subjects_are_many_fresh_and_of_their_own():
         changed(PRESETS["balanced"], options)
 
 
-def test_alone_table_marks_what_falls_short():
-    def row(n_stacks, gain, ssim):
+def test_alone_table_marks_what_falls_short() -> None:
+    def row(n_stacks: int, gain: float, ssim: float) -> dict[str, Any]:
         psnr = {"V_coarse": 20.0, "V_sharp": 21.0, "V_prior": 20.0 + gain}
         scores = {name: {"psnr_db": db, "ssim": ssim} for name, db in psnr.items()}
         return {"case": "c", "n_stacks": n_stacks, "scores": scores, "seconds": 2.5}
@@ -74,8 +76,8 @@ def test_alone_table_marks_what_falls_short():
     assert "2.0e-04 of the intensity scale (asked: 0.001)" in text
 
 
-def test_cases_table_marks_a_prior_that_costs():
-    def row(gain):
+def test_cases_table_marks_a_prior_that_costs() -> None:
+    def row(gain: float) -> dict[str, Any]:
         scores = {v: {"psnr_db": 25.0, "ssim": 0.9} for v in ablation.VARIANTS}
         scores[cases.PRODUCT] = {"psnr_db": 25.0 + gain, "ssim": 0.9}
         return {"n_stacks": 3, "scores": scores, "median_mm": {cases.PRODUCT: 0.07}}
@@ -85,21 +87,21 @@ def test_cases_table_marks_a_prior_that_costs():
     assert "| 24.70 | -0.30 (!) | 0.900 | 0.07 |" in text
 
 
-def network_record():
+def network_record() -> dict[str, Any]:
     scores = {n: {"l1": 0.05, "psnr_db": 25.0 + k, "ssim": 0.9} for k, n in enumerate(("1", "2", "all"))}
     one = {"scores": scores, "parameters": 1_500_000, "seconds": 2.5, "steps": 288, "train_seconds": 600}
     rows = {"size-16-32-64": {**one, "what": "small", "is_size": True}, "full": {**one, "what": "all", "is_size": True}}
     return SETTINGS | {"rows": {"V_coarse": {"scores": scores}, "V_sharp": {"scores": scores}, **rows}}
 
 
-def test_network_table():
+def test_network_table() -> None:
     text = networks.tables(network_record())["networks"]
     assert "| V_coarse |  | 0.0500 | 25.00 | 26.00 | 27.00 | 0.900 |  |  |  |  |" in text
     assert "| full | all | 0.0500 | 25.00 | 26.00 | 27.00 | 0.900 | 1.50 M | 2.5 | 288 | 10 |" in text
     assert text.index("| full |") < text.index("| size-16-32-64 |")
 
 
-def test_networks_differ_from_the_configuration():
+def test_networks_differ_from_the_configuration() -> None:
     config = networks.configuration()
     found = {variant.name for variant in networks.distinct_variants(config)}
     assert "size-" + "-".join(map(str, config["model"]["channels"])) not in found
@@ -111,13 +113,13 @@ def test_networks_differ_from_the_configuration():
     assert networks.epochs_of(36, config, own) == 3
 
 
-def test_network_options_are_those_of_the_module():
+def test_network_options_are_those_of_the_module() -> None:
     training = pytest.importorskip("g3r.training.prior_module", reason="the training extra is not installed")
     for variant in networks.VARIANTS:
         training.PriorModule(**{"channels": [8, 8, 8], **variant.options})
 
 
-def test_scores_by_number_of_stacks():
+def test_scores_by_number_of_stacks() -> None:
     pytest.importorskip("torchmetrics", reason="the training extra is not installed")
     truth = torch.rand(1, 1, 12, 12, 12)
     volumes = [{"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)]
@@ -127,12 +129,12 @@ def test_scores_by_number_of_stacks():
     assert scores["all"]["l1"] == pytest.approx(0.14 / 3, abs=1e-6)
 
 
-def test_a_table_without_training_needs_a_record(tmp_path, capsys):
+def test_a_table_without_training_needs_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert networks.STUDY.main(["--no-train", "--output", str(tmp_path)]) == 3
     assert "no trained variant" in capsys.readouterr().err
 
 
-def test_the_newest_checkpoint_is_gone_on_with(tmp_path):
+def test_the_newest_checkpoint_is_gone_on_with(tmp_path: Path) -> None:
     assert networks.newest_checkpoint(tmp_path) is None
     for version, age in ((0, 50), (1, 10)):
         path = tmp_path / "logs" / f"version_{version}" / "checkpoints" / "last.ckpt"
@@ -142,13 +144,13 @@ def test_the_newest_checkpoint_is_gone_on_with(tmp_path):
     assert networks.newest_checkpoint(tmp_path) == path
 
 
-def test_figures_are_drawn_from_records(tmp_path):
+def test_figures_are_drawn_from_records(tmp_path: Path) -> None:
     draw_ablation(list(ablation_rows().values()), ablation.VARIANTS, ablation.BASELINE, tmp_path / "new" / "a.png")
     draw_networks(network_record(), tmp_path / "b.png")
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["a.png", "b.png"]  # no temporary file
 
 
-def test_slices_without_a_true_pose_are_left_out(tmp_path, rng):
+def test_slices_without_a_true_pose_are_left_out(tmp_path: Path, rng: np.random.Generator) -> None:
     from g3r.acquisition.images import save_volume
 
     affine = np.diag([1.0, 1.0, 3.0, 1.0])

@@ -22,7 +22,7 @@ SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
 
 
 @pytest.fixture
-def atlas(tmp_path, rng):
+def atlas(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A tree with one small head."""
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5
     mask = np.linalg.norm(index / [10, 11, 9], axis=-1) < 1
@@ -34,7 +34,7 @@ def atlas(tmp_path, rng):
     return tmp_path / "atlas"
 
 
-def test_subject_is_simulated_once_and_read_back(atlas, tmp_path):
+def test_subject_is_simulated_once_and_read_back(atlas: Path, tmp_path: Path) -> None:
     folder = simulated_subject(SPEC, atlas, tmp_path / "cache")
     written = (folder / "poses.tsv").stat().st_mtime_ns
     assert simulated_subject(SPEC, atlas, tmp_path / "cache") == folder
@@ -57,7 +57,7 @@ def test_subject_is_simulated_once_and_read_back(atlas, tmp_path):
     np.testing.assert_allclose(other.pose.translation_mm, table.pose.translation_mm, atol=1e-5)
 
 
-def test_turned_subject_keeps_its_size(atlas, tmp_path):
+def test_turned_subject_keeps_its_size(atlas: Path, tmp_path: Path) -> None:
     case = load_case(simulated_subject(replace(SPEC, turned=True), atlas, tmp_path / "cache"))
     axes = case.truth.affine[:3, :3] / case.truth.grid.spacing_mm
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
@@ -67,7 +67,7 @@ def test_turned_subject_keeps_its_size(atlas, tmp_path):
     assert orientation_deg(case, RigidPose(axes[None], np.ones((1, 3)))) == pytest.approx(0, abs=1e-3)
 
 
-def test_error_of_a_hand_made_case(tmp_path):
+def test_error_of_a_hand_made_case(tmp_path: Path) -> None:
     """Two stacks, one left-handed; one slice in ten is 3 mm off by its header, and one 90 degrees turned."""
     rows = []
     for stack, flip in enumerate([1.0, -1.0]):
@@ -93,7 +93,7 @@ def test_error_of_a_hand_made_case(tmp_path):
     assert error.per_slice_mm[1, 7] == pytest.approx(np.linalg.norm(points, axis=1).mean() * 2**0.5, rel=0.02)
 
 
-def test_a_folder_without_poses(tmp_path):
+def test_a_folder_without_poses(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"neither poses\.tsv nor poses\.json"):
         read_true_poses(tmp_path)
     with pytest.raises(InputError, match=r"no stack-N\.nii\.gz"):
@@ -102,20 +102,20 @@ def test_a_folder_without_poses(tmp_path):
         case_folders(["x"], tmp_path)
 
 
-def test_cases_are_chosen_by_a_part_of_their_name_and_ordered_by_motion(tmp_path):
+def test_cases_are_chosen_by_a_part_of_their_name_and_ordered_by_motion(tmp_path: Path) -> None:
     for name in ("b-severe", "a-mild-gap", "c-none", "a-single"):
         (tmp_path / name).mkdir()
     assert [f.name for f in case_folders(["*"], tmp_path)] == ["c-none", "a-mild-gap", "b-severe", "a-single"]
     assert [f.name for f in case_folders(["mild", "b-*"], tmp_path)] == ["a-mild-gap", "b-severe"]
 
 
-def test_data_folder_that_is_not_there(tmp_path, monkeypatch):
+def test_data_folder_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("G3R_TEST_DATA", str(tmp_path / "nothing"))
     with pytest.raises(InputError, match="set G3R_TEST_DATA"):
         data_folder("atlas")
 
 
-def test_a_volume_far_away_is_brought_near_by_the_motion_of_its_slices(rng):
+def test_a_volume_far_away_is_brought_near_by_the_motion_of_its_slices(rng: np.random.Generator) -> None:
     """Half a turn and a metre away, with other intensities; what is left, a millimetre, alignment finds."""
     shape = (40, 44, 36)
     truth = gaussian_filter(rng.normal(size=shape), 2.5)

@@ -1,5 +1,8 @@
 """Studies of the trade-off: steps read off a curve, marks in tables, few Gaussians for a ball, a small phantom."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,16 +13,16 @@ from studies.tradeoff import convergence, gaussian_count, memory, peer_phantom, 
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
 
 
-def test_steps_are_interpolated_on_their_logarithm():
+def test_steps_are_interpolated_on_their_logarithm() -> None:
     assert steps_to_near([10, 40], [20.0, 22.0], 21.1) == pytest.approx(20.0)
 
 
-def test_a_curve_that_is_there_from_the_start_or_never():
+def test_a_curve_that_is_there_from_the_start_or_never() -> None:
     assert steps_to_near([10, 40], [22.0, 22.0], 22.05) == 10
     assert steps_to_near([10, 40], [20.0, 21.0], 22.0) is None
 
 
-def test_convergence_measures_every_way_against_the_best_of_all():
+def test_convergence_measures_every_way_against_the_best_of_all() -> None:
     rows = {}
     for way in WAYS:
         low = 0.0 if way == "few Gaussians first (as shipped)" else 3.0
@@ -33,7 +36,7 @@ def test_convergence_measures_every_way_against_the_best_of_all():
     )
 
 
-def test_budgets_mark_what_is_late_or_worse_and_nothing_else():
+def test_budgets_mark_what_is_late_or_worse_and_nothing_else() -> None:
     given = [(10, 13.0, 30.0), (20, 24.1, 29.95), (30, 30.0, 29.8)]
     more = {"case": "one", "registration": "draft", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
     rows = {str(b): {"budget_s": b, "seconds": s, "psnr_db": db, **more} for b, s, db in given}
@@ -45,13 +48,17 @@ def test_budgets_mark_what_is_late_or_worse_and_nothing_else():
     assert "1,234" in lines[0]
 
 
-def test_memory_is_judged_by_statements_and_limits():
+def test_memory_is_judged_by_statements_and_limits() -> None:
     stated = dict.fromkeys(("weeks", "stacks", "threads"), 1) | {"preset": "draft", "more": "", "voxel_mm": 0.5}
     stated |= {"stage": "prior", "stated_bytes": 1.2e9, "measured_bytes": 1e9}
     limit = {"name": "a", "limit_bytes": 1e9, "stated_bytes": 9e8, "measured_bytes": 9e8, "changes": []}
     limit |= {"cpu_seconds": 9.0, "psnr_db": 28.0}
     refused = {"name": "a", "limit_bytes": 5e8, "refused": "too small; ask for more"}
-    record = {"most": 1.5, "machine": machine(), "rows": {"a": stated, "b": {"limited": [limit, refused]}}}
+    record: dict[str, Any] = {
+        "most": 1.5,
+        "machine": machine(),
+        "rows": {"a": stated, "b": {"limited": [limit, refused]}},
+    }
     text = memory.tables(record)
     assert "| 1.20 GB | prior | 1.00 GB | 1.20 |" in text["memory"]
     assert "| a | 1.00 GB | 0.90 GB | 0.90 GB | 9 | 28.00 | nothing |" in text["memory-limits"]
@@ -61,7 +68,7 @@ def test_memory_is_judged_by_statements_and_limits():
         assert not memory.keeps_its_word(record | {"rows": record["rows"] | broken})
 
 
-def test_a_lattice_is_read_between_its_points_alone():
+def test_a_lattice_is_read_between_its_points_alone() -> None:
     rows = [{"psnr_db": 20.0, "n": 100}, {"psnr_db": 30.0, "n": 10_000}]
     assert gaussian_count.uniform_number(rows, 25.0) == pytest.approx(1000)
     assert gaussian_count.uniform_number(rows, 31.0) is None
@@ -75,7 +82,7 @@ def test_a_lattice_is_read_between_its_points_alone():
 DONE = ("n_seeded", "n_added", "n_dropped", "n_merged")
 
 
-def test_a_ball_needs_few():
+def test_a_ball_needs_few() -> None:
     """On voxels of 1.6 mm, to be quick: under 500 Gaussians, where a lattice of twice as many is worse."""
     volume, mask, grid = gaussian_count.ball(1.6)
     stage = PriorStageSettings(n_steps=15, scale_weight=0.0)
@@ -92,7 +99,9 @@ def test_a_ball_needs_few():
     assert psnr > gaussian_count.psnr_db(uniform, target)
 
 
-def test_the_small_phantom_has_the_size_of_the_other_methods(tmp_path, capsys):
+def test_the_small_phantom_has_the_size_of_the_other_methods(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert peer_phantom.main(["--output", str(tmp_path / "small")]) == 0
     said = capsys.readouterr().out
     assert "truth 64x64x64, stacks 58x58x18, 58x58x18, 58x58x18" in said

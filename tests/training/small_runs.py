@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning.pytorch as lightning
 import pytest
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.data import DataLoader, Dataset
 
 from g3r.cli import export
 
@@ -25,6 +26,11 @@ def trainer(folder: Path, **options: Any) -> lightning.Trainer:
         "log_every_n_steps": 1,
     }
     return lightning.Trainer(default_root_dir=folder, **{**defaults, **options})
+
+
+def in_memory(samples: list[dict[str, torch.Tensor]], batch_size: int | None = None) -> DataLoader:
+    """A loader of samples that are there already."""
+    return DataLoader(cast(Dataset, samples), batch_size=batch_size)
 
 
 def logged(folder: Path) -> Any:

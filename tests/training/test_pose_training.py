@@ -1,6 +1,9 @@
 """Training of the pose network, its logs, and the way to a pose file."""
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,21 +18,22 @@ from g3r.errors import InputError
 from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.model import PoseModel
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from torch.utils.data import DataLoader  # noqa: E402
+import lightning.pytorch as lightning
+from torch.utils.data import DataLoader
 
-from g3r.pose_network.inference import as_pose  # noqa: E402
-from g3r.pose_network.network import PoseStep  # noqa: E402
-from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss  # noqa: E402
-from tests.training.small_runs import assert_export_refuses, logged, trainer  # noqa: E402
+from g3r.pose_network.inference import as_pose
+from g3r.pose_network.network import PoseStep
+from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss
+from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
-SMALL = {"network": NETWORK, "warmup_steps": 1}
+SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/pose.yaml"
 
 
-def sample(seed, n_stacks=2, n_slices=5):
+def sample(seed: int, n_stacks: int = 2, n_slices: int = 5) -> dict[str, torch.Tensor]:
     """One head's slices: noise, but with poses that fit together."""
     rng = np.random.default_rng(seed)
     stack = np.repeat(np.arange(n_stacks), n_slices)
@@ -54,25 +58,27 @@ def sample(seed, n_stacks=2, n_slices=5):
 class TinyData(lightning.LightningDataModule):
     """A few heads in memory, and a template of two ages."""
 
-    def __init__(self, n_ages=2, pixel_mm=3.0, template_mm=3.0, source="/some/where/atlas"):
+    def __init__(
+        self, n_ages: int = 2, pixel_mm: float = 3.0, template_mm: float = 3.0, source: str = "/some/where/atlas"
+    ) -> None:
         super().__init__()
         self.save_hyperparameters()
 
-    def template(self):
+    def template(self) -> AtlasTemplate:
         shape = (self.hparams["n_ages"], 9, 10, 11)
         config = PoseNetworkConfig(template_shape=shape, template_spacing_mm=self.hparams["template_mm"])
         heads = np.random.default_rng(0).random(shape).astype(np.float32)
         return AtlasTemplate(heads, config.template_grid.affine, np.arange(25.0, 25.0 + shape[0]))
 
-    def train_dataloader(self):
-        return DataLoader([sample(seed) for seed in range(3)], batch_size=None)
+    def train_dataloader(self) -> DataLoader:
+        return in_memory([sample(seed) for seed in range(3)])
 
-    def val_dataloader(self):
-        return DataLoader([sample(8, n_stacks=1), sample(9, n_stacks=2)], batch_size=None)
+    def val_dataloader(self) -> DataLoader:
+        return in_memory([sample(8, n_stacks=1), sample(9, n_stacks=2)])
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseModule]:
     """A run of one epoch: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
@@ -83,7 +89,7 @@ def trained(tmp_path_factory):
     return folder, folder / "last.ckpt", module
 
 
-def test_tensorboard_has_scalars_and_the_panel(trained):
+def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, PoseModule]) -> None:
     log = logged(trained[0] / "run" / "version_0")
     scores = {"val/slice_mm", "val/slice_deg", "val/stack_deg", "val/stacks_within_20deg", "val/stack_mm_1"}
     train = {"train/mm_step0", "train/mm_step1", "train/vote_step0", "train/samples_per_second"}
@@ -91,20 +97,22 @@ def test_tensorboard_has_scalars_and_the_panel(trained):
     assert len(log.Tags()["images"]) == 1
 
 
-def test_the_template_is_the_data_module_s(trained):
+def test_the_template_is_the_data_module_s(trained: tuple[Path, Path, PoseModule]) -> None:
     heads = torch.from_numpy(TinyData().template().volume)
     torch.testing.assert_close(trained[2].network.template.permute(3, 0, 1, 2), heads)
     assert trained[2].weeks == [25.0, 26.0]
 
 
-def test_resuming_goes_on(trained, tmp_path):
+def test_resuming_goes_on(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
     module = PoseModule(**SMALL)
     run = trainer(tmp_path, max_epochs=2)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 6
 
 
-def test_export_gives_the_same_network(trained, tmp_path, capsys):
+def test_export_gives_the_same_network(
+    trained: tuple[Path, Path, PoseModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, checkpoint, module = trained
     path = tmp_path / "pose.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
@@ -130,7 +138,13 @@ def test_export_gives_the_same_network(trained, tmp_path, capsys):
         (lambda content: content["state_dict"].popitem(), "cannot be exported"),
     ],
 )
-def test_export_refuses(trained, tmp_path, capsys, alter, expected):
+def test_export_refuses(
+    trained: tuple[Path, Path, PoseModule],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    alter: Callable[[dict[str, Any]], object],
+    expected: str,
+) -> None:
     assert_export_refuses(trained[1], alter, expected, tmp_path, capsys)
 
 
@@ -138,22 +152,22 @@ def test_export_refuses(trained, tmp_path, capsys, alter, expected):
     ("settings", "message"),
     [({"template_mm": 4.0}, "not on a grid of 3 mm"), ({"pixel_mm": 4.0}, "data.pixel_mm: 4.0")],
 )
-def test_data_that_do_not_fit(tmp_path, settings, message):
+def test_data_that_do_not_fit(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         trainer(tmp_path, max_epochs=1).fit(PoseModule(**SMALL), TinyData(**settings))
 
 
-def test_resuming_with_another_template_is_refused(trained, tmp_path):
+def test_resuming_with_another_template_is_refused(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
     module = PoseModule(**SMALL)
     with pytest.raises(InputError, match="resume with the same data"):
         trainer(tmp_path, max_epochs=2).fit(module, TinyData(n_ages=3), ckpt_path=trained[1], weights_only=True)
 
 
-def exact_step(batch):
+def exact_step(batch: dict[str, torch.Tensor]) -> PoseStep:
     return PoseStep(batch["true_rotation"], batch["true_translation_mm"], batch["true_rotation"])
 
 
-def test_losses_and_scores_of_true_poses():
+def test_losses_and_scores_of_true_poses() -> None:
     batch = sample(0)
     step = exact_step(batch)
     assert float(point_loss(step, batch)) == pytest.approx(0.01)  # the root's softening
@@ -165,13 +179,13 @@ def test_losses_and_scores_of_true_poses():
     assert scores["stacks_within_20deg"] == 1.0
 
 
-def test_loss_is_a_distance_in_mm():
+def test_loss_is_a_distance_in_mm() -> None:
     batch = sample(0)
-    off = PoseStep(batch["true_rotation"], batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]), None)
+    off = exact_step(batch)._replace(translation_mm=batch["true_translation_mm"] + torch.tensor([3.0, 4, 0]))
     assert float(point_loss(off, batch)) == pytest.approx(5.0, abs=1e-3)
 
 
-def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are():
+def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are() -> None:
     torch.manual_seed(1)
     n_heads, per_stack = 40, 3
     set_of_stack = torch.arange(n_heads).repeat_interleave(2)
@@ -184,7 +198,7 @@ def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are():
     assert 5 < changed.all(1).sum() < n_heads - 5
 
 
-def test_starting_from_other_weights(trained, tmp_path):
+def test_starting_from_other_weights(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
     fresh = PoseModule(**SMALL, start_from=str(trained[1]))
     for one, other in zip(fresh.network.parameters(), trained[2].network.parameters(), strict=True):
         torch.testing.assert_close(one, other.cpu())
@@ -192,11 +206,12 @@ def test_starting_from_other_weights(trained, tmp_path):
         PoseModule(**SMALL, start_from=str(tmp_path / "none.ckpt"))
     wider = PoseModule(replace(NETWORK, width=64), start_from=str(trained[1]))  # what fits is taken
     torch.testing.assert_close(
-        wider.network.encoder.stem.conv.weight, trained[2].network.encoder.stem.conv.weight.cpu()
+        wider.network.get_parameter("encoder.stem.conv.weight"),
+        trained[2].network.get_parameter("encoder.stem.conv.weight").cpu(),
     )
 
 
-def test_the_configuration_fits(pytestconfig):
+def test_the_configuration_fits(pytestconfig: pytest.Config) -> None:
     config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
     assert config["model"]["class_path"] == f"{PoseModule.__module__}.{PoseModule.__qualname__}"
     arguments = config["model"]["init_args"]
@@ -207,7 +222,9 @@ def test_the_configuration_fits(pytestconfig):
 
 
 @pytest.mark.parametrize(("config", "setting"), [("pose", "width"), ("prior", "alpha")])
-def test_one_command_trains_both(pytestconfig, capsys, config, setting):
+def test_one_command_trains_both(
+    pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str], config: str, setting: str
+) -> None:
     """Settings are read and shown."""
     path = pytestconfig.rootpath / "lightning_configs" / f"{config}.yaml"
     with pytest.raises(SystemExit) as done:

@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,17 +14,19 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from g3r.acquisition.images import save_volume  # noqa: E402
-from g3r.cli import export  # noqa: E402
-from g3r.errors import InputError  # noqa: E402
-from g3r.prior.config import PriorNetworkConfig  # noqa: E402
-from g3r.prior.model import Prior  # noqa: E402
-from g3r.reconstruct import GaussianReconstructor  # noqa: E402
-from g3r.training import prior_module as training  # noqa: E402
-from g3r.training import prior_validation as validation  # noqa: E402
-from tests.training.small_runs import logged, trainer  # noqa: E402
+import lightning.pytorch as lightning
+
+from g3r.acquisition.images import save_volume
+from g3r.cli import export
+from g3r.errors import InputError
+from g3r.prior.config import PriorNetworkConfig
+from g3r.prior.model import Prior
+from g3r.reconstruct import GaussianReconstructor
+from g3r.training import prior_module as training
+from g3r.training import prior_validation as validation
+from tests.training.small_runs import in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 TINY_TRAINING = [
@@ -45,7 +49,7 @@ TINY_TRAINING = [
 ]
 
 
-def volumes(n, seed=0, size=12):
+def volumes(n: int, seed: int = 0, size: int = 12) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     names = ("coarse", "density", "sharp", "truth")
     batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
@@ -57,19 +61,19 @@ class ValidatedByStacks(lightning.LightningDataModule):
 
     spacing_mm = 0.8
 
-    def train_dataloader(self):
-        return DataLoader([volumes(2)], batch_size=None)
+    def train_dataloader(self) -> DataLoader:
+        return in_memory([volumes(2)])
 
-    def val_dataloader(self):
+    def val_dataloader(self) -> DataLoader:
         batches = [
             {**volumes(1, 1), "n_stacks": torch.tensor([1])},
             {**volumes(2, 2), "n_stacks": torch.tensor([3, 3])},
         ]
-        return DataLoader(batches, batch_size=None)
+        return in_memory(batches)
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
+def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What TensorBoard has of two epochs."""
     folder = tmp_path_factory.mktemp("logs")
     torch.manual_seed(0)
@@ -78,7 +82,7 @@ def log(tmp_path_factory):
     return logged(folder / "run" / "version_0")
 
 
-def test_scores_by_number_of_stacks_are_logged(log):
+def test_scores_by_number_of_stacks_are_logged(log: Any) -> None:
     tags = set(log.Tags()["scalars"])
     for stacks in ("", "_1stack", "_3stacks"):
         expected = {f"val/{m}_{v}{stacks}" for m in ("l1", "psnr", "ssim") for v in validation.VALIDATED}
@@ -87,8 +91,8 @@ def test_scores_by_number_of_stacks_are_logged(log):
     assert {"train/samples_per_second", "train/waiting_for_data", "train/l1_prior"} <= tags
 
 
-def test_scores_are_means_over_volumes(log):
-    def last(tag):
+def test_scores_are_means_over_volumes(log: Any) -> None:
+    def last(tag: str) -> float:
         return log.Scalars(tag)[-1].value
 
     expected = (last("val/psnr_coarse_1stack") + 2 * last("val/psnr_coarse_3stacks")) / 3
@@ -99,7 +103,7 @@ def test_scores_are_means_over_volumes(log):
     assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
 
 
-def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
+def test_images_show_gate_and_confidence_for_each_number_of_stacks(log: Any) -> None:
     tags = log.Tags()["images"]
     assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
     assert "confidence, gate" in validation.PANEL_TAG
@@ -107,7 +111,7 @@ def test_images_show_gate_and_confidence_for_each_number_of_stacks(log):
     assert (image.height, image.width) == (12, 7 * 12)
 
 
-def test_panel_of_a_network_without_a_gate():
+def test_panel_of_a_network_without_a_gate() -> None:
     batch = volumes(1)
     shown = validation.panel(batch, batch["coarse"], None)
     coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
@@ -116,14 +120,15 @@ def test_panel_of_a_network_without_a_gate():
     assert torch.equal(prior, coarse)  # which stands for the prior here
 
 
-def test_going_on_at_another_voxel_size_is_refused(tmp_path):
+def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
     """Weights learnt at 0.8 mm, from a prior file or from a run, are not trained on at 1 mm."""
     first = training.PriorModule(NETWORK)
-    options = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
+    options: dict[str, Any] = {"max_steps": 1, "logger": False, "enable_checkpointing": False}
     run = trainer(tmp_path, **options)
     run.fit(first, ValidatedByStacks())
     run.save_checkpoint(tmp_path / "run.ckpt")
     path = tmp_path / "prior.safetensors"
+    assert first.voxel_mm is not None
     Prior(network=first.network, voxel_mm=first.voxel_mm, training_data="noise").save(path)
     data = ValidatedByStacks()
     data.spacing_mm = 1.0
@@ -135,18 +140,18 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path):
         run.fit(fresh, data, ckpt_path=tmp_path / "run.ckpt", weights_only=True)
 
 
-def run_training(folder, *arguments):
+def run_training(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "g3r.cli.pretrain", "fit", *TINY_TRAINING]
     command += [f"--trainer.logger.init_args.save_dir={folder}", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def steps_of(checkpoint):
+def steps_of(checkpoint: Path) -> int:
     return torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"]
 
 
 @pytest.mark.slow
-def test_training_goes_on_after_a_kill(tmp_path):
+def test_training_goes_on_after_a_kill(tmp_path: Path) -> None:
     """Killed without warning after its second epoch at the earliest, and resumed for one epoch more."""
     process = run_training(tmp_path, "--trainer.max_epochs=1000")
     last = tmp_path / "prior" / "version_0" / "checkpoints" / "last.ckpt"
@@ -178,7 +183,7 @@ def test_training_goes_on_after_a_kill(tmp_path):
     [["--trainer.precision=bf16-mixed"], ["--trainer.devices=2", "--trainer.strategy=ddp"]],
     ids=["mixed precision", "two devices"],
 )
-def test_trainer_flags(tmp_path, flags):
+def test_trainer_flags(tmp_path: Path, flags: list[str]) -> None:
     process = run_training(tmp_path, "--trainer.max_epochs=1", *flags)
     words, _ = process.communicate(timeout=400)
     assert process.returncode == 0, words[-2000:]
@@ -187,7 +192,7 @@ def test_trainer_flags(tmp_path, flags):
 
 
 @pytest.mark.slow
-def test_another_anatomy_is_trained_with_the_same_command(tmp_path, capsys):
+def test_another_anatomy_is_trained_with_the_same_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder of volumes with masks is enough for the prior; names need not hold an age."""
     generator = np.random.default_rng(0)
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) - 11.5

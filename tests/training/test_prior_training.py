@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import timedelta
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,27 +21,28 @@ from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
 
-lightning = pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
-from torch.utils.data import DataLoader  # noqa: E402
+import lightning.pytorch as lightning
+from torch.utils.data import DataLoader
 
-from g3r.training import prior_batches as batches  # noqa: E402
-from g3r.training import prior_module as training  # noqa: E402
-from g3r.training.annealed_module import cosine_factor  # noqa: E402
-from g3r.training.prior_validation import sample_scores  # noqa: E402
-from tests.training.small_runs import assert_export_refuses, logged, trainer  # noqa: E402
+from g3r.training import prior_batches as batches
+from g3r.training import prior_module as training
+from g3r.training.annealed_module import cosine_factor
+from g3r.training.prior_validation import sample_scores
+from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
-SMALL = {"network": NETWORK, "warmup_steps": 1}
+SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 
 
-def smooth_noise(generator, size):
+def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
     coarse_noise = torch.rand(1, 1, size // 4, size // 4, size // 4, generator=generator)
     return torch.nn.functional.interpolate(coarse_noise, scale_factor=4, mode="trilinear")[0]
 
 
-def sample(seed, size=16):
+def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
     """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
     generator = torch.Generator().manual_seed(seed)
     truth = smooth_noise(generator, size)
@@ -53,19 +57,19 @@ def sample(seed, size=16):
 class TinyData(lightning.LightningDataModule):
     """Four samples in memory."""
 
-    def __init__(self, spacing_mm=0.8, source="/some/where/atlas"):
+    def __init__(self, spacing_mm: float = 0.8, source: str = "/some/where/atlas") -> None:
         super().__init__()
         self.save_hyperparameters()
 
-    def train_dataloader(self):
-        return DataLoader([sample(seed) for seed in range(4)], batch_size=2)
+    def train_dataloader(self) -> DataLoader:
+        return in_memory([sample(seed) for seed in range(4)], 2)
 
-    def val_dataloader(self):
-        return DataLoader([sample(seed) for seed in (8, 9)], batch_size=2)
+    def val_dataloader(self) -> DataLoader:
+        return in_memory([sample(seed) for seed in (8, 9)], 2)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, training.PriorModule]:
     """A run of two steps: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
@@ -76,7 +80,7 @@ def trained(tmp_path_factory):
     return folder, folder / "last.ckpt", module
 
 
-def test_tensorboard_has_scalars_and_the_panel(trained):
+def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, training.PriorModule]) -> None:
     log = logged(trained[0] / "run" / "version_0")
     scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
@@ -86,18 +90,20 @@ def test_tensorboard_has_scalars_and_the_panel(trained):
     assert (image.height, image.width) == (16, 7 * 16)
 
 
-def test_training_moves_the_weights(trained):
+def test_training_moves_the_weights(trained: tuple[Path, Path, training.PriorModule]) -> None:
     assert float(trained[2].network.refiner.head.weight.detach().abs().max()) > 0
 
 
-def test_resuming_goes_on(trained, tmp_path):
+def test_resuming_goes_on(trained: tuple[Path, Path, training.PriorModule], tmp_path: Path) -> None:
     module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
     run = trainer(tmp_path, max_steps=3)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 3
 
 
-def test_export_gives_the_same_network(trained, tmp_path, capsys):
+def test_export_gives_the_same_network(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, checkpoint, module = trained
     path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
@@ -112,7 +118,9 @@ def test_export_gives_the_same_network(trained, tmp_path, capsys):
     assert "val/psnr_prior" in capsys.readouterr().out
 
 
-def test_export_does_not_overwrite_unless_told(trained, tmp_path, capsys):
+def test_export_does_not_overwrite_unless_told(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "prior.safetensors"
     path.write_text("precious")
     assert export.main([str(trained[1]), str(path)]) == 3
@@ -122,11 +130,11 @@ def test_export_does_not_overwrite_unless_told(trained, tmp_path, capsys):
     assert Prior.load(path).training_data == "three heads"
 
 
-def without(*keys):
+def without(*keys: str) -> Callable[[dict[str, Any]], object]:
     return lambda content: [content.pop(key) for key in keys]
 
 
-def spoil(content):
+def spoil(content: dict[str, Any]) -> None:
     content["state_dict"]["network.refiner.head.weight"][0, 0, 0, 0, 0] = np.inf
 
 
@@ -141,31 +149,41 @@ def spoil(content):
         (spoil, "NaN or infinity"),
     ],
 )
-def test_export_refuses(trained, tmp_path, capsys, alter, expected):
+def test_export_refuses(
+    trained: tuple[Path, Path, training.PriorModule],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    alter: Callable[[dict[str, Any]], object],
+    expected: str,
+) -> None:
     assert_export_refuses(trained[1], alter, expected, tmp_path, capsys)
 
 
-def test_export_wants_the_ending_of_its_format(trained, tmp_path, capsys):
+def test_export_wants_the_ending_of_its_format(
+    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert export.main([str(trained[1]), str(tmp_path / "prior.pt")]) == 3
     assert "expected a name that ends in .safetensors" in capsys.readouterr().err
     assert not (tmp_path / "prior.pt").exists()
 
 
 @pytest.mark.parametrize("content", [None, "text\n"])
-def test_export_refuses_what_is_no_checkpoint(tmp_path, capsys, content):
+def test_export_refuses_what_is_no_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None
+) -> None:
     if content is not None:
         (tmp_path / "run.ckpt").write_text(content)
     assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_voxel_size_must_agree_with_the_data(tmp_path):
+def test_voxel_size_must_agree_with_the_data(tmp_path: Path) -> None:
     module = training.PriorModule(**SMALL, voxel_mm=1.0)
     with pytest.raises(InputError, match=r"1.0 mm, but the data are made at 0.8 mm"):
         trainer(tmp_path, max_steps=2).fit(module, TinyData())
 
 
-def test_a_patch_can_be_learnt():
+def test_a_patch_can_be_learnt() -> None:
     """Sixty steps on one patch bring the prior's error to half the coarse volume's."""
     torch.manual_seed(0)
     module = training.PriorModule(**SMALL, learning_rate=3e-3)
@@ -183,7 +201,7 @@ def test_a_patch_can_be_learnt():
 
 
 @pytest.mark.parametrize("use_sharp", [False, True])
-def test_beginning_with_the_weights_of_another_prior(tmp_path, use_sharp):
+def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_sharp: bool) -> None:
     """Channels that the file lacks have no effect at first; on another base the residual begins at zero."""
     torch.manual_seed(0)
     old = DensityGatedPriorNetwork(replace(NETWORK, use_sharp=use_sharp))
@@ -199,7 +217,7 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path, use_sharp):
         training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
 
 
-def test_loss_weight_is_one_in_the_mask_and_small_outside():
+def test_loss_weight_is_one_in_the_mask_and_small_outside() -> None:
     mask = torch.zeros(1, 1, 5, 5, 5)
     mask[0, 0, 2, 2, 2] = 1
     weight = batches.loss_weight(mask, 0.1)
@@ -207,12 +225,12 @@ def test_loss_weight_is_one_in_the_mask_and_small_outside():
     assert float(weight.sum()) == pytest.approx(1 + 0.1 * 124)
 
 
-def test_weighted_l1_of_an_empty_mask_without_background_is_zero():
+def test_weighted_l1_of_an_empty_mask_without_background_is_zero() -> None:
     ones = torch.ones(1, 1, 4, 4, 4)
     assert float(batches.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
 
 
-def test_symmetries_turn_all_volumes_alike():
+def test_symmetries_turn_all_volumes_alike() -> None:
     batch = {name: value[None] for name, value in sample(0, size=8).items()}
     batch["density"] = batch["truth"].clone()
     seen = set()
@@ -224,12 +242,12 @@ def test_symmetries_turn_all_volumes_alike():
     assert 40 < len(seen) <= 48
 
 
-def test_symmetries_keep_the_shape():
+def test_symmetries_keep_the_shape() -> None:
     batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
     assert {tuple(batches.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
 
 
-def test_validation_scores_are_those_of_an_evaluation():
+def test_validation_scores_are_those_of_an_evaluation() -> None:
     truth = sample(3, size=24)["truth"]
     mask = torch.zeros_like(truth)
     mask[:, 4:20, 5:21, 6:18] = 1
@@ -241,7 +259,7 @@ def test_validation_scores_are_those_of_an_evaluation():
     assert found["l1"] == pytest.approx(float((made - truth).abs()[mask > 0].mean()), rel=1e-5)
 
 
-def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan():
+def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan() -> None:
     truth = sample(3)["truth"]
     assert sample_scores(truth, truth, torch.zeros_like(truth), torch.ones_like(truth)).keys() == {"l1"}
     found = sample_scores(torch.full_like(truth, torch.nan), truth, torch.ones_like(truth), torch.ones_like(truth))
@@ -249,7 +267,7 @@ def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan():
     assert found.keys() == {"l1", "psnr", "ssim"}
 
 
-def test_learning_rate_follows_the_budget_that_ends_first(tmp_path):
+def test_learning_rate_follows_the_budget_that_ends_first(tmp_path: Path) -> None:
     """With many steps but no time left, the rate is at its end."""
     module = training.PriorModule(**SMALL)
     run = trainer(tmp_path, max_steps=-1, max_epochs=10_000, max_time=timedelta(seconds=2))
@@ -258,12 +276,12 @@ def test_learning_rate_follows_the_budget_that_ends_first(tmp_path):
     assert optimizer.param_groups[0]["lr"] < 0.05 * module.learning_rate
 
 
-def test_cosine_factor():
+def test_cosine_factor() -> None:
     values = [cosine_factor(progress) for progress in (-1, 0, 0.5, 1, 7)]
     assert values == pytest.approx([1, 1, 0.505, 0.01, 0.01])
 
 
-def test_the_configuration_fits_the_module(pytestconfig):
+def test_the_configuration_fits_the_module(pytestconfig: pytest.Config) -> None:
     config = yaml.safe_load((pytestconfig.rootpath / CONFIG).read_text())
     assert config["model"]["class_path"] == f"{training.PriorModule.__module__}.PriorModule"
     arguments = config["model"]["init_args"]
@@ -272,7 +290,7 @@ def test_the_configuration_fits_the_module(pytestconfig):
 
 
 @pytest.mark.parametrize("command", ["pretrain", "export"])
-def test_help_is_quick(command):
+def test_help_is_quick(command: str) -> None:
     code = (
         f"import sys\nfrom g3r.cli import {command}\n"
         f"try: {command}.main(['--help'])\nexcept SystemExit as done: assert done.code == 0\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import render
 from g3r.geometry import VolumeGrid
 from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
-from g3r.uncertainty.estimate import MEANING, UNCHECKED_NOTE, UNRELIABLE_NOTE
+from g3r.uncertainty.estimate import MEANING, UNCHECKED_NOTE, UNRELIABLE_NOTE, Uncertainty
 from g3r.uncertainty.predictors import gather_predictors, mean_residual
 from tests.gaussians.scenes import cloud_of, slices_of
 
@@ -51,7 +52,7 @@ def fit_of(noise: float) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=np.ones(n), weight=np.ones(n), history=[], bias_field=[])
 
 
-def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options: object):
+def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options: Any) -> Uncertainty:
     rng = np.random.default_rng(1)
     volume = (0.5 + 0.1 * rng.standard_normal(grid.shape)).astype(np.float32) * mask
     given: dict = {
@@ -60,7 +61,9 @@ def uncertainty_of(fit: SliceFit, grid: VolumeGrid, mask: np.ndarray, **options:
         "prior_grid": grid,
         "prior_share": np.full(grid.shape, 0.2, np.float32),
     }
-    own = {name: options.pop(name) for name in ("with_prior", "intensity", "reliable") if name in options}
+    own: dict[str, Any] = {
+        name: options.pop(name) for name in ("with_prior", "intensity", "reliable") if name in options
+    }
     inputs = UncertaintyInputs(volume=volume, mask=mask, grid=grid, fit=fit, **{**given, **options})
     return estimate_uncertainty(inputs, **own)
 
