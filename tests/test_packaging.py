@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,9 @@ BUILT_FROM = ("g3r", "data_synth", "pyproject.toml", "README.md", "LICENSE")
 
 
 def run(*line: str | Path, cwd: Path) -> str:
-    done = subprocess.run([str(word) for word in line], capture_output=True, text=True, check=False, cwd=cwd)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    words = [str(word) for word in line]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=cwd, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

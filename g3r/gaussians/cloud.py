@@ -27,7 +27,7 @@ MIN_QUATERNION = 1e-15
 """Shorter ones have no direction, and gradients grow as one over their length."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GaussianCloud:
     """V(x) = sum_j c_j exp(-(x - mu_j)^T Sigma_j^-1 (x - mu_j) / 2), Sigma = R diag(s^2) R^T (G3R Eq. 3).
 
@@ -75,8 +75,8 @@ class GaussianCloud:
     @classmethod
     def of(cls, parameters: Sequence[Tensor], origin_mm: NDArray[np.float64]) -> GaussianCloud:
         """A cloud from the four tensors in the order of `parameters`."""
-        mean_mm, log_scale, quaternion_wxyz, amplitude = parameters
-        return cls(mean_mm, log_scale, quaternion_wxyz, amplitude, origin_mm)
+        names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
+        return cls(**dict(zip(names, parameters, strict=True)), origin_mm=origin_mm)
 
     def __len__(self) -> int:
         return len(self.mean_mm)

@@ -55,7 +55,7 @@ def seed_cloud(
     def tensor(array: NDArray[np.float64]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
-    return GaussianCloud(tensor(points - origin), tensor(log_scale), tensor(quaternion), tensor(amplitude), origin)
+    return GaussianCloud.of([tensor(points - origin), tensor(log_scale), tensor(quaternion), tensor(amplitude)], origin)
 
 
 def _lattice(low: NDArray[np.float64], high: NDArray[np.float64], spacing_mm: float) -> NDArray[np.float64]:

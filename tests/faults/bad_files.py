@@ -290,22 +290,8 @@ BAD_MASKS: dict[str, tuple[Maker, str]] = {
 }
 """Masks for `stack.nii.gz`, the good stack."""
 
-USABLE_AS_A_VOLUME = {
-    "sheared axes",
-    "metres without a word",
-    "micrometres without a word",
-    "one infinite",
-    "beyond float32",
-    "constant",
-    "too faint to divide by",
-    "too bright to square",
-    "one slice",
-    "one pixel",
-    "a mask",
-    "slope beyond float32",
-    "all infinite",
-    "all zero",
-    "all negative",
-    "all NaN",
-}
+_UNITS = {"sheared axes", "metres without a word", "micrometres without a word"}
+_VALUES = {"one infinite", "beyond float32", "constant", "too faint to divide by", "too bright to square", "a mask"}
+_SHAPES = {"one slice", "one pixel", "slope beyond float32"}
+USABLE_AS_A_VOLUME = _UNITS | _VALUES | _SHAPES | {f"all {what}" for what in ("infinite", "zero", "negative", "NaN")}
 """Bad as a stack of thick slices; as a volume each command judges for itself."""

@@ -17,11 +17,13 @@ def test_moving_the_whole_world_changes_nothing() -> None:
     turn = Rotation.from_matrix(motion.rotation[0])
     wxyz = cloud.quaternion_wxyz.numpy()
     turned = (turn * Rotation.from_quat(np.roll(wxyz, -1, axis=1))).as_quat()
-    moved = GaussianCloud(
-        torch.tensor(turn.apply(cloud.mean_mm.numpy())),
-        cloud.log_scale,
-        torch.tensor(np.roll(turned, 1, axis=1)),
-        cloud.amplitude,
+    moved = GaussianCloud.of(
+        [
+            torch.tensor(turn.apply(cloud.mean_mm.numpy())),
+            cloud.log_scale,
+            torch.tensor(np.roll(turned, 1, axis=1)),
+            cloud.amplitude,
+        ],
         motion.apply(cloud.origin_mm[None, None])[0, 0],
     )
     assert_same_images((cloud, planes), (moved, planes.moved(motion)))
@@ -37,22 +39,22 @@ def test_the_order_of_gaussians_does_not_matter() -> None:
 def test_q_and_minus_q_and_their_length_do_not_matter() -> None:
     cloud, planes = make_cloud(7, 10), make_planes(7)
     for factor in (-1.0, 3.7, -1e-3):
-        other = GaussianCloud(
-            cloud.mean_mm, cloud.log_scale, factor * cloud.quaternion_wxyz, cloud.amplitude, cloud.origin_mm
+        other = GaussianCloud.of(
+            [cloud.mean_mm, cloud.log_scale, factor * cloud.quaternion_wxyz, cloud.amplitude], cloud.origin_mm
         )
         assert_same_images((cloud, planes), (other, planes))
 
 
 def test_the_origin_is_only_a_number() -> None:
     cloud, planes = make_cloud(8, 10), make_planes(8)
-    other = GaussianCloud(cloud.mean_mm + 3.0, *cloud.parameters[1:], cloud.origin_mm - 3.0)
+    other = GaussianCloud.of([cloud.mean_mm + 3.0, *cloud.parameters[1:]], cloud.origin_mm - 3.0)
     assert_same_images((cloud, planes), (other, planes))
 
 
 def test_ten_metres_from_the_origin_no_digit_is_lost() -> None:
     near, far = np.zeros(3), np.array([1e4, -1e4, 1e4])
     cloud, planes = make_cloud(9, 10, origin=near), make_planes(9, origin=near)
-    away = GaussianCloud(*cloud.parameters, far)
+    away = GaussianCloud.of([*cloud.parameters], far)
     moved = Planes(
         rotation=planes.rotation,
         center_mm=planes.center_mm + far,

@@ -43,7 +43,9 @@ def test_planes_that_meet_no_gaussian_are_zero_and_the_others_unharmed() -> None
 def test_extreme_shapes_agree_with_the_reference_and_have_finite_gradients(log_scale: list[float], psf: float) -> None:
     """Sigma 0.02 and 100 mm, and an axis ratio of 1000."""
     base, planes = make_cloud(16, 5, spread_mm=0.2), make_planes(16, psf=psf, shape=(15, 15))
-    cloud = GaussianCloud(base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:], base.origin_mm)
+    cloud = GaussianCloud.of(
+        [base.mean_mm, torch.tensor([log_scale] * 5).double(), *base.parameters[2:]], base.origin_mm
+    )
     expected = render(cloud, planes, backend="reference")
     leaves = [p.float().requires_grad_() for p in cloud.parameters]
     twist = torch.zeros(len(planes), 6, requires_grad=True)
@@ -58,10 +60,8 @@ def test_large_and_slanted_ellipses_of_several_strips_agree_with_the_reference()
     """Planes many times as wide as the sixteen pixels of a strip, cut by every border."""
     base = make_cloud(24, 12, spread_mm=15)
     rng = np.random.default_rng(24)
-    cloud = GaussianCloud(
-        base.mean_mm,
-        torch.tensor(np.log(rng.uniform([0.3, 1, 4], [1, 4, 15], (12, 3)))),
-        *base.parameters[2:],
+    cloud = GaussianCloud.of(
+        [base.mean_mm, torch.tensor(np.log(rng.uniform([0.3, 1, 4], [1, 4, 15], (12, 3)))), *base.parameters[2:]],
         base.origin_mm,
     )
     for psf in (0.0, 1.0):
@@ -93,7 +93,7 @@ def test_overlap_lists_with_a_margin_give_the_same_pixels_and_stay_valid() -> No
     plain = render(cloud, planes)
     assert torch.equal(render(cloud, planes, pairs=tight), plain)
     assert torch.equal(render(cloud, planes, pairs=wide), plain)
-    moved = GaussianCloud(cloud.mean_mm + 0.3, *cloud.parameters[1:], cloud.origin_mm)
+    moved = GaussianCloud.of([cloud.mean_mm + 0.3, *cloud.parameters[1:]], cloud.origin_mm)
     assert torch.equal(render(moved, planes, pairs=wide), render(moved, planes))
 
 

@@ -100,7 +100,7 @@ def absolute(cloud: GaussianCloud, dtype: torch.dtype) -> GaussianCloud:
     """The cloud with world coordinates in one dtype and no origin of its own, as is usual."""
     mean = (cloud.mean_mm.double() + torch.from_numpy(cloud.origin_mm)).to(dtype)
     rest = [p.to(dtype) for p in cloud.parameters[1:]]
-    return GaussianCloud(mean, rest[0], rest[1], rest[2], np.zeros(3))
+    return GaussianCloud.of([mean, rest[0], rest[1], rest[2]], np.zeros(3))
 
 
 def naive_amplitudes(

@@ -87,11 +87,8 @@ def test_weights_of_any_size(factor: float, tally: Tally) -> None:
 
 def test_an_epsilon_in_the_denominator_of_peaks_has_a_hidden_unit() -> None:
     """Sums over a narrow Gaussian are small: the epsilon decides the naive amplitude, and ours does not move."""
-    cloud = GaussianCloud(
-        torch.zeros(1, 3),
-        torch.full((1, 3), float(np.log(0.02))),
-        torch.tensor([[1.0, 0, 0, 0]]),
-        torch.ones(1),
+    cloud = GaussianCloud.of(
+        [torch.zeros(1, 3), torch.full((1, 3), float(np.log(0.02))), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1)],
         head_scene().cloud.origin_mm,
     )
     planes = head_scene().planes.take([4, 5])

@@ -42,7 +42,7 @@ def with_quaternions(length: float) -> Scene:
     scene = head_scene()
     mean, log_scale, quaternion, amplitude = scene.cloud.parameters
     unit = quaternion / quaternion.norm(dim=1, keepdim=True)
-    return Scene(GaussianCloud(mean, log_scale, unit * length, amplitude, scene.cloud.origin_mm), scene.planes)
+    return Scene(GaussianCloud.of([mean, log_scale, unit * length, amplitude], scene.cloud.origin_mm), scene.planes)
 
 
 def of_thickness(thickness_mm: float) -> Scene:
@@ -96,7 +96,7 @@ def astray() -> Scene:
     scene = head_scene()
     mean = scene.cloud.mean_mm.clone()
     mean[::3] += 5000.0
-    return Scene(GaussianCloud(mean, *scene.cloud.parameters[1:], scene.cloud.origin_mm), scene.planes)
+    return Scene(GaussianCloud.of([mean, *scene.cloud.parameters[1:]], scene.cloud.origin_mm), scene.planes)
 
 
 def pixels_of(shape: tuple[int, int], n_planes: int) -> Scene:
@@ -242,7 +242,7 @@ def test_pairs_of_flat_gaussians_are_not_missed() -> None:
 def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair() -> None:
     """Centres in float64, 10 m from the cloud's own origin."""
     scene = head_scene()
-    far = GaussianCloud(scene.cloud.mean_mm + 1e4, *scene.cloud.parameters[1:], scene.cloud.origin_mm - 1e4)
+    far = GaussianCloud.of([scene.cloud.mean_mm + 1e4, *scene.cloud.parameters[1:]], scene.cloud.origin_mm - 1e4)
     near, away = (find_overlaps(c, scene.planes, 3.2) for c in (scene.cloud, far))
     assert abs(len(near) - len(away)) <= 1e-3 * len(near)
     found = render(far, scene.planes, cutoff_sigma=6.0)
@@ -285,15 +285,15 @@ def test_calls_that_make_no_sense_are_refused(backend: str, tally: Tally) -> Non
         with tally.refusal():
             render(cloud, scene.planes, backend=backend, **options)
     for dtype in (torch.float16, torch.bfloat16):
+        half = [p.to(dtype) for p in cloud.parameters]
         with tally.refusal():
-            half = GaussianCloud.of([p.to(dtype) for p in cloud.parameters], cloud.origin_mm)
-            render(half, scene.planes, backend=backend)
+            render(GaussianCloud.of(half, cloud.origin_mm), scene.planes, backend=backend)
 
 
 def test_a_sigma_of_more_pixels_than_integers_hold_is_refused(tally: Tally) -> None:
     scene = head_scene()
     log_scale = torch.full_like(scene.cloud.log_scale, np.log(0.99 * SIGMA_RANGE_MM[1]))
-    cloud = GaussianCloud(scene.cloud.mean_mm, log_scale, *scene.cloud.parameters[2:], ORIGIN_MM)
+    cloud = GaussianCloud.of([scene.cloud.mean_mm, log_scale, *scene.cloud.parameters[2:]], ORIGIN_MM)
     with tally.case():
         pixels = render(single(cloud), scene.planes, cutoff_sigma=6.0)
         assert (pixels - cloud.amplitude.sum()).abs().max() < 1e-4 * cloud.amplitude.sum()

@@ -90,11 +90,11 @@ DEGENERATE = {
 
 
 def grown(cloud: GaussianCloud, by: float) -> GaussianCloud:
-    return GaussianCloud(cloud.mean_mm, cloud.log_scale + by, *cloud.parameters[2:], cloud.origin_mm)
+    return GaussianCloud.of([cloud.mean_mm, cloud.log_scale + by, *cloud.parameters[2:]], cloud.origin_mm)
 
 
 def shifted(cloud: GaussianCloud, by_mm: float) -> GaussianCloud:
-    return GaussianCloud(cloud.mean_mm + by_mm, *cloud.parameters[1:], cloud.origin_mm)
+    return GaussianCloud.of([cloud.mean_mm + by_mm, *cloud.parameters[1:]], cloud.origin_mm)
 
 
 @pytest.mark.parametrize("amplitudes_first", [True, False])
@@ -176,8 +176,8 @@ def test_stage_1_steps_back_as_well(monkeypatch: pytest.MonkeyPatch, caplog: pyt
 
 
 def one_gaussian() -> FitParameters:
-    cloud = GaussianCloud(
-        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0), np.zeros(3)
+    cloud = GaussianCloud.of(
+        [torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 2.0)], np.zeros(3)
     )
     return FitParameters(cloud, LearningRates())
 
