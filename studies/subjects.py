@@ -102,7 +102,13 @@ def read_case(folder: Path, n_stacks: int | None = None) -> SimulatedCase:
 
 
 def simulated_case(spec: SubjectSpec, cache: Path, n_stacks: int | None = None) -> SimulatedCase:
-    """A subject of the test data's atlas with its first stacks (None: all), simulated if the cache lacks it."""
+    """Return a subject of the test data's atlas, simulated if the cache lacks it.
+
+    Args:
+        spec: of the subject.
+        cache: folder of simulated subjects.
+        n_stacks: how many of its stacks to read, from the first; None for all.
+    """
     return read_case(simulated_subject(spec, data_folder("atlas"), cache), n_stacks)
 
 

@@ -76,7 +76,13 @@ def new_figure(size: tuple[float, float], **options: Any) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a PNG, whole or not at all; folders are made."""
+    """Write a PNG, whole or not at all; folders are made.
+
+    Args:
+        figure: to write.
+        path: of the PNG.
+        dpi: dots per inch.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
     figure.savefig(temporary, dpi=dpi)

@@ -36,7 +36,13 @@ class CommandRun:
 
 
 def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]:
-    """Arguments of g3r-infer for a simulated subject."""
+    """Arguments of g3r-infer for a simulated subject.
+
+    Args:
+        case: to reconstruct.
+        preset: name of the preset.
+        output: folder for the results.
+    """
     numbers = range(len(case.stacks))
     return [
         "--stacks",

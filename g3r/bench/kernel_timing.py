@@ -36,7 +36,13 @@ N_IN_CACHE, N_TURNS, N_FUSED = 2048, 2000, 64
 
 
 def best_seconds(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Least time of several calls, after one that is not counted."""
+    """Least time of several calls, after one that is not counted.
+
+    Args:
+        call: to be timed.
+        repeats: number of timed calls.
+        clock: seconds since any fixed moment.
+    """
     call()
     seconds = []
     for _ in range(repeats):
@@ -113,7 +119,13 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
 
 
 def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, float]:
-    """The same of the dense reference in torch, which has no cut-off: every pair has every pixel."""
+    """Time one pass of the dense torch reference, which has no cut-off: every pair has every pixel.
+
+    Args:
+        n_gaussians: in the scene.
+        n_slices: in the scene.
+        repeats: passes, of which the fastest counts; at most three are made.
+    """
     scene = head_scene(n_gaussians, n_slices)
     leaves = [p.clone().requires_grad_() for p in scene.cloud.parameters]
     cloud = GaussianCloud.of(leaves, scene.cloud.origin_mm)

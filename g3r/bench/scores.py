@@ -45,6 +45,12 @@ def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.f
 
     The volume may stand in another orientation than the truth, further than alignment reaches: the common
     motion of the slices brings it near first.
+
+    Args:
+        case: with the truth.
+        data: [I, J, K] reconstructed volume.
+        affine: [4, 4], world (RAS+, mm) from index.
+        poses: of the slices, as reconstructed.
     """
     error = target_registration_error(case.points_mm, case.true, poses)
     grid = VolumeGrid(data.shape, affine).moved(error.common)

@@ -49,7 +49,16 @@ class Task:
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
-    """Refuse what can be seen without reading an image; returns the files of networks, by kind."""
+    """Refuse what can be seen without reading an image; returns the files of networks, by kind.
+
+    Args:
+        options: of g3r-infer.
+        folder: for the results.
+        replaces: whether earlier results in the folder may be replaced.
+
+    Raises:
+        InputError: a file that is missing or cannot be used, or a folder that must not be written.
+    """
     from g3r.checkpoints.weights_file import read_weights
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.output_folder import check_output_folder

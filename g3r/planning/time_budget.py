@@ -220,7 +220,13 @@ PRIOR_STEP, AMPLITUDE_STEP = 0.35, 0.8
 
 
 def timed_step(cloud: GaussianCloud, slices: Slices, rng: np.random.Generator) -> float:
-    """Seconds of one step of the slice stage, from a few steps on a part of the slices."""
+    """Time one step of the slice stage, in seconds, by a few steps on a subset of the slices.
+
+    Args:
+        cloud: to fit; left as it is.
+        slices: all slices; the result is scaled to their number.
+        rng: draws what the steps draw.
+    """
     part = slices.take(np.arange(0, len(slices), min(PROBE_EVERY, max(1, len(slices) // 4))))
     ones = np.ones(len(part))
     seconds = []

@@ -64,21 +64,45 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
 
 
 def group_mean(value: Tensor, group: Tensor, n_groups: int) -> Tensor:
-    """Means [G, ...] of values [S, ...] by their group's number [S]."""
+    """Average values by group; a group without values has mean 0.
+
+    Args:
+        value: [S, ...].
+        group: [S] group of each value, 0 to G - 1.
+        n_groups: G.
+
+    Returns:
+        [G, ...].
+    """
     total = value.new_zeros(n_groups, *value.shape[1:]).index_add(0, group, value)
     count = torch.bincount(group, minlength=n_groups).clamp_min(1).to(value.dtype)
     return total / count.reshape(-1, *[1] * (value.dim() - 1))
 
 
 def pixel_points_mm(size: int, pixel_mm: float, like: Tensor) -> Tensor:
-    """Positions [N * N, 3] of the pixels of a square image in its own frame."""
+    """Positions [N * N, 3] of the pixels of a square image in its own frame.
+
+    Args:
+        size: N, pixels per edge.
+        pixel_mm: pixel size.
+        like: gives dtype and device.
+    """
     at = (torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2) * pixel_mm
     x, y = torch.meshgrid(at, at, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
 
 
 def moved_points(rotation: Tensor, translation_mm: Tensor, points_mm: Tensor) -> Tensor:
-    """Points [P, 3] after each of S motions, [S, P, 3], whatever autocast is around it."""
+    """Apply S rigid motions to P points, in full precision under autocast too.
+
+    Args:
+        rotation: [S, 3, 3].
+        translation_mm: [S, 3].
+        points_mm: [P, 3], the same for all motions.
+
+    Returns:
+        [S, P, 3], in mm.
+    """
     with torch.autocast(points_mm.device.type, enabled=False):
         return points_mm @ rotation.transpose(1, 2) + translation_mm[:, None]
 

@@ -80,7 +80,14 @@ class StageStore:
         return as_stored(value)
 
     def write(self, name: str, value: Any, seconds: float, cpu_seconds: float) -> None:
-        """Keep what a stage gave; a full disk gives up the files, not the run."""
+        """Store the result of a stage. On a full disk the store is dropped and the run goes on.
+
+        Args:
+            name: of the stage.
+            value: its result.
+            seconds: wall-clock time that it took.
+            cpu_seconds: processor time that it took.
+        """
         path = self._path(name)
         if path is None:
             return

@@ -100,7 +100,13 @@ class AnnealedModule(LightningModule):
         torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Log samples per second and the share of time spent waiting for data."""
+        """Log samples per second and the share of time spent waiting for data.
+
+        Args:
+            outputs: of the training step; not used.
+            batch: that was trained on.
+            batch_idx: its number in the epoch, from 0.
+        """
         self._throughput.end_batch(self.n_samples(batch))
         every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
         if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
@@ -148,6 +154,11 @@ class WholeCheckpoints(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
     ) -> None:
         """Write a checkpoint, whole or not at all.
+
+        Args:
+            checkpoint: what Lightning keeps of the training.
+            path: of the file; folders are made.
+            storage_options: not used.
 
         Raises:
             InputError: it cannot be written.

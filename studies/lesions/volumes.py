@@ -75,7 +75,12 @@ def kept(change_found: NDArray[np.floating], lesion: Lesion) -> float:
 
 
 def load_labels(volume_file: Path, mask_file: Path, margin_voxels: int) -> TruthVolume:
-    """The label map beside an atlas volume, reoriented and cropped as `load_subject` and `cropped` do it.
+    """Load the label map of an atlas volume, reoriented and cropped like the volume itself.
+
+    Args:
+        volume_file: of the atlas volume; the label map is in the same folder.
+        mask_file: its brain mask.
+        margin_voxels: kept around the mask.
 
     Raises:
         InputError: no label map.

@@ -56,7 +56,14 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(spec: SubjectSpec, label: str, changes: Mapping[str, Any], options: argparse.Namespace) -> Row:
-    """One variant of one subject."""
+    """Measure one variant of one subject.
+
+    Args:
+        spec: of the subject.
+        label: of the variant.
+        changes: settings that differ from the preset, by dotted name.
+        options: of the command.
+    """
     _, row = run(simulated_case(spec, options.cache), options, changes, full=not options.motion_only)
     return {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "shading": label, **row}
 

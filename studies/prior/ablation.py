@@ -67,7 +67,13 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure_subject(spec: SubjectSpec, n_stacks: int, options: argparse.Namespace) -> Row:
-    """One subject from its first stacks."""
+    """Measure one subject from its first stacks.
+
+    Args:
+        spec: of the subject.
+        n_stacks: stacks to use.
+        options: of the command.
+    """
     row = measure(simulated_case(spec, options.cache, n_stacks), options)
     return {"subject": spec.name, "n_stacks": n_stacks, "volume": spec.volume, **row}
 
@@ -165,7 +171,14 @@ def differences_db(rows: Sequence[Row], variant: str, n_stacks: int) -> list[flo
 
 
 def values(rows: Sequence[Row], variant: str, n_stacks: int, key: str) -> list[float]:
-    """One score of a variant, subject by subject; arguments as of `differences_db`."""
+    """One score of a variant, subject by subject.
+
+    Args:
+        rows: one per subject and number of stacks.
+        variant: name of the variant.
+        n_stacks: only rows with this number of stacks.
+        key: name of the score.
+    """
     return [row["scores"][variant][key] for row in rows if row["n_stacks"] == n_stacks]
 
 

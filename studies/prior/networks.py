@@ -103,7 +103,17 @@ def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
 
 
 def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], options: argparse.Namespace) -> Row | None:
-    """Train and score one variant."""
+    """Train and score one variant.
+
+    Args:
+        variant: to train.
+        n_epochs: of training.
+        data: the first three arguments of `validation_volumes`.
+        options: of the command.
+
+    Returns:
+        The row of the record, or None when training failed.
+    """
     run = options.output / variant.name
     checkpoint, seconds = _train(variant, run, n_epochs, [*_data_arguments(*data), *options.train_args])
     if checkpoint is None:
