@@ -19,9 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g3r.bench.record import available_cores, machine, put_between_markers, use_threads, write_json, write_text
+from g3r.bench.record import machine, put_between_markers, write_json, write_text
 from g3r.errors import G3RError, InputError
 from g3r.planning.presets import PRESETS
+from g3r.run.machine import available_cores, use_up_to
 
 Row = dict[str, Any]
 Record = dict[str, Any]
@@ -230,13 +231,13 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
     """
     if jobs == 1 or len(tasks) < 2:
         if threads:
-            use_threads(threads)
+            use_up_to(threads)
         for task in tasks:
             yield task, task.call(*task.arguments)
         return
     # a fresh interpreter for each worker: thread pools do not survive a fork
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawn, initializer=use_threads, initargs=(threads or 1,)) as pool:
+    with ProcessPoolExecutor(jobs, spawn, initializer=use_up_to, initargs=(threads or 1,)) as pool:
         waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
         for done in as_completed(waiting):
             yield waiting[done], done.result()

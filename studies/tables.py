@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any
 
 from g3r.bench.record import markdown_table
+from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,6 +84,5 @@ def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
         dpi: dots per inch.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    figure.savefig(temporary, dpi=dpi)
-    os.replace(temporary, path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)

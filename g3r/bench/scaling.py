@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from g3r.bench.record import add_output_arguments, machine, run_measurement, use_threads
+from g3r.bench.record import add_output_arguments, machine, run_measurement
 from g3r.errors import InputError
+from g3r.run.machine import use_up_to
 
 if TYPE_CHECKING:
     from g3r.acquisition.planes import Planes, Slices
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    use_threads(options.threads)
+    use_up_to(options.threads)
     record: dict[str, Any] = {"machine": machine(options.threads), "growing": {}}
     for name in GROWING:
         print(f"g3r-bench scaling: {name}", file=sys.stderr, flush=True)

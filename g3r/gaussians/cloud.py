@@ -8,7 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from g3r.errors import InputError
+from g3r.run.atomic_file import atomic_path
 
 SIGMA_RANGE_MM = (1e-6, 1e6)
 """No structure of a head is outside this range; beyond it the kernels' integers and float32 overflow."""
@@ -107,17 +107,19 @@ class GaussianCloud:
         return replace(self, amplitude=amplitude)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as .npz with float32 arrays named like the fields (atomically)."""
+        """Write an .npz with float32 arrays named like the fields, whole or not at all.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         arrays = {
             name: getattr(self, name).detach().cpu().numpy().astype(np.float32)
             for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays, origin_mm=self.origin_mm)
-        path = Path(path)
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.write_bytes(buffer.getvalue())
-        os.replace(beside, path)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> GaussianCloud:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
+
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
@@ -41,6 +43,19 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def remove_leftovers(folder: Path, suffix: str) -> None:
+    """Remove the temporary files of `atomic_path` in a folder whose process was killed.
+
+    Args:
+        folder: to look in.
+        suffix: of the files that were being written; others are left alone.
+    """
+    for temporary in folder.glob(f".*{suffix}"):
+        process = temporary.name.split(".")[1]
+        if process.isdigit() and not psutil.pid_exists(int(process)):
+            temporary.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:

@@ -17,8 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY, NetworkConfig
 from g3r.errors import InputError, cannot_be_written
-
-UNFINISHED = ".unfinished"
+from g3r.run.atomic_file import atomic_path, remove_leftovers
 
 
 class AnnealedModule(LightningModule):
@@ -164,37 +163,21 @@ class WholeCheckpoints(TorchCheckpointIO):
             InputError: it cannot be written.
         """
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(checkpoint, temporary)
-            os.replace(temporary, path)
+            with atomic_path(path) as temporary:
+                torch.save(checkpoint, temporary)
         except OSError as error:
             raise cannot_be_written(path, error) from None
         except RuntimeError as error:  # what torch makes of a full disk
             if "write" not in str(error):
                 raise
             raise InputError(f"{path}: cannot be written ({error}); free some space") from None
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
-        """Read a checkpoint to resume from; remove what its run, if dead, had not finished writing."""
-        for temporary in Path(path).parent.glob(f".*{UNFINISHED}"):
-            process = temporary.name.removesuffix(UNFINISHED).rpartition(".")[2]
-            if not (process.isdigit() and _is_alive(int(process))):
-                temporary.unlink(missing_ok=True)
+        """Read a checkpoint to resume from; remove what a killed run has left of those it was writing."""
+        remove_leftovers(Path(path).parent, Path(path).suffix)
         return super().load_checkpoint(path, *arguments, **options)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        pass
-    return True
 
 
 class _Throughput:

@@ -14,8 +14,9 @@ from typing import Any
 
 import yaml
 
-from g3r.bench.record import available_cores, machine
+from g3r.bench.record import machine
 from g3r.errors import InputError
+from g3r.run.machine import available_cores
 from studies.harness import Record, Row, Study, Task, positive
 from studies.prior.figures import draw_networks
 from studies.prior.network_scores import (
