@@ -134,23 +134,3 @@ class GaussianCloud:
                 return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
-
-
-def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] of any length but zero."""
-    # by the largest entry first: squares of 1e-30 are zero in float32, and no epsilon knows their size
-    largest = quaternion_wxyz.detach().abs().amax(1, keepdim=True)
-    scaled = quaternion_wxyz / largest
-    w, x, y, z = (scaled / scaled.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, 1).reshape(-1, 3, 3)

@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from g3r.geometry.quaternion import rotation_from_unit_quaternion
+
 MIN_SINGULAR_SUM = 0.05
 """Below it (two singular values cancel: the rotation is not determined) gradients are held back."""
 
@@ -48,19 +50,7 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Rotations [S, 3, 3] of vectors [S, 3]: the unit quaternion along (1, v / 2); about v rad when small."""
     quaternion = torch.nn.functional.normalize(torch.cat([torch.ones_like(vector[:, :1]), vector / 2], dim=1), dim=1)
-    w, x, y, z = quaternion.unbind(1)
-    entries = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(entries, 1).reshape(-1, 3, 3)
+    return rotation_from_unit_quaternion(quaternion)
 
 
 def group_mean(value: Tensor, group: Tensor, n_groups: int) -> Tensor:
