@@ -37,7 +37,7 @@ class Task:
 
     Attributes:
         key: name of its row in the record.
-        call: measures; returns the row, or None where there is none (it has said why). A row with an entry
+        call: measures; returns the row, or None where there is none (it has printed why). A row with an entry
             "skipped" is tried again by the next run. With --jobs the call runs in another process.
         arguments: of the call.
     """
@@ -82,8 +82,8 @@ class Study:
         picture: in docs/images/, the figure of --publish.
         shared: those of `SHARED` that it takes.
         options: its own, as arguments of `add_argument` by their name.
-        settings: what rows depend on beside the preset, weights, threads, jobs and --development.
-        line: what is said of a new row; its key and seconds when None.
+        settings: what rows depend on apart from the preset, weights, threads, jobs and --development.
+        line: what is printed for a new row; its key and seconds when None.
         figure: draws the record into `options.figure`.
         finish: changes the record after the measurements.
         resumes: False measures everything anew each time.

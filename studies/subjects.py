@@ -47,9 +47,9 @@ class SubjectSpec:
         volume: subject of the atlas tree, as in `find_subjects`.
         motion: mild, moderate or severe.
         seed: of the stretch and of the simulation.
-        bias: strength of the shading.
+        bias: strength of the bias field.
         stretch: bound of the random stretch of each axis.
-        turned: whether the head lies in a random orientation instead of the atlas's.
+        turned: whether the head is in a random orientation instead of the atlas's.
     """
 
     name: str = ""
@@ -66,7 +66,7 @@ class SubjectSpec:
 
 
 def data_folder(part: str) -> Path:
-    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` beside the repository.
+    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` next to the repository.
 
     Raises:
         InputError: there is none.
@@ -91,7 +91,7 @@ def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path
 
 
 def chosen_folders(folders: Sequence[Path]) -> Sequence[Path]:
-    """The folders that were given, or the case of the test data that stands for all."""
+    """The folders that were given, or the case of the test data that represents all."""
     return folders or [data_folder("cases") / USUAL_CASE]
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Cell = str | Callable[[Any], object]
-"""What stands in a column: a format such as "{scores[V_prior][ssim]:.3f}", or a function of the row."""
+"""Content of a column: a format such as "{scores[V_prior][ssim]:.3f}", or a function of the row."""
 
 
 def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Sequence[tuple[str, Cell]]) -> str:
@@ -22,10 +22,10 @@ def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Seque
 
     Args:
         rows: values by name.
-        columns: cells by the head of the column; pairs where a head stands twice.
+        columns: cells by the head of the column; pairs where a head occurs twice.
     """
-    pairs = list(columns.items()) if isinstance(columns, Mapping) else columns
-    return markdown_table([head for head, _ in pairs], [[_cell(row, cell) for _, cell in pairs] for row in rows])
+    listed = list(columns.items()) if isinstance(columns, Mapping) else columns
+    return markdown_table([head for head, _ in listed], [[_cell(row, cell) for _, cell in listed] for row in rows])
 
 
 def _cell(row: Mapping[str, Any], cell: Cell) -> object:

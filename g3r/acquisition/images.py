@@ -75,7 +75,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
     offset = reference.grid.index(mask.grid.world(corners)) - corners
     if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
         raise InputError(
-            f"{mask.name}: mask lies up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
+            f"{mask.name}: mask is up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
             "header; resample the mask or pass the matching file"
         )
     _check_mask_values(mask)

@@ -21,7 +21,7 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 
 CLOCK = time.thread_time
 STEP_FACTOR = 0.1
-"""Of the step sizes while steps are timed, as near the end of a fit."""
+"""Factor on the step sizes while steps are timed, as near the end of a fit."""
 
 STEPS = 10
 
@@ -95,14 +95,14 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
     """Pairs, pixels inside the cut-off, and seconds of one forward and one backward pass."""
     scene = head_scene(n_gaussians)
     cloud, planes = scene.cloud, scene.slices.planes
-    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, planes, CUTOFF_SIGMA)
     n_pixels, n_pairs = evaluations(cloud, planes, CUTOFF_SIGMA)
     out = np.zeros(planes.n_pixels, np.float32)
     buffers = np.zeros((1, n_gaussians, kernels.N_GRADIENTS))
     plane_gradient = np.zeros((len(planes), kernels.N_PLANE_GRADIENTS))
     described = PlaneArrays.of(planes, cloud.origin_mm)
-    work = Workspace.of(planes, pairs.most)
-    common = (CloudArrays.of(cloud), described, pairs.arrays, CUTOFF_SIGMA**2, True, work)
+    work = Workspace.of(planes, overlaps.most)
+    common = (CloudArrays.of(cloud), described, overlaps.arrays, CUTOFF_SIGMA**2, True, work)
 
     def forward() -> None:
         kernels.forward(*common, out)

@@ -98,11 +98,11 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
     cloud = made_cloud(size)
     volume, slices = made_volume_planes(size), made_slices(size, cloud)
     planes = volume if operations == (WRITING,) else slices.planes
-    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, planes, CUTOFF_SIGMA)
     calls = scene_calls(cloud, slices, volume)
     row: dict[str, Any] = {
         "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
-        "pairs": len(pairs),
+        "pairs": len(overlaps),
         "evaluations": evaluations(cloud, planes, CUTOFF_SIGMA)[0],
         "seconds": {name: calls[name][0]() for name in operations},
         "bytes": {name: peak_extra_bytes(calls[name][1]) for name in operations},
@@ -128,11 +128,11 @@ def scene_calls(
     from g3r.gaussians.render import CUTOFF_SIGMA
 
     weight = slices.mask.astype("float32")
-    pairs = find_overlaps(cloud, slices.planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, slices.planes, CUTOFF_SIGMA)
     single: dict[str, Callable[[], object]] = {
         SEARCH: lambda: find_overlaps(cloud, slices.planes, CUTOFF_SIGMA),
         AMPLITUDES: lambda: solve_amplitudes(
-            cloud, slices.planes, slices.value, weight, n_iterations=AMPLITUDE_ITERATIONS, pairs=pairs
+            cloud, slices.planes, slices.value, weight, n_iterations=AMPLITUDE_ITERATIONS, overlaps=overlaps
         ),
         WRITING: lambda: render(cloud, volume),
     }

@@ -43,8 +43,8 @@ class Quality:
 def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable) -> Quality:
     """Score a volume [I, J, K] and the slices' poses.
 
-    The volume may stand in another orientation than the truth, further than alignment reaches: the common
-    motion of the slices brings it near first.
+    The volume may be oriented too differently from the truth for alignment: the common motion of the slices
+    is applied first.
 
     Args:
         case: with the truth.

@@ -91,7 +91,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
     """The true poses of a simulated subject, from `poses.tsv` or else `poses.json`.
 
     `poses.json` is a list of `stack`, `slice`, `rotation` [3, 3] and `center` [3]: the point (x, y) mm from
-    the middle of a slice's pixel grid, along the file's first two axes, truly lies at
+    the middle of a slice's pixel grid, along the file's first two axes, is truly at
     rotation (x, y, 0) + center.
 
     Raises:

@@ -17,7 +17,7 @@ from g3r.geometry import VolumeGrid
 from g3r.registration import Registration
 
 MARGIN_MM = 5.0
-"""Of the prior's grid around the masked pixels."""
+"""Margin of the prior's grid around the masked pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

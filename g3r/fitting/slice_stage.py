@@ -147,7 +147,7 @@ def fit_slices(
             cutoff_sigma=settings.cutoff_sigma,
             projection_bytes=settings.projection_bytes,
         )
-    several = slices.n_stacks > 1  # one stack cannot tell its bias field from anatomy
+    several = slices.n_stacks > 1  # one stack cannot separate its bias field from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
     blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses)
     parameters = FitParameters(cloud, settings.rates, blocks)

@@ -47,7 +47,7 @@ class StageResults:
         stacks: as they were given.
         registration: poses of their slices.
         prior: the prior volume and what it was made of.
-        intensity: what 1 stands for in the fit.
+        intensity: intensity of 1 in the fit.
         cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
             volume less well than that volume does.
         fit: of the fit to the slices; None before it.

@@ -34,7 +34,7 @@ class StoppedAt:
 
 @dataclass(kw_only=True)
 class RunContext:
-    """Runs the stages of one computation: times them, keeps what they give, and ends early when it is asked to.
+    """Runs the stages of one computation: times them, keeps what they give, and ends early when a stop is requested.
 
     A stop request before the first droppable or stoppable stage raises `KeyboardInterrupt`. Afterwards it
     sets `stopped_at`, and the caller makes its result of what there is.
@@ -45,7 +45,7 @@ class RunContext:
         progress: called with (stage, steps done, steps in all).
         clock: seconds of each stage.
         notes: remarks for the record.
-        warnings: what must be known before the result is believed; logged when the result is made.
+        warnings: about the result; logged when the result is made.
         stopped_at: where a stop request ended the run; None while it was not.
     """
 

@@ -37,7 +37,7 @@ class AnnealedModule(LightningModule):
     """
 
     kind: ClassVar[str]
-    """Of the exported model."""
+    """Kind of the exported model: prior or pose."""
     network: Any
 
     def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:

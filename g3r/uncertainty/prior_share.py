@@ -48,10 +48,11 @@ def estimate_prior_share(
 ) -> NDArray[np.float32]:
     """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
 
-    With r the share of a change of the prior that the slices leave standing, and c = 1 - exp(-M_rho) the
-    confidence, the answer is the larger of r and (1 - c)^2: Gaussians carry what slices say a little beyond
-    where they are, but a voxel that nothing measured rests on the prior all the same. The square is how r
-    falls with coverage where slices lie evenly. Shapes, poses, gains and slice weights are those of the finished fit.
+    With r the share of a change of the prior that the fit to the slices leaves in the result, and
+    c = 1 - exp(-M_rho) the confidence, the result is the larger of r and (1 - c)^2: Gaussians carry what the slices
+    determine a little beyond them, but a voxel that nothing measured depends on the prior in any case. The square
+    is how r falls with coverage where slices are evenly spaced. Shapes, poses, gains and slice weights are those of
+    the finished fit.
 
     Args:
         fit: of stage 2.
@@ -85,7 +86,7 @@ def remaining_share(
     cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
-    """r: how much of a random change of the amplitudes the slices leave standing, on a coarse grid over `grid`.
+    """r: how much of a random change of the amplitudes the slices leave in place, on a coarse grid over `grid`.
 
     The local regression of what is left on what was put in, <left, put in> / <put in, put in>, with means
     over a Gaussian neighbourhood and all probes; 1 where no Gaussian reaches.

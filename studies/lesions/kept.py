@@ -27,7 +27,7 @@ FIRST_SEED, DEVELOPMENT_SEED = 52_300, 51_300
 
 STACK_NUMBERS = (3, 1)
 WANTED_SHARE = 0.85
-"""Of what the fit without prior keeps."""
+"""Smallest accepted share, with the prior, of what the fit without prior keeps."""
 
 WITH_PRIOR, WITHOUT_PRIOR, PRIOR_ALONE = "with prior", "without prior", "prior alone"
 VARIANTS = (WITHOUT_PRIOR, WITH_PRIOR, PRIOR_ALONE)

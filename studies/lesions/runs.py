@@ -41,7 +41,7 @@ class LesionSubject:
 
     @property
     def grid(self) -> VolumeGrid:
-        """Of the truth and the lesions."""
+        """Grid of the truth and the lesions."""
         return VolumeGrid(self.healthy.data.shape, self.healthy.affine)
 
 
@@ -113,7 +113,7 @@ def lesion_run(
     """Reconstruct a head twice by each variant and compare the difference with the lesions.
 
     Poses and gains of the slices are the true ones. A wrong pose blurs a lesion with and without prior alike;
-    here the question is what the prior does to what slices show, and both reconstructions have to stand in
+    here the question is what the prior does to what slices show, and both reconstructions have to be in
     one frame.
 
     Args:

@@ -94,7 +94,7 @@ def measure(case: SimulatedCase, options: argparse.Namespace) -> Row:
         tre[name] = error.median_mm
         volumes = {name: (result.volume, result.grid)}
         if name == BASELINE:
-            # what stands in for a prior
+            # what replaces a prior
             volumes |= {"V_coarse": (result.coarse, result.prior_grid), "V_sharp": (result.prior, result.prior_grid)}
         elif name == VARIANTS[-1]:
             volumes["prior alone"] = result.prior, result.prior_grid

@@ -1,4 +1,4 @@
-"""How trained variants of the prior network are judged: errors by number of stacks, seconds, size."""
+"""How trained variants of the prior network are compared: errors by number of stacks, seconds, size."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Variant:
     Args:
         name: of its folder, and in tables.
         what: how it differs, in words.
-        options: of the network, beside those of the configuration.
+        options: of the network, in addition to the configuration.
         is_size: whether it belongs to the curve of error against seconds.
     """
 
@@ -167,7 +167,7 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
 
 
 def _data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
-    """What all variants are told about their data."""
+    """Arguments about the data, the same for all variants."""
     listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
     return [
         f"--data.source={source}",
