@@ -50,7 +50,7 @@ STORED_RECORDS = (
     VolumeGrid,
     GaussianCloud,
 )
-"""What the files of a stage store may hold."""
+"""Classes that the files of a stage store may hold."""
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 

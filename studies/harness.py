@@ -1,4 +1,4 @@
-"""What all studies share: options, a record that an interrupted run goes on with, tables and the end of a command.
+"""Common part of all studies: options, a record that an interrupted run resumes, tables and the end of a command.
 
 A study consists of what is special to it: its cases as tasks, what is measured, its tables and its figure. See
 `Study`; `python -m studies.PAGE.NAME --help` lists the options of each.
@@ -177,7 +177,7 @@ class Study:
         return 0 if self.verdict is None or self.verdict(record) else 1
 
     def _settings(self, options: argparse.Namespace) -> Record:
-        """What all rows of a record depend on."""
+        """Settings that all rows of a record depend on."""
         found: Record = {}
         if hasattr(options, "preset"):
             found["preset"] = options.preset

@@ -103,7 +103,7 @@ def aligned(
 
 
 def figures(scores: Scores) -> dict[str, float]:
-    """What the tables show of scores, as plain numbers."""
+    """Scores that the tables show, as plain numbers."""
     return {"psnr_db": round(scores.psnr_db, 4), "ssim": round(scores.ssim, 5)}
 
 

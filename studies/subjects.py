@@ -1,4 +1,4 @@
-"""What studies measure on: simulated subjects, kept in a folder, and the cases of the test data."""
+"""Subjects of the studies: simulated subjects, kept in a folder, and the cases of the test data."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ PACKAGES = ("numpy", "torch", "numba")
 
 
 def machine(n_threads: int | None = None) -> dict[str, Any]:
-    """What seconds depend on: processor, cores, memory, versions, and the commit of a checkout.
+    """The conditions of a timing: processor, cores, memory, versions, and the commit of a checkout.
 
     Args:
         n_threads: that the measurement used; as many as there are cores when None.

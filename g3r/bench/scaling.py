@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from g3r.gaussians import GaussianCloud
 
 STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "overlap search", "amplitudes", "volume"
-"""What is measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
+"""Operations measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
 
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, AMPLITUDES, WRITING)),
@@ -26,7 +26,7 @@ GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "pixels per slice": ("n_pixels", 1024, (STEP, AMPLITUDES)),
     "output voxels": ("n_voxels", 27_000, (WRITING,)),
 }
-"""What grows: its field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
+"""Sizes that grow: the field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
 
 PIXEL_FIELDS = ("n_pixels", "n_voxels")
 """These leave the number of pairs (nearly) as it is, whose set-up is then no part of what grows."""
@@ -116,7 +116,7 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
 def scene_calls(
     cloud: GaussianCloud, slices: Slices, volume: Planes
 ) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
-    """What gives the seconds of each operation, and a single call of it.
+    """For each operation a function for its seconds, and a single call of it.
 
     Args:
         cloud: Gaussians.
@@ -180,7 +180,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
 
 
 def _actual(field: str, size: SceneSize, plane_shape: Any, volume_shape: Any) -> int:
-    """Sides are whole numbers, so pixels and voxels are not quite what was asked for."""
+    """Sides are whole numbers, so the numbers of pixels and voxels are only near those requested."""
     if field == "n_pixels":
         return int(plane_shape.prod())
     if field == "n_voxels":

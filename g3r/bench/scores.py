@@ -20,7 +20,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 
 @dataclass(frozen=True)
 class Quality:
-    """What a volume and its poses are worth.
+    """Scores of a volume and its poses.
 
     Attributes:
         psnr_db, ssim: of the volume in the truth's mask, after one rigid motion and an affine fit of the

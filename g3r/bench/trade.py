@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from g3r.evaluation.case import SimulatedCase
 
 OUTSIDE_STAGES = "start-up, reading, writing"
-"""What the command does besides the stages that run.json times."""
+"""Name for the time outside the stages that run.json records."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -75,7 +75,7 @@ class TrainedModel:
         raise NotImplementedError
 
     def in_words(self) -> str:
-        """What it is, in half a line."""
+        """Short description of the model."""
         raise NotImplementedError
 
     @staticmethod

@@ -40,12 +40,12 @@ BYTES_PER_VALUE = {"F16": 2, "F32": 4, "I64": 8}
 
 
 class DamagedError(ValueError):
-    """What a file holds cannot be."""
+    """The content of a file is impossible."""
 
 
 @dataclass(frozen=True)
 class TensorClaim:
-    """What the header says about a tensor."""
+    """Dtype and shape of a tensor as the header states them."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -199,5 +199,5 @@ def write_weights(path: Path, description: Mapping[str, Any], tensors: Mapping[s
 
 
 def another_file(kind: str) -> str:
-    """What to do about a file that is no exported network of this kind."""
+    """Advice for a file that is not an exported network of this kind."""
     return f"pass a {kind} network made by g3r-export, or leave it out to use the one that ships with g3r"

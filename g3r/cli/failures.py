@@ -1,4 +1,4 @@
-"""What the machine could not give (memory, space on a disk), as one line and an exit code."""
+"""Failures of the machine (no memory, full disk) as one line and an exit code."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from g3r.geometry import RigidPose
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedCase:
-    """What a folder of `g3r-simulate` holds (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
+    """Content of a folder of `g3r-simulate` (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
 
     Attributes:
         name: of the folder.

@@ -66,7 +66,7 @@ class AdaptiveSettings:
 
 @dataclass(kw_only=True)
 class Densification:
-    """What was done to a cloud on the way to the bound.
+    """Record of the rounds that brought a cloud to the bound.
 
     Attributes:
         bound: as in the settings.

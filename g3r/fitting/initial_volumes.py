@@ -1,4 +1,4 @@
-"""What a fit starts from: slices of order one, and the volumes that posed slices give by themselves."""
+"""Start of a fit: normalised slices, and the volumes that posed slices determine without a prior."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class InitialVolumes:
 
 @dataclass(frozen=True, kw_only=True)
 class PriorVolume:
-    """What the fit starts from and is drawn to.
+    """Start and target of the fit.
 
     Attributes:
         volumes: the slices as they are fitted, and the volumes that they give.

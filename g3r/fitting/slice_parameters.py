@@ -22,7 +22,7 @@ def slice_blocks(
     rates: LearningRates,
     optimise_poses: bool,
 ) -> dict[str, Block]:
-    """What is fitted along with the cloud: start values and step sizes, by name.
+    """Parameters fitted along with the cloud: start values and step sizes, by name.
 
     Args:
         slices: K slices.

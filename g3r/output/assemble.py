@@ -41,7 +41,7 @@ PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of t
 
 @dataclass(frozen=True, kw_only=True)
 class StageResults:
-    """What the stages of a run gave.
+    """Results of the stages of a run.
 
     Attributes:
         stacks: as they were given.

@@ -1,4 +1,4 @@
-"""What a reconstruction gives, and the folder that it is written to."""
+"""The result of a reconstruction, and the folder that it is written to."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class ReconstructionResult:
             raise cannot_be_written(folder, error, self._max_bytes()) from None
 
     def _max_bytes(self) -> int:
-        """What the files take together if nothing could be compressed, but for the picture and tables."""
+        """Size of the uncompressed files together, without the picture and tables."""
         arrays = [getattr(self, one.name) for one in fields(self)]
         arrays += [tensor.numpy() for tensor in self.cloud.parameters]
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))

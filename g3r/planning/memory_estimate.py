@@ -29,7 +29,7 @@ PROJECTION_BYTES = 48
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """What each stage holds at most, in bytes, the process with its libraries included."""
+    """Peak memory of each stage in bytes, including the process with its libraries."""
 
     stages: dict[Stage, int]
 
@@ -40,7 +40,7 @@ class MemoryEstimate:
 
     @property
     def peak(self) -> int:
-        """What that one needs."""
+        """Memory of that stage in bytes."""
         return self.stages[self.stage]
 
     def line(self) -> str:
@@ -50,7 +50,7 @@ class MemoryEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSizes:
-    """What the estimate is made of: counts, none of them in bytes."""
+    """Counts that the estimate is made from."""
 
     n_pixels: int
     prior_shape: tuple[int, ...]
@@ -156,7 +156,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
 
 
 def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> float:
-    """What the prior network sees at a time."""
+    """Voxels that the prior network sees at a time."""
     n_voxels = GRID_SLACK * math.prod(shape)
     if n_voxels <= settings.prior_whole_voxels:
         return n_voxels

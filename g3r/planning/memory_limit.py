@@ -46,7 +46,7 @@ class MemoryPlan:
     at_once: bool = False
 
     def record(self) -> MemoryRecord:
-        """What run.json says."""
+        """The entry of run.json."""
         return MemoryRecord(self.estimate.peak, self.estimate.stage, self.limit_bytes, self.changes)
 
 
@@ -116,7 +116,7 @@ def plan_for_stacks(
     limit_bytes: int | None,
     prior_voxel_mm: float | None = None,
 ) -> MemoryPlan:
-    """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
+    """`plan_memory` for this process as it is; makes it return memory to the system at once where the plan requires it.
 
     Args:
         stacks: that will be reconstructed.
@@ -150,7 +150,7 @@ class Estimator(Protocol):
     """`estimate_memory` of one problem."""
 
     def __call__(self, of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
-        """What settings need."""
+        """Memory that settings need."""
         ...
 
 

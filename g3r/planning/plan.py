@@ -15,7 +15,7 @@ from g3r.run.deadline import Deadline, LoopRecord
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetRecord:
-    """What a time budget chose; fields are None where the run ended before the choice.
+    """Choices of a time budget; fields are None where the run ended before the choice.
 
     Attributes:
         seconds: that were given.
@@ -69,7 +69,7 @@ class Plan(Protocol):
         """When the second stage of the fit has to end."""
 
     def record(self) -> BudgetRecord | None:
-        """What was decided; None where nothing was."""
+        """The decisions; None where there were none."""
 
 
 @dataclass
@@ -134,5 +134,5 @@ class RepeatedBudget(FixedPlan):
         return self.deadline
 
     def record(self) -> BudgetRecord:
-        """What the earlier run decided."""
+        """The decisions of the earlier run."""
         return self.earlier

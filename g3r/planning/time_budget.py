@@ -2,7 +2,7 @@
 
 Before registration only the budget is known, so that it alone decides how registration searches; its loops
 end by the clock. After it the slices are in place, one optimiser step has been timed, and the most careful
-preset is taken whose steps fit. Every loop has a deadline besides, so that an estimate that was wrong costs
+preset is taken whose steps fit. Every loop also has a deadline, so that an estimate that was wrong costs
 steps and not the time that was promised.
 """
 
@@ -49,7 +49,7 @@ VIEWS_SHARE = 0.2
 
 COARSE_AT_END = 0.9
 """Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
-output of as many voxels; the picture and the files take `WRITING_S` besides."""
+output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
@@ -188,13 +188,13 @@ class TimeBudget:
         return self.fit_deadline.part(PRIOR_STAGE_SHARE)
 
     def record(self) -> BudgetRecord:
-        """What was decided, for run.json."""
+        """The decisions, for run.json."""
         loops = self.deadline.loop_record.loops if self.deadline.loop_record else []
         return BudgetRecord(seconds=self.given_s, loops=loops, **self.choices)
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:
-    """What both stages would take with the settings of a preset.
+    """Seconds of both stages with the settings of a preset.
 
     Args:
         preset: whose spacing, rounds and steps.

@@ -44,7 +44,7 @@ Disturbance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class PoseStep(NamedTuple):
-    """What one step of the network says: poses atlas frame from image frame, and the votes behind them.
+    """Output of one step of the network: poses atlas frame from image frame, and the votes behind them.
 
     Attributes:
         rotation: [S, 3, 3].

@@ -1,4 +1,4 @@
-"""What the C library does with memory that was freed: keep it for later, or give it back to the system."""
+"""Whether the C library keeps freed memory for later or returns it to the system."""
 
 from __future__ import annotations
 

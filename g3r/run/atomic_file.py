@@ -62,7 +62,7 @@ def sync(path: Path) -> None:
     """Wait until a file is on the disk.
 
     Raises:
-        OSError: the disk is full or broken, which some systems say no sooner.
+        OSError: the disk is full or broken, which some systems report only now.
     """
     descriptor = os.open(path, os.O_RDWR)  # Windows refuses to sync what is open for reading
     try:

@@ -1,4 +1,4 @@
-"""What a run carries besides its data: stage store, clock, stop request, progress, and what it has to say."""
+"""Context of a run: stage store, clock, stop request, progress, notes and warnings."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class RunContext:
     _position: StoppedAt | None = field(default=None, init=False)
 
     def stage(self, name: str, make: Callable[[], Result]) -> Result:
-        """What a stage gives: from the store if it was finished in an earlier run, else made, timed and kept."""
+        """Result of a stage: from the store if an earlier run finished it, else computed, timed and stored."""
         return self._run(name, make)
 
     def droppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:

@@ -14,7 +14,7 @@ def _nobody() -> bool:
 
 @dataclass
 class LoopRecord:
-    """What the clock decided in the loops of a run, in their order, so that a later run can do the same.
+    """Decisions of the clock in the loops of a run, in order, so that a later run can repeat them.
 
     Attributes:
         loops: for each loop the fractions of its steps (see `timed_steps`).

@@ -1,4 +1,4 @@
-"""What this machine offers to a run: cores and memory, on Linux, macOS and Windows."""
+"""Cores and memory that this machine offers, on Linux, macOS and Windows."""
 
 from __future__ import annotations
 

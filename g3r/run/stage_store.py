@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class FinishedStage:
-    """What a stage gave in an earlier run, and the seconds that it took then."""
+    """Result of a stage in an earlier run, and the seconds that it took."""
 
     value: Any
     seconds: float
@@ -62,7 +62,7 @@ class StageStore:
         self._begin(path, provenance or {})
 
     def read(self, name: str) -> FinishedStage | None:
-        """What an earlier run made of a stage; None where it has to be made."""
+        """Result of a stage in an earlier run; None where it has to be computed."""
         path = self._path(name)
         if path is None or not self.reads or not path.exists():
             return None

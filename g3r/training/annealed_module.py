@@ -1,4 +1,4 @@
-"""What the trainings share: the optimiser annealed over a budget, the throughput, and what an export needs."""
+"""Common part of the trainings: the optimiser annealed over a budget, the throughput, and what an export needs."""
 
 import inspect
 import math
@@ -57,7 +57,7 @@ class AnnealedModule(LightningModule):
         raise NotImplementedError
 
     def own_description(self) -> dict[str, Any]:
-        """What the exported model needs apart from its weights, in plain values."""
+        """Values that the exported model needs apart from its weights, in plain values."""
         raise NotImplementedError
 
     def keep_hyperparameters(self, network: NetworkConfig) -> None:

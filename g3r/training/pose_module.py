@@ -181,7 +181,7 @@ class PoseModule(AnnealedModule):
             ) from error
 
     def own_description(self) -> dict[str, Any]:
-        """What a `PoseModel` needs apart from its weights."""
+        """Values that a `PoseModel` needs apart from its weights."""
         return {"weeks": self.weeks}
 
 

@@ -168,7 +168,7 @@ class PriorModule(AnnealedModule):
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
 
     def own_description(self) -> dict[str, Any]:
-        """What a `Prior` needs apart from its weights."""
+        """Values that a `Prior` needs apart from its weights."""
         return {"voxel_mm": self.voxel_mm}
 
 

@@ -33,7 +33,7 @@ UNCHECKED_NOTE = "a single stack: nothing but the prior checks its poses"
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """The map and what run.json says about it.
+    """The map and its entry of run.json.
 
     Attributes:
         expected_error: [I, J, K] in the volume's intensities; zero outside the mask.
@@ -46,7 +46,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class UncertaintyInputs:
-    """What is known of a result without the truth, in normalised intensities.
+    """Properties of a result that are known without the truth, in normalised intensities.
 
     Attributes:
         volume: [I, J, K].

@@ -47,7 +47,7 @@ class LesionSubject:
 
 @dataclass(frozen=True, kw_only=True)
 class LesionRun:
-    """What one head gave with one number of stacks.
+    """Result of one head with one number of stacks.
 
     Attributes:
         subject: the head.
@@ -145,7 +145,7 @@ def lesion_run(
 
 
 def true_motion(stacks: list[SimulatedStack]) -> Registration:
-    """What a registration without error would give for simulated stacks."""
+    """The error-free registration of simulated stacks."""
     slices = slices_from_stacks([one.stack for one in stacks])
     rotation = np.concatenate([one.true_pose.rotation for one in stacks])
     shift = np.concatenate([one.true_pose.translation_mm for one in stacks])

@@ -22,7 +22,7 @@ SEED = 33_000
 motion, noise and the shape of the field agree."""
 
 VARIANTS: dict[str, Mapping[str, Any]] = {"estimated": {}, "not estimated": {"slice_stage.optimise_bias_field": False}}
-"""What is compared; options as `g3r.planning.presets.changed` reads them."""
+"""Variants compared; options as `g3r.planning.presets.changed` reads them."""
 
 
 def specs(n_repeats: int = 1) -> list[SubjectSpec]:

@@ -62,7 +62,7 @@ WITHOUT: dict[str, Options] = {
     "slices and joint": {"registration.n_rounds": 0, "slice_stage.optimise_poses": False},
     "bias field": {"slice_stage.optimise_bias_field": False},
 }
-"""What is switched off, one at a time, in a whole reconstruction."""
+"""Layers switched off, one at a time, in a whole reconstruction."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:

@@ -71,7 +71,7 @@ def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         _, row = run(case, options, full=options.full)
-    except G3RError as error:  # a refusal is an honest answer: nothing was moved, and the user was warned
+    except G3RError as error:  # a refusal counts as a row: nothing was moved, and the user was warned
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
         row = pose_row(header, [str(error)], seconds, cpu_seconds)
     shown = {"level": spec.motion, "seed": spec.seed, "turned": spec.turned}

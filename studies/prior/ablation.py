@@ -46,7 +46,7 @@ FITS_COMPARED: dict[str, Mapping[str, Any]] = {
     "prior as initialisation": {"distillation": False},
     "with distillation": {},
 }
-"""What is fitted, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
+"""Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
 
 VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS_COMPARED)
 """In the order of the table."""

@@ -30,7 +30,7 @@ EXPORTED = "prior.safetensors"
 
 
 BASELINES = {"V_coarse": "coarse", "V_sharp": "sharp"}
-"""What the network starts from, by its name in a validation volume."""
+"""Inputs of the network, by their names in a validation volume."""
 
 
 @functools.cache

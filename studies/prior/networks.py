@@ -75,7 +75,7 @@ def configuration() -> dict[str, Any]:
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """What all variants share; a table made later takes it from the record."""
+    """Settings that all variants share; a later table reads them from the record."""
     if options.no_train:
         return {}
     epochs = epochs_of(options.steps, configuration(), options.train_args)
@@ -83,7 +83,7 @@ def settings(options: argparse.Namespace) -> Record:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """What the network starts from, and the variants."""
+    """The inputs of the network and the variants."""
     if options.no_train:
         return
     config = configuration()

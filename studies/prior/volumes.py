@@ -27,7 +27,7 @@ MARGIN_MM = 5.0
 
 @dataclass(frozen=True)
 class PriorVolumes:
-    """What the network is given and answers, [I, J, K] in normalised intensities.
+    """Inputs and output of the network, [I, J, K] in normalised intensities.
 
     Attributes:
         by_name: `V_coarse` (Eq. 6), `V_sharp` and `V_prior` (Eq. 7).

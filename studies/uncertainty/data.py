@@ -170,7 +170,7 @@ def relative_error(
 
 
 def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
-    """What the map of a result was made of."""
+    """Predictors of the map of a result."""
     scale = np.float32(result.intensity_scale)
     fit = SliceFit(
         cloud=result.cloud,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 N_BINS = 10
 COVERAGE_FACTORS = (1.0, 2.0, 3.0)
 EXPONENTIAL_COVERAGE = tuple(1 - np.exp(-np.array(COVERAGE_FACTORS)))
-"""What errors of exponential size would show."""
+"""Coverage of exponentially distributed errors."""
 
 REMOVED_SHARES = np.linspace(0, 0.95, 20)
 """Shares of the most uncertain voxels removed, for the sparsification curve."""
