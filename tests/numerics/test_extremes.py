@@ -231,11 +231,11 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
 def test_pairs_of_flat_gaussians_are_not_missed() -> None:
     """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
     scene = flat(False, 40, 1e-5, 0.03)
-    pairs = find_overlaps(single(scene.cloud), scene.planes, 3.2)
+    overlaps = find_overlaps(single(scene.cloud), scene.planes, 3.2)
     for k in range(len(scene.planes)):
         shown = render(scene.cloud.take(torch.tensor([k])), scene.planes.take([k]), backend="reference")
         assert shown.max() > 0.3 * scene.cloud.amplitude[k]
-        assert k in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
+        assert k in overlaps.gaussian[overlaps.start[k] : overlaps.start[k + 1]]
 
 
 def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair() -> None:
