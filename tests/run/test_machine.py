@@ -22,7 +22,7 @@ def _same_threads_afterwards() -> Iterator[None]:
     numba.set_num_threads(before[1])
 
 
-def test_more_threads_than_there_are_are_refused():
+def test_more_threads_than_there_are_are_refused() -> None:
     with pytest.raises(InputError, match=f"this machine offers {OFFERED}"):
         use_threads(OFFERED + 1)
 
