@@ -11,7 +11,7 @@ import torch
 from g3r.errors import InputError
 from g3r.run.machine import use_threads, use_up_to
 
-OFFERED = int(numba.config.NUMBA_NUM_THREADS)
+OFFERED = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 @pytest.fixture(autouse=True)
@@ -28,6 +28,6 @@ def test_more_threads_than_there_are_are_refused() -> None:
 
 
 @pytest.mark.parametrize("wanted", [1, OFFERED, OFFERED + 1])
-def test_a_measurement_takes_what_there_is(wanted: int):
+def test_a_measurement_takes_what_there_is(wanted: int) -> None:
     assert use_up_to(wanted) == min(wanted, OFFERED)
     assert torch.get_num_threads() == numba.get_num_threads() == min(wanted, OFFERED)
