@@ -1,6 +1,6 @@
 """Which room of g3r may import which: read by tests/test_architecture.py, written into CONTRIBUTING.md.
 
-`python -m tests.rooms` writes the table between the markers of CONTRIBUTING.md.
+`python -m tests.rooms` writes the table between the markers of CONTRIBUTING.md, and counts rooms, floors and pairs.
 """
 
 from __future__ import annotations
@@ -93,5 +93,17 @@ def with_table(text: str) -> str:
     return f"{before}{BEGIN}\n{table()}\n{END}{rest.split(END)[1]}"
 
 
+def floor(room: str) -> int:
+    """How many rooms stand on each other up to this one: the longest chain of imports, the open rooms included."""
+    below = set() if room in OPEN_TO_ALL else allowed(room) | OPEN_TO_ALL
+    return 1 + max(map(floor, below), default=0)
+
+
 if __name__ == "__main__":
     DOCUMENT.write_text(with_table(DOCUMENT.read_text(encoding="utf-8")), encoding="utf-8")
+    loose = [room for room in MAY_IMPORT if not (REPOSITORY / "g3r" / room).is_dir()]
+    pairs = sum(len(allowed(room)) for room in MAY_IMPORT)
+    print(
+        f"{len(MAY_IMPORT)} rooms, {len(loose)} of them loose modules; {pairs} import pairs, the open rooms apart; "
+        f"{max(map(floor, MAY_IMPORT))} floors"
+    )
