@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -129,7 +130,7 @@ class GaussianCloud:
             InputError: not such a file.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
                 return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
