@@ -61,7 +61,8 @@ class ErrorModel:
         if missing:
             raise ValueError(f"no predictor for {', '.join(missing)}")
         log_u = self.intercept + sum(b * found[name] for name, b in self.coefficients.items())
-        return np.clip(np.exp(np.asarray(log_u, dtype=np.float64)), MIN_ERROR, MAX_ERROR)
+        with np.errstate(over="ignore"):  # infinity is clipped
+            return np.clip(np.exp(np.asarray(log_u, dtype=np.float64)), MIN_ERROR, MAX_ERROR)
 
 
 def fit_model(

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from g3r.evaluation.metrics import score
 from g3r.planning.presets import PRESETS, changed
+from g3r.prior.config import PriorNetworkConfig
 from studies.motion import sweep
 from studies.prior import ablation, alone, cases, network_scores, networks
 from studies.prior.figures import draw_ablation, draw_networks
@@ -104,7 +106,7 @@ def test_network_table() -> None:
 def test_networks_differ_from_the_configuration() -> None:
     config = networks.configuration()
     found = {variant.name for variant in networks.distinct_variants(config)}
-    assert "size-" + "-".join(map(str, config["model"]["channels"])) not in found
+    assert "size-" + "-".join(map(str, config["model"]["init_args"]["network"]["channels"])) not in found
     assert {"full", "no-gate", "no-density", "no-density-no-gate", "no-sharp"} <= found
     per_epoch = networks.epochs_of(10**6, config) / 10**6
     assert networks.epochs_of(1, config) == 1
@@ -113,18 +115,19 @@ def test_networks_differ_from_the_configuration() -> None:
     assert networks.epochs_of(36, config, own) == 3
 
 
-def test_network_options_are_those_of_the_module() -> None:
-    training = pytest.importorskip("g3r.training.prior_module", reason="the training extra is not installed")
+def test_network_options_are_those_of_the_network() -> None:
     for variant in networks.VARIANTS:
-        training.PriorModule(**{"channels": [8, 8, 8], **variant.options})
+        PriorNetworkConfig(**variant.options)
 
 
 def test_scores_by_number_of_stacks() -> None:
-    pytest.importorskip("torchmetrics", reason="the training extra is not installed")
-    truth = torch.rand(1, 1, 12, 12, 12)
+    truth = torch.rand(1, 1, 12, 12, 12, generator=torch.Generator().manual_seed(0))
+    pattern = torch.where(torch.arange(12) % 2 == 0, 1.0, -1.0)
     volumes = [{"truth": truth, "mask": torch.ones_like(truth), "n_stacks": torch.tensor([n])} for n in (1, 3, 3)]
-    scores = network_scores.scores_by_stacks([truth + error for error in (0.1, 0.01, 0.03)], volumes)
-    assert scores["1"]["psnr_db"] == pytest.approx(20, abs=1e-3)
+    made = [truth + error * pattern for error in (0.1, 0.01, 0.03)]
+    scores = network_scores.scores_by_stacks(made, volumes)
+    expected = score(made[0][0, 0].numpy(), truth[0, 0].numpy(), np.ones((12, 12, 12), bool))
+    assert (scores["1"]["psnr_db"], scores["1"]["ssim"]) == (expected.psnr_db, expected.ssim)
     assert scores["3"]["l1"] == pytest.approx(0.02, abs=1e-6)
     assert scores["all"]["l1"] == pytest.approx(0.14 / 3, abs=1e-6)
 
