@@ -94,6 +94,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 
 
 @pytest.mark.faults
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
 @pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
