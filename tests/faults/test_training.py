@@ -131,7 +131,9 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
 
 CONFIG = """
 seed_everything: 5
-model: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
+model:
+  class_path: g3r.training.prior_module.PriorModule
+  init_args: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
