@@ -99,7 +99,7 @@ def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Gener
 
 
 def _other_anatomy(volume: TruthVolume, rng: np.random.Generator) -> TruthVolume:
-    """What torchio has no transform for: ventricles, contrast by tissue, lesions."""
+    """Augmentations that torchio lacks: ventricles, contrast by tissue, lesions."""
     draws = rng.random(3)
     if draws[0] < VENTRICLES_SHARE:
         volume = enlarged_ventricles(volume, float(rng.uniform(0.3, 1.0) * REACH_MM))

@@ -1,4 +1,4 @@
-"""What the data modules of both networks share: the subjects, the checks of settings, the worker processes."""
+"""Common part of the data modules of both networks: the subjects, the checks of settings, the worker processes."""
 
 from __future__ import annotations
 

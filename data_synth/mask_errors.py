@@ -1,4 +1,4 @@
-"""What brain extraction leaves wrong: masks that reach into what surrounds the head, or miss its outermost voxels."""
+"""Errors of brain extraction: masks that reach beyond the brain, or miss its outermost voxels."""
 
 from __future__ import annotations
 

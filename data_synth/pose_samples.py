@@ -27,7 +27,7 @@ LOOK_PIXEL_MM, LOOK_SIZE = 5.0, 36
 
 @dataclass(frozen=True)
 class SliceSet:
-    """Slice images of one head and the answer.
+    """Slice images of one head with their true poses.
 
     Args:
         images: what the network sees.

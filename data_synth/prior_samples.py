@@ -78,7 +78,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         self.artefact_share = artefact_share
         self.distinct = distinct
         self.augmentation = None if in_order else augmentation()
-        # all that decides the subjects, besides the code
+        # all that decides the subjects, apart from the code
         spec = ([one.name for one in subjects], spacing_mm, seed, patch_size, artefact_share, in_order)
         self.cache = SubjectCache(cache, repr(spec)) if cache is not None else None
 

@@ -1,4 +1,4 @@
-"""What registration leaves wrong in the poses of slices."""
+"""Errors that registration leaves in the poses of slices."""
 
 from __future__ import annotations
 

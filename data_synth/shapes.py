@@ -67,7 +67,13 @@ def union(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
 
 
 def intersection(a: Field, b: Field, blend_mm: float = 0.0) -> Field:
-    """Intersection of two shapes, its edges rounded; for the arguments see `union`."""
+    """Intersection of two shapes, with rounded edges.
+
+    Args:
+        a: signed distance (mm), positive inside.
+        b: signed distance (mm), positive inside.
+        blend_mm: width over which the edges where they meet are rounded.
+    """
     return -union(-a, -b, blend_mm)
 
 

@@ -85,7 +85,19 @@ def sample_slices(
 def sample_masks(
     head: Head, index_from_atlas: Array, pose: RigidPose, pixel_mm: float, size: int, threshold: float
 ) -> NDArray[np.float32]:
-    """Whether each pixel's centre is in the mask [K, N, N], 0 or 1; for the arguments see `sample_slices`."""
+    """Mark the pixels whose centres are in the mask.
+
+    Args:
+        head: the truth.
+        index_from_atlas: [4, 4] voxel index from the atlas frame (mm).
+        pose: [K] atlas frame from the slices, whose origins are the images' centres.
+        pixel_mm: edge of the square pixels.
+        size: pixels per edge, N.
+        threshold: of the soft mask; less makes the head larger.
+
+    Returns:
+        [K, N, N], 0 or 1.
+    """
     linear = index_from_atlas[:3, :3]
     axes = np.ascontiguousarray(linear @ pose.rotation, dtype=np.float32)
     origin = np.ascontiguousarray(pose.translation_mm @ linear.T + index_from_atlas[:3, 3], dtype=np.float32)

@@ -20,7 +20,7 @@ SYNTHESIS_VERSION = 2
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticSubject:
-    """What the prior network sees and should answer, on the truth's grid, in normalised intensities.
+    """Input and target of the prior network, on the truth's grid, in normalised intensities.
 
     Args:
         coarse: [I, J, K] V_coarse.

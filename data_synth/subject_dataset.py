@@ -105,7 +105,7 @@ class EpochSampler(Sampler[int]):
 def epoch_of(trainer: Any, n_batches: int) -> Callable[[], int] | None:
     """A function that gives the epoch of a trainer; None without a trainer.
 
-    Loaders are made before a checkpoint has said how far the training is, so the epoch is asked for later.
+    Loaders are made before a checkpoint is read that holds the epoch, so the epoch is looked up later.
 
     Args:
         trainer: of Lightning, or None.

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 TEMPLATE_WEEKS = (22.0, 25.0, 28.0, 31.0, 34.0, 37.0)
 HALF_WINDOW_WEEKS = 2.0
-"""A mean head of an age takes in the subjects of at most this many weeks more or less."""
+"""The template of an age is the mean of the subjects within this many weeks of it."""
 
 
 def atlas_templates(

@@ -37,17 +37,17 @@ def cannot_be_written(path: str | os.PathLike[str], error: OSError, needed_bytes
 
     Args:
         path: what was being written.
-        error: what the system said.
+        error: of the system.
         needed_bytes: what the file takes at most, where that is known.
     """
-    said = error.strerror or type(error).__name__
+    reason = error.strerror or type(error).__name__
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return InputError(f"{path}: cannot be written ({said}); choose another --output")
+        return InputError(f"{path}: cannot be written ({reason}); choose another --output")
     needed = "" if needed_bytes is None else f", at most {needed_bytes / MEGABYTE:.1f} MB are needed"
     free = _free_bytes(Path(path))
     # a quota or a limit on the size of files leaves the disk itself with space
     left = "" if free is None else f", {free / MEGABYTE:.1f} MB are free"
-    return InputError(f"{path}: cannot be written ({said}{needed}{left}); free some space or choose another --output")
+    return InputError(f"{path}: cannot be written ({reason}{needed}{left}); free some space or choose another --output")
 
 
 def _free_bytes(path: Path) -> int | None:

@@ -50,7 +50,7 @@ STORED_RECORDS = (
     VolumeGrid,
     GaussianCloud,
 )
-"""What the files of a stage store may hold."""
+"""Classes that the files of a stage store may hold."""
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
@@ -167,11 +167,11 @@ class GaussianReconstructor:
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
     def _slices(self, stacks: Sequence[Stack], run: RunContext) -> tuple[Slices, float]:
-        """The slices at their header poses, in normalised intensities, and what 1 stands for."""
+        """The slices at their header poses, in normalised intensities, and the intensity of 1."""
         slices, scale = normalised_slices(stacks)
         run.notes += skipped_slice_notes(stacks, slices)
         if slices.n_stacks == 1:
-            run.notes.append("bias field not estimated: a single stack cannot tell it from anatomy")
+            run.notes.append("bias field not estimated: a single stack cannot separate it from anatomy")
         return slices, scale
 
     def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:

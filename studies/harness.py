@@ -1,4 +1,4 @@
-"""What all studies share: options, a record that an interrupted run goes on with, tables and the end of a command.
+"""Common part of all studies: options, a record that an interrupted run resumes, tables and the end of a command.
 
 A study consists of what is special to it: its cases as tasks, what is measured, its tables and its figure. See
 `Study`; `python -m studies.PAGE.NAME --help` lists the options of each.
@@ -19,9 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g3r.bench.record import available_cores, machine, put_between_markers, use_threads, write_json, write_text
+from g3r.bench.record import machine, put_between_markers, write_json, write_text
 from g3r.errors import G3RError, InputError
 from g3r.planning.presets import PRESETS
+from g3r.run.machine import available_cores, use_up_to
 
 Row = dict[str, Any]
 Record = dict[str, Any]
@@ -36,7 +37,7 @@ class Task:
 
     Attributes:
         key: name of its row in the record.
-        call: measures; returns the row, or None where there is none (it has said why). A row with an entry
+        call: measures; returns the row, or None where there is none (it has printed why). A row with an entry
             "skipped" is tried again by the next run. With --jobs the call runs in another process.
         arguments: of the call.
     """
@@ -81,8 +82,8 @@ class Study:
         picture: in docs/images/, the figure of --publish.
         shared: those of `SHARED` that it takes.
         options: its own, as arguments of `add_argument` by their name.
-        settings: what rows depend on beside the preset, weights, threads, jobs and --development.
-        line: what is said of a new row; its key and seconds when None.
+        settings: what rows depend on apart from the preset, weights, threads, jobs and --development.
+        line: what is printed for a new row; its key and seconds when None.
         figure: draws the record into `options.figure`.
         finish: changes the record after the measurements.
         resumes: False measures everything anew each time.
@@ -176,7 +177,7 @@ class Study:
         return 0 if self.verdict is None or self.verdict(record) else 1
 
     def _settings(self, options: argparse.Namespace) -> Record:
-        """What all rows of a record depend on."""
+        """Settings that all rows of a record depend on."""
         found: Record = {}
         if hasattr(options, "preset"):
             found["preset"] = options.preset
@@ -230,13 +231,13 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
     """
     if jobs == 1 or len(tasks) < 2:
         if threads:
-            use_threads(threads)
+            use_up_to(threads)
         for task in tasks:
             yield task, task.call(*task.arguments)
         return
     # a fresh interpreter for each worker: thread pools do not survive a fork
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawn, initializer=use_threads, initargs=(threads or 1,)) as pool:
+    with ProcessPoolExecutor(jobs, spawn, initializer=use_up_to, initargs=(threads or 1,)) as pool:
         waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
         for done in as_completed(waiting):
             yield waiting[done], done.result()

@@ -68,7 +68,7 @@ def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seco
 
     Args:
         error: of the poses.
-        warnings: what g3r said against trusting them.
+        warnings: of g3r about them.
         seconds: wall time of what was run.
         cpu_seconds: of all threads.
     """
@@ -89,8 +89,8 @@ def aligned(
 ) -> Comparison:
     """A volume compared with the truth after rigid alignment.
 
-    The volume may stand in another orientation than the truth, further than alignment reaches: the common
-    motion of the slices brings it near first. `alignment` of the comparison starts from there.
+    The volume may be oriented too differently from the truth for alignment: the common motion of the slices
+    is applied first. `alignment` of the comparison starts from there.
 
     Args:
         case: with the truth.
@@ -103,7 +103,7 @@ def aligned(
 
 
 def figures(scores: Scores) -> dict[str, float]:
-    """What the tables show of scores, as plain numbers."""
+    """Scores that the tables show, as plain numbers."""
     return {"psnr_db": round(scores.psnr_db, 4), "ssim": round(scores.ssim, 5)}
 
 

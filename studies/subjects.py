@@ -1,4 +1,4 @@
-"""What studies measure on: simulated subjects, kept in a folder, and the cases of the test data."""
+"""Subjects of the studies: simulated subjects, kept in a folder, and the cases of the test data."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class SubjectSpec:
         volume: subject of the atlas tree, as in `find_subjects`.
         motion: mild, moderate or severe.
         seed: of the stretch and of the simulation.
-        bias: strength of the shading.
+        bias: strength of the bias field.
         stretch: bound of the random stretch of each axis.
-        turned: whether the head lies in a random orientation instead of the atlas's.
+        turned: whether the head is in a random orientation instead of the atlas's.
     """
 
     name: str = ""
@@ -66,7 +66,7 @@ class SubjectSpec:
 
 
 def data_folder(part: str) -> Path:
-    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` beside the repository.
+    """`atlas` or `cases` of the test data: below `G3R_TEST_DATA`, or `shared/data` next to the repository.
 
     Raises:
         InputError: there is none.
@@ -91,7 +91,7 @@ def case_folders(patterns: Sequence[str], root: Path | None = None) -> list[Path
 
 
 def chosen_folders(folders: Sequence[Path]) -> Sequence[Path]:
-    """The folders that were given, or the case of the test data that stands for all."""
+    """The folders that were given, or the case of the test data that represents all."""
     return folders or [data_folder("cases") / USUAL_CASE]
 
 
@@ -102,7 +102,13 @@ def read_case(folder: Path, n_stacks: int | None = None) -> SimulatedCase:
 
 
 def simulated_case(spec: SubjectSpec, cache: Path, n_stacks: int | None = None) -> SimulatedCase:
-    """A subject of the test data's atlas with its first stacks (None: all), simulated if the cache lacks it."""
+    """Return a subject of the test data's atlas, simulated if the cache lacks it.
+
+    Args:
+        spec: of the subject.
+        cache: folder of simulated subjects.
+        n_stacks: how many of its stacks to read, from the first; None for all.
+    """
     return read_case(simulated_subject(spec, data_folder("atlas"), cache), n_stacks)
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any
 
 from g3r.bench.record import markdown_table
+from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Cell = str | Callable[[Any], object]
-"""What stands in a column: a format such as "{scores[V_prior][ssim]:.3f}", or a function of the row."""
+"""Content of a column: a format such as "{scores[V_prior][ssim]:.3f}", or a function of the row."""
 
 
 def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Sequence[tuple[str, Cell]]) -> str:
@@ -22,10 +22,10 @@ def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Cell] | Seque
 
     Args:
         rows: values by name.
-        columns: cells by the head of the column; pairs where a head stands twice.
+        columns: cells by the head of the column; pairs where a head occurs twice.
     """
-    pairs = list(columns.items()) if isinstance(columns, Mapping) else columns
-    return markdown_table([head for head, _ in pairs], [[_cell(row, cell) for _, cell in pairs] for row in rows])
+    listed = list(columns.items()) if isinstance(columns, Mapping) else columns
+    return markdown_table([head for head, _ in listed], [[_cell(row, cell) for _, cell in listed] for row in rows])
 
 
 def _cell(row: Mapping[str, Any], cell: Cell) -> object:
@@ -76,8 +76,13 @@ def new_figure(size: tuple[float, float], **options: Any) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a PNG, whole or not at all; folders are made."""
+    """Write a PNG, whole or not at all; folders are made.
+
+    Args:
+        figure: to write.
+        path: of the PNG.
+        dpi: dots per inch.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    figure.savefig(temporary, dpi=dpi)
-    os.replace(temporary, path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)

@@ -19,13 +19,13 @@ MAY_IMPORT = {
     "_version": "",
     "geometry": "",
     "run": "",
-    "acquisition": "geometry",
-    "checkpoints": "",
-    "gaussians": "geometry acquisition",
+    "acquisition": "geometry run",
+    "checkpoints": "run",
+    "gaussians": "geometry run acquisition",
     "prior": "acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
     "evaluation": "geometry acquisition",
-    "training": "geometry checkpoints prior pose_network evaluation",
+    "training": "geometry run checkpoints prior pose_network evaluation",
     "registration": "geometry run acquisition",
     "fitting": "geometry run acquisition gaussians registration",
     "uncertainty": "geometry acquisition gaussians fitting",
@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reconstruct": "geometry run acquisition checkpoints gaussians prior pose_network registration fitting planning"
     " output",
-    "bench": "geometry acquisition gaussians registration fitting planning evaluation output reconstruct",
+    "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": "run acquisition checkpoints prior pose_network training planning evaluation output reconstruct",
 }
 """From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""

@@ -1,4 +1,4 @@
-"""What the scanner gives and how it sees, in the order of the data.
+"""Input stacks and the model of their acquisition, in the order of the data.
 
 1. `nifti`, `images`, `header_text` read files and check them; `stacks` makes a `Stack` of an image and its mask.
 2. `slicing` cuts stacks into `planes.Slices`, cropped to the mask and normalised.

@@ -1,6 +1,6 @@
 """The second-order bias field of a stack: polynomial terms in the in-plane coordinates of its header.
 
-The receive coil stands still while the fetus moves, so the field belongs to the header frame of a stack.
+The receive coil is fixed while the fetus moves, so the field belongs to the header frame of a stack.
 """
 
 from __future__ import annotations

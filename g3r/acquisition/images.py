@@ -14,6 +14,7 @@ from g3r.acquisition.header_text import HeaderText
 from g3r.acquisition.nifti import checked_grid, open_nifti, orientation_remarks, voxels
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
+from g3r.run.atomic_file import atomic_path
 
 MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 """Masks are drawn on copies whose headers lost digits: corners may differ by this much."""
@@ -74,7 +75,7 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
     offset = reference.grid.index(mask.grid.world(corners)) - corners
     if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
         raise InputError(
-            f"{mask.name}: mask lies up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
+            f"{mask.name}: mask is up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
             "header; resample the mask or pass the matching file"
         )
     _check_mask_values(mask)
@@ -103,7 +104,7 @@ def save_volume(
     affine: NDArray[np.float64],
     header_text: HeaderText | None = None,
 ) -> None:
-    """Write a volume as NIfTI, atomically: float32, or uint8 for masks; int16 stays.
+    """Write a volume as NIfTI, whole or not at all: float32, or uint8 for masks; int16 stays.
 
     Args:
         path: of the file.
@@ -126,12 +127,8 @@ def save_volume(
     image.set_qform(affine, code="scanner")
     if header_text is not None:
         header_text.put_into(image)
-    suffix = ".nii.gz" if path.name.endswith(".nii.gz") else ".nii"
-    beside = path.with_name(f".{path.name}.{os.getpid()}{suffix}")
     try:
-        nib.save(image, beside)
-        os.replace(beside, path)
+        with atomic_path(path) as temporary:
+            nib.save(image, temporary)
     except OSError as error:
         raise cannot_be_written(path, error, array.nbytes) from None
-    finally:
-        beside.unlink(missing_ok=True)

@@ -29,7 +29,7 @@ GZIP_RATIO = 1032
 """Largest expansion of deflate (zlib's documentation), which bounds what a compressed file can hold."""
 
 BLOCK_BYTES, MAX_BLOCKS_BEYOND = 2**20, 64
-"""What follows the voxels of a compressed file is read in such blocks, up to this many."""
+"""Bytes after the voxels of a compressed file are read in blocks of this size, up to this many."""
 
 NIFTI_ENDINGS = (".nii", ".hdr", ".img")
 """File endings, alone or before .gz; .hdr and .img are the two files of a pair."""

@@ -16,7 +16,7 @@ from g3r.geometry.rigid import Selection
 class Planes:
     """K rectangular pixel grids in space.
 
-    Pixel (i, j) of plane k lies at R (u_x, u_y, 0) + t with u = (index - (shape - 1) / 2) * spacing. Pixels
+    Pixel (i, j) of plane k is at R (u_x, u_y, 0) + t with u = (index - (shape - 1) / 2) * spacing. Pixels
     of all planes are numbered plane after plane, inside a plane in C order (j fastest).
 
     Args:

@@ -24,7 +24,7 @@ def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: fl
 
 
 def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weight of each slice [K], lower where its mean robust loss stands out.
+    """Weight of each slice [K], lower where its mean robust loss is unusually large.
 
     1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
     `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices.

@@ -118,5 +118,5 @@ def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
         missing = sorted(set(masked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
         if missing:
             numbers = ", ".join(map(str, missing))
-            lines.append(f"{stack.name}: slices {numbers} left out, fewer than {MIN_SLICE_PIXELS} masked pixels")
+            lines.append(f"{stack.name}: slices {numbers} skipped, fewer than {MIN_SLICE_PIXELS} masked pixels")
     return lines

@@ -225,8 +225,8 @@ def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> Non
     apart_mm = float(np.linalg.norm(_middle_mm(stack) - _middle_mm(other)))
     if apart_mm > FARTHEST_MM:
         raise InputError(
-            f"{stack.name}: lies {apart_mm:.0f} mm from {other.name} by its header; expected scans of one "
-            "head in one session, fix the header or leave the stack out"
+            f"{stack.name}: is {apart_mm:.0f} mm from {other.name} by its header; expected scans of one "
+            "head in one session, fix the header or omit the stack"
         )
 
 

@@ -1,1 +1,1 @@
-"""What measures g3r: speed against accuracy, the kernels, and how time grows with size."""
+"""Measurements of g3r: speed against accuracy, the kernels, and how time grows with size."""

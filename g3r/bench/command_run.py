@@ -36,7 +36,13 @@ class CommandRun:
 
 
 def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]:
-    """Arguments of g3r-infer for a simulated subject."""
+    """Arguments of g3r-infer for a simulated subject.
+
+    Args:
+        case: to reconstruct.
+        preset: name of the preset.
+        output: folder for the results.
+    """
     numbers = range(len(case.stacks))
     return [
         "--stacks",
@@ -74,14 +80,14 @@ def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
         env={**os.environ, "PYTHONPATH": path},
     )
     assert child.stderr is not None
-    said = child.stderr.read().decode(errors="replace").strip()  # to the end of the process
+    message = child.stderr.read().decode(errors="replace").strip()  # to the end of the process
     _, status, usage = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     child.stderr.close()
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode == InputError.exit_code:
-        raise InputError(said.removeprefix("g3r-infer: "))
+        raise InputError(message.removeprefix("g3r-infer: "))
     if child.returncode:
-        raise NumericalError(f"g3r-infer ended with {child.returncode}: {said[-2000:]}")
+        raise NumericalError(f"g3r-infer ended with {child.returncode}: {message[-2000:]}")
     record = RunRecord.read(output / "run.json")
     return CommandRun(seconds, usage.ru_utime + usage.ru_stime, record.peak_memory_bytes, record)

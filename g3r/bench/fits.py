@@ -24,7 +24,7 @@ RESOLUTIONS_MM = (0.6, 0.8, 1.0, 1.3, 1.6)
 
 
 def sweeps(base: ReconstructionSettings) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """What is varied, one at a time: sweep, label, change of the settings (see `g3r.planning.presets.changed`)."""
+    """Sweeps of one thing at a time: sweep, label, change of the settings (see `g3r.planning.presets.changed`)."""
     prior_steps, slice_steps = base.prior_stage.n_steps, base.slice_stage.n_steps
     return {
         "Gaussians": {

@@ -21,7 +21,7 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 
 CLOCK = time.thread_time
 STEP_FACTOR = 0.1
-"""Of the step sizes while steps are timed, as near the end of a fit."""
+"""Factor on the step sizes while steps are timed, as near the end of a fit."""
 
 STEPS = 10
 
@@ -36,7 +36,13 @@ N_IN_CACHE, N_TURNS, N_FUSED = 2048, 2000, 64
 
 
 def best_seconds(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Least time of several calls, after one that is not counted."""
+    """Least time of several calls, after one that is not counted.
+
+    Args:
+        call: to be timed.
+        repeats: number of timed calls.
+        clock: seconds since any fixed moment.
+    """
     call()
     seconds = []
     for _ in range(repeats):
@@ -89,14 +95,14 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
     """Pairs, pixels inside the cut-off, and seconds of one forward and one backward pass."""
     scene = head_scene(n_gaussians)
     cloud, planes = scene.cloud, scene.slices.planes
-    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, planes, CUTOFF_SIGMA)
     n_pixels, n_pairs = evaluations(cloud, planes, CUTOFF_SIGMA)
     out = np.zeros(planes.n_pixels, np.float32)
     buffers = np.zeros((1, n_gaussians, kernels.N_GRADIENTS))
     plane_gradient = np.zeros((len(planes), kernels.N_PLANE_GRADIENTS))
     described = PlaneArrays.of(planes, cloud.origin_mm)
-    work = Workspace.of(planes, pairs.most)
-    common = (CloudArrays.of(cloud), described, pairs.arrays, CUTOFF_SIGMA**2, True, work)
+    work = Workspace.of(planes, overlaps.most)
+    common = (CloudArrays.of(cloud), described, overlaps.arrays, CUTOFF_SIGMA**2, True, work)
 
     def forward() -> None:
         kernels.forward(*common, out)
@@ -113,7 +119,13 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
 
 
 def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, float]:
-    """The same of the dense reference in torch, which has no cut-off: every pair has every pixel."""
+    """Time one pass of the dense torch reference, which has no cut-off: every pair has every pixel.
+
+    Args:
+        n_gaussians: in the scene.
+        n_slices: in the scene.
+        repeats: passes, of which the fastest counts; at most three are made.
+    """
     scene = head_scene(n_gaussians, n_slices)
     leaves = [p.clone().requires_grad_() for p in scene.cloud.parameters]
     cloud = GaussianCloud.of(leaves, scene.cloud.origin_mm)

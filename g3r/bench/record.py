@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from g3r._version import __version__
-from g3r.errors import InputError
+from g3r.errors import InputError, cannot_be_written
+from g3r.run import atomic_file
+from g3r.run.machine import available_cores
 
 PACKAGES = ("numpy", "torch", "numba")
 """Whose versions decide speed."""
 
 
 def machine(n_threads: int | None = None) -> dict[str, Any]:
-    """What seconds depend on: processor, cores, memory, versions, and the commit of a checkout.
+    """The conditions of a timing: processor, cores, memory, versions, and the commit of a checkout.
 
     Args:
         n_threads: that the measurement used; as many as there are cores when None.
@@ -45,23 +47,6 @@ def machine_line(found: dict[str, Any]) -> str:
         f"Python {found['python']}, torch {found['torch']}, numba {found['numba']}; "
         f"g3r {found['g3r']}, commit {found['commit'] or 'unknown'}."
     )
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def use_threads(n_threads: int) -> None:
-    """Give both thread pools the same number, at most what the process was started with."""
-    import numba
-    import torch
-
-    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    numba.set_num_threads(min(n_threads, most))
-    torch.set_num_threads(min(n_threads, most))
 
 
 def add_output_arguments(parser: argparse.ArgumentParser, name: str, figure: str) -> None:
@@ -226,10 +211,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
+        atomic_file.write_text(path, text)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another --output") from None
+        raise cannot_be_written(path, error) from None

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from g3r.bench.record import add_output_arguments, machine, run_measurement, use_threads
+from g3r.bench.record import add_output_arguments, machine, run_measurement
 from g3r.errors import InputError
+from g3r.run.machine import use_up_to
 
 if TYPE_CHECKING:
     from g3r.acquisition.planes import Planes, Slices
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from g3r.gaussians import GaussianCloud
 
 STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "overlap search", "amplitudes", "volume"
-"""What is measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
+"""Operations measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
 
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, AMPLITUDES, WRITING)),
@@ -25,7 +26,7 @@ GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "pixels per slice": ("n_pixels", 1024, (STEP, AMPLITUDES)),
     "output voxels": ("n_voxels", 27_000, (WRITING,)),
 }
-"""What grows: its field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
+"""Sizes that grow: the field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
 
 PIXEL_FIELDS = ("n_pixels", "n_voxels")
 """These leave the number of pairs (nearly) as it is, whose set-up is then no part of what grows."""
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    use_threads(options.threads)
+    use_up_to(options.threads)
     record: dict[str, Any] = {"machine": machine(options.threads), "growing": {}}
     for name in GROWING:
         print(f"g3r-bench scaling: {name}", file=sys.stderr, flush=True)
@@ -97,11 +98,11 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
     cloud = made_cloud(size)
     volume, slices = made_volume_planes(size), made_slices(size, cloud)
     planes = volume if operations == (WRITING,) else slices.planes
-    pairs = find_overlaps(cloud, planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, planes, CUTOFF_SIGMA)
     calls = scene_calls(cloud, slices, volume)
     row: dict[str, Any] = {
         "size": _actual(field, size, slices.planes.shape[0], volume.shape[0]),
-        "pairs": len(pairs),
+        "pairs": len(overlaps),
         "evaluations": evaluations(cloud, planes, CUTOFF_SIGMA)[0],
         "seconds": {name: calls[name][0]() for name in operations},
         "bytes": {name: peak_extra_bytes(calls[name][1]) for name in operations},
@@ -115,7 +116,7 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
 def scene_calls(
     cloud: GaussianCloud, slices: Slices, volume: Planes
 ) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
-    """What gives the seconds of each operation, and a single call of it.
+    """For each operation a function for its seconds, and a single call of it.
 
     Args:
         cloud: Gaussians.
@@ -127,11 +128,11 @@ def scene_calls(
     from g3r.gaussians.render import CUTOFF_SIGMA
 
     weight = slices.mask.astype("float32")
-    pairs = find_overlaps(cloud, slices.planes, CUTOFF_SIGMA)
+    overlaps = find_overlaps(cloud, slices.planes, CUTOFF_SIGMA)
     single: dict[str, Callable[[], object]] = {
         SEARCH: lambda: find_overlaps(cloud, slices.planes, CUTOFF_SIGMA),
         AMPLITUDES: lambda: solve_amplitudes(
-            cloud, slices.planes, slices.value, weight, n_iterations=AMPLITUDE_ITERATIONS, pairs=pairs
+            cloud, slices.planes, slices.value, weight, n_iterations=AMPLITUDE_ITERATIONS, overlaps=overlaps
         ),
         WRITING: lambda: render(cloud, volume),
     }
@@ -179,7 +180,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
 
 
 def _actual(field: str, size: SceneSize, plane_shape: Any, volume_shape: Any) -> int:
-    """Sides are whole numbers, so pixels and voxels are not quite what was asked for."""
+    """Sides are whole numbers, so the numbers of pixels and voxels are only near those requested."""
     if field == "n_pixels":
         return int(plane_shape.prod())
     if field == "n_voxels":

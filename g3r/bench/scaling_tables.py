@@ -68,9 +68,9 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
     parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
     parts.append(
         "Exponents are slopes between logarithms, with their standard errors: over the largest decade of "
-        "sizes, where the fixed cost of a call no longer counts, and over all. The design has time as so "
-        "much per pair and so much per pixel evaluation, and predicts 1. Where pixels or voxels grow, pairs "
-        "do not: the judged exponent is that of the seconds less those of the same pairs with a pixel in "
+        "sizes, where the fixed cost of a call no longer counts, and over all. By design a pair and a pixel "
+        "evaluation each take a fixed time, which predicts 1. Where pixels or voxels grow, pairs "
+        "do not: the exponent under test is that of the seconds less those of the same pairs with a pixel in "
         "each corner of their planes (set-up). Elsewhere it is that of all seconds. "
         f"(!) is outside {MIN_EXPONENT:g} to {MAX_EXPONENT:g}. Seconds are CPU time, the least of "
         f"several calls; memory is what a call holds beyond its arguments. {machine_line(record['machine'])}"
@@ -79,7 +79,7 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
 
 
 def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Exponent | None:
-    """Of the largest decade, without the set-up of pairs where that was measured; None if nothing is left."""
+    """Exponent of the largest decade, without the set-up of pairs where that was measured; None if nothing remains."""
     cost = [row["seconds"][operation] - row.get("setup_seconds", {}).get(operation, 0.0) for row in rows]
     if min(cost[-2:]) <= 0:
         return None
@@ -89,7 +89,7 @@ def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Expone
 
 
 def exponents(rows: list[dict[str, Any]], operation: str, kind: str) -> tuple[Exponent, Exponent] | None:
-    """Of the largest decade and of all sizes; None where nothing was measured.
+    """Exponents of the largest decade and of all sizes; None where nothing was measured.
 
     Args:
         rows: of one growing size.

@@ -18,7 +18,7 @@ from g3r.gaussians.kernels import PROJECTION, project
 from g3r.geometry import VolumeGrid
 
 SEMI_AXES_MM = np.array([40.0, 48.0, 38.0])
-"""Of the ellipsoid that `head_scene` fills with Gaussians."""
+"""Semi-axes of the ellipsoid that `head_scene` fills with Gaussians."""
 
 SIGMA_PER_SPACING, LOG_SIGMA_SPREAD = 0.6, 0.25
 """Sigma of its Gaussians over the edge of their share of the head, as the fit seeds them; deviation of ln sigma."""
@@ -170,10 +170,10 @@ def evaluations(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> tu
         planes: K planes.
         cutoff_sigma: where a Gaussian ends.
     """
-    pairs = find_overlaps(cloud, planes, cutoff_sigma)
+    overlaps = find_overlaps(cloud, planes, cutoff_sigma)
     described = PlaneArrays.of(planes, cloud.origin_mm)
-    space = np.zeros(pairs.most, PROJECTION)
-    n_pixels, n_pairs = _count(CloudArrays.of(cloud).shapes, described, pairs.arrays, cutoff_sigma**2, space)
+    space = np.zeros(overlaps.most, PROJECTION)
+    n_pixels, n_pairs = _count(CloudArrays.of(cloud).shapes, described, overlaps.arrays, cutoff_sigma**2, space)
     return int(n_pixels), int(n_pairs)
 
 

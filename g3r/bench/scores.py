@@ -20,7 +20,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 
 @dataclass(frozen=True)
 class Quality:
-    """What a volume and its poses are worth.
+    """Scores of a volume and its poses.
 
     Attributes:
         psnr_db, ssim: of the volume in the truth's mask, after one rigid motion and an affine fit of the
@@ -43,8 +43,14 @@ class Quality:
 def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable) -> Quality:
     """Score a volume [I, J, K] and the slices' poses.
 
-    The volume may stand in another orientation than the truth, further than alignment reaches: the common
-    motion of the slices brings it near first.
+    The volume may be oriented too differently from the truth for alignment: the common motion of the slices
+    is applied first.
+
+    Args:
+        case: with the truth.
+        data: [I, J, K] reconstructed volume.
+        affine: [4, 4], world (RAS+, mm) from index.
+        poses: of the slices, as reconstructed.
     """
     error = target_registration_error(case.points_mm, case.true, poses)
     grid = VolumeGrid(data.shape, affine).moved(error.common)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from g3r.evaluation.case import SimulatedCase
 
 OUTSIDE_STAGES = "start-up, reading, writing"
-"""What the command does besides the stages that run.json times."""
+"""Name for the time outside the stages that run.json records."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,8 +43,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     from g3r.bench.command_run import infer_arguments, run_infer
-    from g3r.bench.record import available_cores, machine, use_threads
+    from g3r.bench.record import machine
     from g3r.evaluation.case import load_case
+    from g3r.run.machine import available_cores, use_up_to
 
     if not options.cases:
         raise InputError("no case given; expected folders written by g3r-simulate")
@@ -74,7 +75,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
                 rows[preset] = measured_command(case, arguments, output, options.repeats)
                 keep(record)
     if options.sweeps:
-        use_threads(threads)
+        use_up_to(threads)
         _measure_fits(cases[0], options, record)
     return record
 

@@ -9,7 +9,7 @@ from typing import Any
 from g3r.bench.record import machine_line, markdown_table
 
 ALLOWED_SECONDS = {"draft": 15.0, "fast": 30.0, "balanced": 75.0, "accurate": 240.0}
-"""Of the whole command, on two cores, for three stacks of a 30-week head."""
+"""Time limit of the whole command by preset, on two cores, for three stacks of a 30-week head."""
 
 ALLOWED_LOSS_DB = {"draft": 4.0, "fast": 1.5, "balanced": 0.5}
 """Against `accurate` on the same case."""
@@ -61,7 +61,7 @@ def sweep_offset(case: Mapping[str, Any], base: str) -> float:
 def pareto_front(seconds: Sequence[float], quality: Sequence[float]) -> list[int]:
     """Numbers of the points that no other reaches in less time and with better quality, fastest first.
 
-    Of points that are alike in both the first stays.
+    Among points with equal values the first is kept.
 
     Args:
         seconds: less is better.

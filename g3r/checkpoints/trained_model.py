@@ -75,7 +75,7 @@ class TrainedModel:
         raise NotImplementedError
 
     def in_words(self) -> str:
-        """What it is, in half a line."""
+        """Short description of the model."""
         raise NotImplementedError
 
     @staticmethod
@@ -129,15 +129,15 @@ class TrainedModel:
                 fit the network, or with values that make no sense.
         """
         file = source if isinstance(source, WeightsFile) else read_weights(Path(source or cls.shipped), cls.kind)
-        said = file.description
+        description = file.description
         _check_identity(file, cls.kind, {"format_version": FORMAT_VERSION, **cls.conventions})
         try:
-            config: NetworkConfig = config_from_plain(cls.config_type, said["network_arguments"])
+            config: NetworkConfig = config_from_plain(cls.config_type, description["network_arguments"])
             facts: dict[str, Any] = {
-                "training_data": text(said, "training_data"),
-                "validation": named_numbers(said, "validation"),
-                "g3r_version": text(said, "g3r_version"),
-                **cls.own_facts(said),
+                "training_data": text(description, "training_data"),
+                "validation": named_numbers(description, "validation"),
+                "g3r_version": text(description, "g3r_version"),
+                **cls.own_facts(description),
             }
             network = _filled(cls.network_type, config, file)
             model = cls(network=network, file_name=file.path.name, file_sha256=file.sha256, **facts)
@@ -145,7 +145,7 @@ class TrainedModel:
             raise InputError(f"{file.path}: is damaged (entry {error} is missing); {DAMAGED}") from error
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{file.path}: {one_line(error)}; {DAMAGED}") from error
-        if model.weights_sha256 != said.get("weights_sha256"):
+        if model.weights_sha256 != description.get("weights_sha256"):
             raise InputError(f"{file.path}: is damaged (the weights do not match their checksum); {DAMAGED}")
         return model
 
@@ -182,12 +182,12 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
 
 def _check_identity(file: WeightsFile, kind: str, expected: Mapping[str, object]) -> None:
     """Raise `InputError` for another kind of file, another version of its format, and other conventions."""
-    path, said = file.path, file.description
-    if said.get("format") != f"g3r-{kind}":
-        instead = f"format is {shown(said.get('format'))}, expected {f'g3r-{kind}'!r}"
+    path, description = file.path, file.description
+    if description.get("format") != f"g3r-{kind}":
+        instead = f"format is {shown(description.get('format'))}, expected {f'g3r-{kind}'!r}"
         raise InputError(f"{path}: is not a {kind} checkpoint ({instead}); {another_file(kind)}")
     for key, value in expected.items():
-        found = said.get(key)
+        found = description.get(key)
         if type(found) is not type(value) or found != value:  # True is not 1
             name, again = key.replace("_", " "), f"train and export a {kind} with this version of g3r"
             raise InputError(f"{path}: {name} is {shown(found)}, this g3r reads {value!r}; {again}")

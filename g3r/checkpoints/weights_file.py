@@ -11,13 +11,13 @@ import json
 import math
 import os
 import stat
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from g3r.errors import InputError
+from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,12 +40,12 @@ BYTES_PER_VALUE = {"F16": 2, "F32": 4, "I64": 8}
 
 
 class DamagedError(ValueError):
-    """What a file holds cannot be."""
+    """The content of a file is impossible."""
 
 
 @dataclass(frozen=True)
 class TensorClaim:
-    """What the header says about a tensor."""
+    """Dtype and shape of a tensor as the header states them."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -191,19 +191,13 @@ def write_weights(path: Path, description: Mapping[str, Any], tensors: Mapping[s
 
     # one entry: the library writes several in random order, and equal weights should be equal bytes
     content = save(dict(tensors), {DESCRIPTION_KEY: json.dumps(description)})
-    temporary = None
     try:
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content)
-        Path(temporary).chmod(0o644)  # mkstemp makes files that only their owner reads
-        Path(temporary).replace(path)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
     except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose a writable path") from error
 
 
 def another_file(kind: str) -> str:
-    """What to do about a file that is no exported network of this kind."""
+    """Advice for a file that is not an exported network of this kind."""
     return f"pass a {kind} network made by g3r-export, or leave it out to use the one that ships with g3r"

@@ -31,7 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
     parser.add_argument("--json", metavar="FILE", help="also write the scores here")
     parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
-    parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, mask-N.nii.gz beside it)")
+    parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, with mask-N.nii.gz in its folder)")
     parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser

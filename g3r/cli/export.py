@@ -94,12 +94,12 @@ def _weights(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_run(run: Path, entry: str) -> dict[str, Any]:
-    """Return a training checkpoint's content, or say in one line why there is none."""
+    """Return a training checkpoint's content, or explain in one line why there is none."""
     import torch
 
     expected = "expected a training checkpoint of g3r-pretrain, such as .../checkpoints/last.ckpt"
     try:
-        with warnings.catch_warnings(action="ignore"):  # the file's, which a refusal says better
+        with warnings.catch_warnings(action="ignore"):  # the file's, which the refusal replaces
             content = torch.load(run, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise InputError(f"{run}: no such file; {expected}") from error

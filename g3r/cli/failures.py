@@ -1,4 +1,4 @@
-"""What the machine could not give (memory, space on a disk), as one line and an exit code."""
+"""Failures of the machine (no memory, full disk) as one line and an exit code."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written
 EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
 """Errors that `line_and_code` may know; a defect of the program is none of them, or is raised again."""
 
-SAID_WITHOUT_MEMORY = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
-"""Words of numpy, torch, the loader of libraries and the system."""
+OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
+"""In the messages of numpy, torch, the loader of libraries and the system."""
 
 EXTRAS = {"evaluate": ("SimpleITK", "skimage"), "train": ("lightning", "torchio", "jsonargparse", "tensorboard")}
 """Packages, as they are imported, that only some commands need."""
@@ -32,9 +32,9 @@ def line_and_code(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError):
         if error.filename is not None:
             return str(cannot_be_written(error.filename, error)), InputError.exit_code
-        said = " ".join(str(error.strerror or error).split())
+        reason = " ".join(str(error.strerror or error).split())
         remedy = f"; {KERNEL_CACHE}" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
-        return f"a file could not be read or written ({said}){remedy}", InputError.exit_code
+        return f"a file could not be read or written ({reason}){remedy}", InputError.exit_code
     raise error
 
 
@@ -53,8 +53,8 @@ def missing_extra(error: ModuleNotFoundError) -> str:
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Whether an error, or one that led to it, means that memory could not be had."""
     while error is not None:
-        said = str(error).lower()
-        if isinstance(error, MemoryError) or any(words in said for words in SAID_WITHOUT_MEMORY):
+        message = str(error).lower()
+        if isinstance(error, MemoryError) or any(words in message for words in OUT_OF_MEMORY_WORDS):
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -147,7 +147,7 @@ def _interrupted(result: ReconstructionResult, folder: Path, stop_request: StopR
     if result.record.partial:
         line = f"{result.record.stopped_at}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
     else:
-        line = f"interrupted when the fit had ended: the result in {folder} is whole"
+        line = f"interrupted when the fit had ended: the result in {folder} is complete"
     return _failed(line, stop_request.exit_code)
 
 

@@ -9,7 +9,7 @@ from g3r._version import __version__
 from g3r.planning import PRESET_NAMES
 
 DEFAULTS = {"preset": "balanced", "space": "standard", "resolution": 0.8, "seed": 0}
-"""Of the options that --config takes the place of, --no-prior and --time-budget besides."""
+"""Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -33,7 +33,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--ckpt", metavar="PRIOR.safetensors", help="prior from g3r-export (default: the one shipped)")
     parser.add_argument(
-        "--pose-ckpt", metavar="POSE.safetensors", help="pose network and mean heads from g3r-export (default: shipped)"
+        "--pose-ckpt",
+        metavar="POSE.safetensors",
+        help="pose network and atlas template from g3r-export (default: shipped)",
     )
     parser.add_argument(
         "--space",

@@ -25,11 +25,11 @@ STARTED_S = time.monotonic()
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What the command is to do, once its input has proved good.
+    """The task of the command, once its input has been checked.
 
     Attributes:
         stacks: to reconstruct.
-        settings: that were asked for.
+        settings: as requested.
         memory: the settings that stay below the memory limit.
         reconstructor: with its networks loaded.
         inputs: hashes of all files.
@@ -49,7 +49,16 @@ class Task:
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
-    """Refuse what can be seen without reading an image; returns the files of networks, by kind."""
+    """Refuse what can be seen without reading an image; returns the files of networks, by kind.
+
+    Args:
+        options: of g3r-infer.
+        folder: for the results.
+        replaces: whether earlier results in the folder may be replaced.
+
+    Raises:
+        InputError: a file that is missing or cannot be used, or a folder that must not be written.
+    """
     from g3r.checkpoints.weights_file import read_weights
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.output_folder import check_output_folder
@@ -105,7 +114,7 @@ def _earlier(options: argparse.Namespace) -> RunRecord | None:
 
     earlier = RunRecord.read(options.config)
     if earlier.partial:
-        raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a whole result")
+        raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a complete result")
     n_then, n_now = len(earlier.stacks), len(options.stacks)
     if n_then != n_now and not options.thickness:
         raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
@@ -151,7 +160,7 @@ def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -
 
 
 def _plan(options: argparse.Namespace, settings: ReconstructionSettings, earlier: RunRecord | None) -> Plan:
-    """What is left of a time budget that began with the command, the earlier run's once more, or fixed settings."""
+    """Plan of the rest of a time budget, of the repeated budget of an earlier run, or of fixed settings."""
     from g3r.planning.plan import FixedPlan, RepeatedBudget
     from g3r.planning.time_budget import TimeBudget
 

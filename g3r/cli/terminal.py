@@ -1,4 +1,4 @@
-"""What a command shows while it works: progress bars, and log lines that wait until the input has proved good."""
+"""Progress bars, and log lines that are held back until the input has been checked."""
 
 from __future__ import annotations
 

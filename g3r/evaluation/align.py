@@ -75,7 +75,7 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> A
     for n, start in enumerate(_starts(fixed, moving)):
         try:
             found = _register(fixed, moving, fixed_mask, start, levels=(COARSE_SHRINK,), n_iterations=40)
-        except RuntimeError as error:  # ITK's way to say that nothing overlapped
+        except RuntimeError as error:  # ITK found no overlap
             logger.debug("a start was dropped: %s", " ".join(str(error).split())[-120:])
             continue
         if best is None or found[0] > best[0]:
@@ -107,7 +107,7 @@ def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | Non
 
     Args:
         volume: to be read; values that are not finite count as zero.
-        grid: of the answer.
+        grid: of the result.
         volume_from_grid: one motion of world space, from the grid to the volume; none when None.
     """
     same = volume.data.shape == grid.shape and np.allclose(volume.affine, grid.affine, atol=1e-4)

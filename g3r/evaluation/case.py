@@ -28,7 +28,7 @@ from g3r.geometry import RigidPose
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedCase:
-    """What a folder of `g3r-simulate` holds (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
+    """Content of a folder of `g3r-simulate` (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
 
     Attributes:
         name: of the folder.
@@ -91,7 +91,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
     """The true poses of a simulated subject, from `poses.tsv` or else `poses.json`.
 
     `poses.json` is a list of `stack`, `slice`, `rotation` [3, 3] and `center` [3]: the point (x, y) mm from
-    the middle of a slice's pixel grid, along the file's first two axes, truly lies at
+    the middle of a slice's pixel grid, along the file's first two axes, is truly at
     rotation (x, y, 0) + center.
 
     Raises:

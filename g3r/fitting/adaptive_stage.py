@@ -26,7 +26,7 @@ from g3r.geometry.grid import bounding_box
 from g3r.run.deadline import Deadline
 
 WINDOW_SHARE = 0.5
-"""Sigma of the neighbourhood in which the residual is judged, over the finest spacing."""
+"""Sigma of the neighbourhood over which the residual is averaged, over the finest spacing."""
 
 GROWTH = 1.7
 """Largest ratio of Gaussians after a round to those before it: new ones need the next fit to find their place."""
@@ -66,7 +66,7 @@ class AdaptiveSettings:
 
 @dataclass(kw_only=True)
 class Densification:
-    """What was done to a cloud on the way to the bound.
+    """Record of the rounds that brought a cloud to the bound.
 
     Attributes:
         bound: as in the settings.

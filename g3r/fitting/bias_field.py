@@ -1,6 +1,6 @@
-"""Smooth multiplicative bias field of each stack (receive-coil inhomogeneity), where stacks can tell it.
+"""Smooth multiplicative bias field of each stack (receive-coil inhomogeneity), where the stacks determine it.
 
-The coil stands still while the fetus moves, so the field belongs to a stack's header frame. Its logarithm is
+The coil is fixed while the fetus moves, so the field belongs to a stack's header frame. Its logarithm is
 a polynomial of second order in the stack's in-plane coordinates without a constant; what varies from slice to
 slice is the slices' gain. Stacks of different orientation see the same tissue under different fields, which
 determines the fields up to what they share; a small ridge keeps that part at zero.

@@ -1,4 +1,4 @@
-"""What a fit starts from: slices of order one, and the volumes that posed slices give by themselves."""
+"""Start of a fit: normalised slices, and the volumes that posed slices determine without a prior."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from g3r.geometry import VolumeGrid
 from g3r.registration import Registration
 
 MARGIN_MM = 5.0
-"""Of the prior's grid around the masked pixels."""
+"""Margin of the prior's grid around the masked pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class InitialVolumes:
 
 @dataclass(frozen=True, kw_only=True)
 class PriorVolume:
-    """What the fit starts from and is drawn to.
+    """Start and target of the fit.
 
     Attributes:
         volumes: the slices as they are fitted, and the volumes that they give.

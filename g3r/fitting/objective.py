@@ -115,7 +115,7 @@ class TermOverlaps:
 
     term: ImageTerm
     state: PlaneState
-    pairs: OverlapList
+    overlaps: OverlapList
     work: Workspace
 
 
@@ -180,8 +180,8 @@ class CloudObjective:
     def _search(self, name: str, term: ImageTerm, state: PlaneState) -> TermOverlaps:
         finder = self._finders.setdefault(name, OverlapFinder(len(self.shapes)))
         cutoff = term.cutoff_sigma + OVERLAP_MARGIN_SIGMA
-        pairs = finder.find(self.shapes, term.planes, state.rotation, state.center_mm, cutoff)
-        return TermOverlaps(term, state, pairs, Workspace.of(term.planes, pairs.most))
+        overlaps = finder.find(self.shapes, term.planes, state.rotation, state.center_mm, cutoff)
+        return TermOverlaps(term, state, overlaps, Workspace.of(term.planes, overlaps.most))
 
     def _moved(self, terms: Terms) -> bool:
         # the largest movement of any plane goes with the narrowest PSF of all: too early rather than too late
@@ -225,7 +225,7 @@ class LossStep:
         kernels.image_l1(
             CloudArrays(self.objective.shapes, self.objective.parameters.value["amplitude"]),
             planes,
-            held.pairs.arrays,
+            held.overlaps.arrays,
             term.cutoff_sigma**2,
             held.work,
             term.pixels,

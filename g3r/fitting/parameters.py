@@ -1,4 +1,4 @@
-"""What the optimiser moves: the cloud's arrays, poses and gains in one buffer, each with a step size."""
+"""Parameters of the optimiser: the cloud's arrays, poses and gains in one buffer, each with a step size."""
 
 from __future__ import annotations
 

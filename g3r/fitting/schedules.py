@@ -42,7 +42,13 @@ class AnnealedWeight:
 
 
 def cosine_decay(fraction: float, hold: float = 0.4, floor: float = 0.05) -> float:
-    """Step size factor: 1 until `hold`, then half a cosine down to `floor` at the end."""
+    """Step size factor: 1 until `hold`, then half a cosine down to `floor` at the end.
+
+    Args:
+        fraction: of the steps that are done, in [0, 1].
+        hold: fraction up to which the factor is 1.
+        floor: factor at the end.
+    """
     if fraction < hold:
         return 1.0
     along = (fraction - hold) / (1 - hold)

@@ -22,7 +22,7 @@ def slice_blocks(
     rates: LearningRates,
     optimise_poses: bool,
 ) -> dict[str, Block]:
-    """What is fitted along with the cloud: start values and step sizes, by name.
+    """Parameters fitted along with the cloud: start values and step sizes, by name.
 
     Args:
         slices: K slices.
@@ -36,7 +36,7 @@ def slice_blocks(
     if optimise_poses:
         blocks["rotation"] = np.zeros((n, 3)), rates.rotation_rad
         blocks["translation"] = np.zeros((n, 3)), rates.translation_mm
-    if n > 1:  # the gain of a single slice cannot be told from the amplitudes
+    if n > 1:  # the gain of a single slice cannot be separated from the amplitudes
         blocks["log_gain"] = np.log(gain), rates.log_gain
     if bias_field:
         blocks["bias_field"] = np.zeros((len(bias_field.stacks), N_TERMS)), rates.bias_field

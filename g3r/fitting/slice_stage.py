@@ -47,7 +47,7 @@ class SliceStageSettings:
         distillation_planes: share of the prior's planes in a step (random).
         optimise_poses: whether slices move.
         pose_prior_mm: movement from the registered pose at which the pose prior of a slice equals the mean residual;
-            holds slices of which the data say nothing.
+            holds slices that the data do not determine.
         reweight_every: steps between two estimates of the slice weights.
         optimise_bias_field: whether stacks have a smooth intensity field each (two stacks or more).
         bias_field_ridge: weight of the mean squared coefficient of the fields.
@@ -147,7 +147,7 @@ def fit_slices(
             cutoff_sigma=settings.cutoff_sigma,
             projection_bytes=settings.projection_bytes,
         )
-    several = slices.n_stacks > 1  # one stack cannot tell its bias field from anatomy
+    several = slices.n_stacks > 1  # one stack cannot separate its bias field from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
     blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses)
     parameters = FitParameters(cloud, settings.rates, blocks)

@@ -28,7 +28,7 @@ class AmplitudeSystem:
         cloud: its shapes; its amplitudes are not read.
         planes: K planes.
         gain: [K] intensity factors; 1 when None.
-        pairs: list from `find_overlaps`; made here when None.
+        overlaps: list from `find_overlaps`; made here when None.
         cutoff_sigma: where a Gaussian ends.
         projection_bytes: memory for projections; with less than they need they are made again in every product.
     """
@@ -39,18 +39,18 @@ class AmplitudeSystem:
         planes: Planes,
         *,
         gain: NDArray[np.floating] | None = None,
-        pairs: OverlapList | None = None,
+        overlaps: OverlapList | None = None,
         cutoff_sigma: float = CUTOFF_SIGMA,
         projection_bytes: int = MAX_PROJECTION_BYTES,
     ) -> None:
-        pairs = find_overlaps(cloud, planes, cutoff_sigma) if pairs is None else pairs
+        overlaps = find_overlaps(cloud, planes, cutoff_sigma) if overlaps is None else overlaps
         self.n_gaussians, self.n_pixels = len(cloud), planes.n_pixels
         self.cut = cutoff_sigma**2
         self.shapes = CloudArrays.of(cloud).shapes
-        self.planes, self.overlaps = PlaneArrays.of(planes, cloud.origin_mm, gain), pairs.arrays
-        self.parts = _parts(pairs.start, projection_bytes // PROJECTION.itemsize)
-        longest = max((int(pairs.start[b] - pairs.start[a]) for a, b in self.parts), default=0)
-        self.held = HeldProjections(pairs.start, np.zeros(longest, PROJECTION), np.zeros(len(planes), np.int64))
+        self.planes, self.overlaps = PlaneArrays.of(planes, cloud.origin_mm, gain), overlaps.arrays
+        self.parts = _parts(overlaps.start, projection_bytes // PROJECTION.itemsize)
+        longest = max((int(overlaps.start[b] - overlaps.start[a]) for a, b in self.parts), default=0)
+        self.held = HeldProjections(overlaps.start, np.zeros(longest, PROJECTION), np.zeros(len(planes), np.int64))
         self.images = Workspace.of(planes, 0).images
         self.is_set_up = False
 
@@ -100,7 +100,7 @@ def solve_amplitudes(
     gain: NDArray[np.floating] | None = None,
     n_iterations: int = 10,
     damping: float = 1e-3,
-    pairs: OverlapList | None = None,
+    overlaps: OverlapList | None = None,
     cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> GaussianCloud:
@@ -117,14 +117,14 @@ def solve_amplitudes(
         gain: [K] intensity factor of each plane.
         n_iterations: largest number of products with A and A^T.
         damping: relative; above zero keeps Gaussians that no pixel sees where they were.
-        pairs: list from `find_overlaps`.
+        overlaps: list from `find_overlaps`.
         cutoff_sigma: as in `render`.
         projection_bytes: see `AmplitudeSystem`; less memory, more seconds, the same result.
 
     Source: Hestenes and Stiefel (1952), in the CGLS order of operations (Bjoerck 1996, 7.4.1).
     """
     system = AmplitudeSystem(
-        cloud, planes, gain=gain, pairs=pairs, cutoff_sigma=cutoff_sigma, projection_bytes=projection_bytes
+        cloud, planes, gain=gain, overlaps=overlaps, cutoff_sigma=cutoff_sigma, projection_bytes=projection_bytes
     )
     start = cloud.amplitude.detach().double().numpy()
     residual = target.astype(np.float64) - system.forward(start)

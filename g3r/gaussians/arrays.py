@@ -1,4 +1,4 @@
-"""What the kernels read, grouped: numba takes a named tuple of arrays as it takes single arrays.
+"""Arguments of the kernels in groups: numba takes a named tuple of arrays as it takes single arrays.
 
 What a parallel kernel writes is an argument of its own: numba does not see that an array from a tuple is the caller's,
 and drops a loop that writes nothing else. Scratch space may be grouped, since what is written there is read again.

@@ -8,7 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from g3r.errors import InputError
+from g3r.run.atomic_file import atomic_path
 
 SIGMA_RANGE_MM = (1e-6, 1e6)
 """No structure of a head is outside this range; beyond it the kernels' integers and float32 overflow."""
@@ -107,17 +107,19 @@ class GaussianCloud:
         return replace(self, amplitude=amplitude)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as .npz with float32 arrays named like the fields (atomically)."""
+        """Write an .npz with float32 arrays named like the fields, whole or not at all.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         arrays = {
             name: getattr(self, name).detach().cpu().numpy().astype(np.float32)
             for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays, origin_mm=self.origin_mm)
-        path = Path(path)
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.write_bytes(buffer.getvalue())
-        os.replace(beside, path)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> GaussianCloud:
@@ -132,23 +134,3 @@ class GaussianCloud:
                 return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
-
-
-def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] of any length but zero."""
-    # by the largest entry first: squares of 1e-30 are zero in float32, and no epsilon knows their size
-    largest = quaternion_wxyz.detach().abs().amax(1, keepdim=True)
-    scaled = quaternion_wxyz / largest
-    w, x, y, z = (scaled / scaled.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, 1).reshape(-1, 3, 3)

@@ -11,8 +11,9 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from g3r.gaussians.cloud import GaussianCloud, rotation_from_quaternion
+from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
+from g3r.geometry.quaternion import rotation_from_quaternion
 
 WIDEST = 3.0
 """Largest sigma of a new Gaussian, over that of the filter that found it."""

@@ -21,7 +21,7 @@ from g3r.gaussians.simd import N_LANES, add_strip
 f32 = np.float32
 
 LOOSE = {"contract", "arcp", "nsz"}
-"""What the compiler may do to sums here; NaN keeps its meaning, because comparisons guard against it."""
+"""How the compiler may transform sums; NaN keeps its meaning, because comparisons guard against it."""
 
 SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""

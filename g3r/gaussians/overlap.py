@@ -31,7 +31,7 @@ class OverlapList:
 
     @property
     def arrays(self) -> OverlapArrays:
-        """What the kernels take."""
+        """The arrays for the kernels."""
         return OverlapArrays(self.start, self.gaussian)
 
 

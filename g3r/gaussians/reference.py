@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from g3r.acquisition.planes import Planes
-from g3r.gaussians.cloud import GaussianCloud, rotation_from_quaternion
+from g3r.gaussians.cloud import GaussianCloud
+from g3r.geometry.quaternion import rotation_from_quaternion
 
 PAIRS_AT_ONCE = 4_000_000
 

@@ -36,7 +36,7 @@ def render(
     backend: str = "numba",
     attenuation: str = "exact",
     cutoff_sigma: float = CUTOFF_SIGMA,
-    pairs: OverlapList | None = None,
+    overlaps: OverlapList | None = None,
 ) -> Tensor:
     """Pixels of planes through their PSF, differentiable in cloud, poses and gains.
 
@@ -52,7 +52,7 @@ def render(
             cut-off).
         attenuation: "exact", or "printed" for B = 1 as in the printed G3R Eq. 5 (for comparison).
         cutoff_sigma: where a Gaussian ends, up to 6 (numba only).
-        pairs: list from `find_overlaps`, to be used again while nothing moves far (numba only).
+        overlaps: list from `find_overlaps`, to be used again while nothing moves far (numba only).
 
     Returns:
         [P] pixels, plane after plane, in C order inside a plane.
@@ -81,11 +81,11 @@ def render(
         widest = float(cloud.log_scale.detach().max().double().exp() / planes.spacing_mm.min())
         if widest > kernels.MAX_PIXELS / 10:
             raise ValueError(f"a sigma is {widest:.2g} pixels wide; expected at most {kernels.MAX_PIXELS / 10:g}")
-    if pairs is None:
-        pairs = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
+    if overlaps is None:
+        overlaps = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
     exact = attenuation == "exact"
     pixels: Tensor = _Render.apply(
-        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, pairs, cutoff_sigma, exact
+        *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, overlaps, cutoff_sigma, exact
     )
     return pixels
 
@@ -111,15 +111,15 @@ class _Render(torch.autograd.Function):
         log_gain: Tensor | None,
         origin_mm: NDArray[np.float64],
         planes: Planes,
-        pairs: OverlapList,
+        overlaps: OverlapList,
         cutoff_sigma: float,
         exact: bool,
     ) -> Tensor:
         moved = moved_planes(planes, twist)
         gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
         cloud = GaussianCloud.of((mean, log_scale, quaternion, amplitude), origin_mm)
-        work = Workspace.of(planes, pairs.most)
-        given = (CloudArrays.of(cloud), PlaneArrays.of(moved, origin_mm, gain), pairs.arrays, cutoff_sigma**2, exact)
+        work = Workspace.of(planes, overlaps.most)
+        given = (CloudArrays.of(cloud), PlaneArrays.of(moved, origin_mm, gain), overlaps.arrays, cutoff_sigma**2, exact)
         out = np.zeros(planes.n_pixels, np.float32)
         kernels.forward(*given, work, out)
         ctx.saved = (given, work, cloud, twist)

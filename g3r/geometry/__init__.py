@@ -1,4 +1,4 @@
-"""Rigid poses (`rigid`) and voxel grids (`grid`), all in float64. Imports nothing of ours."""
+"""Rigid poses (`rigid`), voxel grids (`grid`) in float64, and rotations from quaternions in torch (`quaternion`)."""
 
 from g3r.geometry.grid import VolumeGrid
 from g3r.geometry.rigid import RigidPose

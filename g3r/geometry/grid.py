@@ -135,7 +135,7 @@ def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, 
     Args:
         data: [I, J, K] on `source`.
         source: its grid.
-        target: the grid of the answer.
+        target: the grid of the result.
         outside: value where `source` does not reach.
     """
     if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Selection = NDArray[np.integer] | NDArray[np.bool_] | Sequence[int] | slice
-"""What `take` accepts: indices, a mask or a slice."""
+"""Argument of `take`: indices, a mask or a slice."""
 
 ORTHONORMALITY_TOLERANCE = 1e-6
 """Largest accepted entry of R R^T - 1; a rotation read from text has about 1e-7."""

@@ -1,1 +1,1 @@
-"""What a reconstruction gives: the result, its record, files and pictures."""
+"""Output of a reconstruction: the result, its record, files and pictures."""

@@ -41,13 +41,13 @@ PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of t
 
 @dataclass(frozen=True, kw_only=True)
 class StageResults:
-    """What the stages of a run gave.
+    """Results of the stages of a run.
 
     Attributes:
         stacks: as they were given.
         registration: poses of their slices.
         prior: the prior volume and what it was made of.
-        intensity: what 1 stands for in the fit.
+        intensity: intensity of 1 in the fit.
         cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
             volume less well than that volume does.
         fit: of the fit to the slices; None before it.

@@ -58,7 +58,7 @@ def slice_table(
 
 
 def _reason(gain: float, ncc: float, size_share: float) -> str:
-    """Why a slice is down-weighted, as far as its figures tell."""
+    """Why a slice is down-weighted, as far as its figures show."""
     if gain < LOST_SIGNAL_GAIN:
         return "signal loss"
     if size_share < SMALL_SHARE:

@@ -1,4 +1,4 @@
-"""run.json as a record: what is needed to judge a result and to run it again; file names only, no paths."""
+"""run.json as a record: what is needed to assess a result and to run it again; file names only, no paths."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class InactiveTerm:
 
 @dataclass(frozen=True, kw_only=True)
 class CommandRecord:
-    """What `g3r-infer` was told."""
+    """Arguments of `g3r-infer`."""
 
     stacks: list[str]
     preset: str | None
@@ -269,7 +269,7 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: 
     if len(slices) == 1:
         found.append(InactiveTerm("gain of the slice", "a single slice: amplitudes explain its gain as well"))
     if single:
-        found.append(InactiveTerm("bias field", "a single stack cannot tell it from anatomy"))
+        found.append(InactiveTerm("bias field", "a single stack cannot separate it from anatomy"))
     elif not stage.optimise_bias_field:
         found.append(InactiveTerm("bias field", "switched off in the settings"))
     if not stage.optimise_poses:
@@ -283,7 +283,7 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: 
         share, spacing_mm = 1 - gaussians["share_over_bound"], gaussians["finest_spacing_mm"]
         reason = (
             f"the Gaussians are within {gaussians['bound']:g} (local root mean square) of the prior volume for "
-            f"{100 * share:.1f} % of the head, or {spacing_mm:.2f} mm apart, as close as pixels can tell"
+            f"{100 * share:.1f} % of the head, or {spacing_mm:.2f} mm apart, as close as pixels resolve"
         )
         found.append(InactiveTerm("finer Gaussians", reason))
     return found

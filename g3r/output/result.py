@@ -1,4 +1,4 @@
-"""What a reconstruction gives, and the folder that it is written to."""
+"""The result of a reconstruction, and the folder that it is written to."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class ReconstructionResult:
             raise cannot_be_written(folder, error, self._max_bytes()) from None
 
     def _max_bytes(self) -> int:
-        """What the files take together if nothing could be compressed, but for the picture and tables."""
+        """Size of the uncompressed files together, without the picture and tables."""
         arrays = [getattr(self, one.name) for one in fields(self)]
         arrays += [tensor.numpy() for tensor in self.cloud.parameters]
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
@@ -113,7 +113,7 @@ class ReconstructionResult:
     def _write(self, folder: Path) -> None:
         maps = {name: self.grid for name in ("volume", "mask", "uncertainty", "prior_share")}
         maps |= {name: self.prior_grid for name in ("prior", "coarse", "density")}
-        with ThreadPoolExecutor() as pool:  # compression runs beside the drawing of sections
+        with ThreadPoolExecutor() as pool:  # compression runs while the sections are drawn
             saved = [
                 pool.submit(save_volume, folder / f"{name}.nii.gz", data, grid.affine, self.header_text)
                 for name, grid in maps.items()
@@ -153,12 +153,12 @@ class ReconstructionResult:
         )
 
     def _title(self) -> str:
-        """What must be known before the picture is believed."""
+        """Warnings that belong on the picture."""
         lines = []
         if self.record.stopped_at:
             lines.append(f"PARTIAL: {self.record.stopped_at}")
         if self.record.registration and self.record.registration.reliable is False:
-            lines.append("REGISTRATION DOUBTFUL: do not trust this volume (see run.json)")
+            lines.append("REGISTRATION UNRELIABLE: do not rely on this volume (see run.json)")
         return "; ".join(lines)
 
 

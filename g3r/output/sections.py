@@ -89,7 +89,7 @@ def save_sections(
             by the nearest anatomical direction.
         mask: [I, J, K]; the sections go through the middle of it and are cropped around it.
         maps: names of the volumes that are maps.
-        captions: what a row shows, in a few words beside its name.
+        captions: what a row shows, in a few words next to its name.
         ranges: values of the two ends of the bar, for maps that have natural ones.
         title: a line above.
 

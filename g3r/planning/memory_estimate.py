@@ -23,13 +23,13 @@ from g3r.run.machine import held_bytes
 GRID_SLACK = 1.1
 """Voxels over those of the box at header poses: heads that were turned into the atlas frame."""
 
-PAIR_BYTES = 48
-"""A kept record of a pair (`gaussians.kernels.PAIR`)."""
+PROJECTION_BYTES = 48
+"""A kept projection of a Gaussian on a plane (`gaussians.kernels.PROJECTION`)."""
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """What each stage holds at most, in bytes, the process with its libraries included."""
+    """Peak memory of each stage in bytes, including the process with its libraries."""
 
     stages: dict[Stage, int]
 
@@ -40,7 +40,7 @@ class MemoryEstimate:
 
     @property
     def peak(self) -> int:
-        """What that one needs."""
+        """Memory of that stage in bytes."""
         return self.stages[self.stage]
 
     def line(self) -> str:
@@ -50,7 +50,7 @@ class MemoryEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSizes:
-    """What the estimate is made of: counts, none of them in bytes."""
+    """Counts that the estimate is made from."""
 
     n_pixels: int
     prior_shape: tuple[int, ...]
@@ -83,15 +83,15 @@ def estimate_memory(
     start = held_bytes() if process_bytes is None else process_bytes
     buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
-    resting = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
-    volumes = resting + VOLUMES_PER_VOXEL * voxels
-    records = min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
+    base = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
+    volumes = base + VOLUMES_PER_VOXEL * voxels
+    projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
-    prior_records = min(PAIR_BYTES * sizes.n_pairs, settings.prior_stage.projection_bytes)
+    prior_projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.prior_stage.projection_bytes)
     outputs = volumes + OUTPUTS_PER_VOXEL * output + cloud
     stages = {
-        Stage.LOADING: resting,
-        Stage.REGISTRATION: resting + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
+        Stage.LOADING: base,
+        Stage.REGISTRATION: base + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,
         Stage.COARSE: volumes + COARSE_PER_PIXEL * n_pixels + 4 * (COARSE_VOLUMES + buffers) * voxels,
     }
     if settings.use_prior:
@@ -99,12 +99,12 @@ def estimate_memory(
         begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
         stages[Stage.PRIOR] = volumes + begin + per_voxel * seen + 16 * voxels
     stages |= {
-        Stage.FIT_TO_PRIOR: volumes + cloud + prior_records + TARGET_PER_VOXEL * voxels,
-        Stage.FIT_TO_SLICES: volumes + cloud + records + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
+        Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
+        Stage.FIT_TO_SLICES: volumes + cloud + projections + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
         Stage.VOLUME: outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
     if settings.use_prior:
-        stages[Stage.PRIOR_SHARE] = outputs + records + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
+        stages[Stage.PRIOR_SHARE] = outputs + projections + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages[Stage.UNCERTAINTY] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
     stages[Stage.WRITING] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
@@ -137,7 +137,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
     spacing_mm = gaussian_spacing_mm(slices, settings.gaussian_spacing_pixels)
     n_gaussians = head_volume_mm3(slices) / spacing_mm**3
     n_stacks = slices.n_stacks
-    # a Gaussian reaches so far along a plane's normal, and so many planes of a stack lie within
+    # how far a Gaussian reaches along a plane's normal, and how many planes of a stack that covers
     reach_mm = (
         2
         * (settings.slice_stage.cutoff_sigma + 1)
@@ -156,7 +156,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
 
 
 def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> float:
-    """What the prior network sees at a time."""
+    """Voxels that the prior network sees at a time."""
     n_voxels = GRID_SLACK * math.prod(shape)
     if n_voxels <= settings.prior_whole_voxels:
         return n_voxels

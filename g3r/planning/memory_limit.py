@@ -11,7 +11,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
-from g3r.planning.memory_estimate import PAIR_BYTES, MemoryEstimate, ProblemSizes, estimate_memory, sizes_of
+from g3r.planning.memory_estimate import PROJECTION_BYTES, MemoryEstimate, ProblemSizes, estimate_memory, sizes_of
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage
@@ -46,7 +46,7 @@ class MemoryPlan:
     at_once: bool = False
 
     def record(self) -> MemoryRecord:
-        """What run.json says."""
+        """The entry of run.json."""
         return MemoryRecord(self.estimate.peak, self.estimate.stage, self.limit_bytes, self.changes)
 
 
@@ -116,7 +116,7 @@ def plan_for_stacks(
     limit_bytes: int | None,
     prior_voxel_mm: float | None = None,
 ) -> MemoryPlan:
-    """`plan_memory` for this process as it is; has it give memory back at once where the plan says so.
+    """`plan_memory` for this process as it is; makes it return memory to the system at once where the plan requires it.
 
     Args:
         stacks: that will be reconstructed.
@@ -150,7 +150,7 @@ class Estimator(Protocol):
     """`estimate_memory` of one problem."""
 
     def __call__(self, of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
-        """What settings need."""
+        """Memory that settings need."""
         ...
 
 
@@ -166,11 +166,11 @@ def _lowered(
     if at_once:
         changes.append("memory limit: freed memory is given back at once (slower)")
     stages = estimate(settings, at_once).stages
-    with_records = max(stages.get(name, 0) for name in STAGES_WITH_PROJECTIONS)
-    less = _fewer_projections(settings, sizes, with_records - limit)
+    with_projections = max(stages.get(name, 0) for name in STAGES_WITH_PROJECTIONS)
+    less = _fewer_projections(settings, sizes, with_projections - limit)
     if less is not settings:
         kept = less.slice_stage.projection_bytes
-        changes.append(f"memory limit: pairs kept in {kept / 1e6:.0f} MB, else set up again (slower)")
+        changes.append(f"memory limit: projections kept in {kept / 1e6:.0f} MB, others computed again (slower)")
     tiled = _smaller_tiles(less, lambda of: estimate(of, at_once).peak, limit)
     if tiled is not less:
         edge = tiled.prior_tile_voxels
@@ -182,8 +182,8 @@ def _lowered(
 def _fewer_projections(
     settings: ReconstructionSettings, sizes: ProblemSizes, excess_bytes: int
 ) -> ReconstructionSettings:
-    """Settings whose records of pairs take so many bytes less."""
-    own = round(min(PAIR_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes))
+    """Settings whose kept projections take `excess_bytes` less."""
+    own = round(min(PROJECTION_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes))
     kept = max(own - max(excess_bytes, 0), MIN_PROJECTION_BYTES)
     if kept >= own:
         return settings

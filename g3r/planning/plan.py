@@ -15,7 +15,7 @@ from g3r.run.deadline import Deadline, LoopRecord
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetRecord:
-    """What a time budget chose; fields are None where the run ended before the choice.
+    """Choices of a time budget; fields are None where the run ended before the choice.
 
     Attributes:
         seconds: that were given.
@@ -53,13 +53,23 @@ class Plan(Protocol):
     def for_fit_to_prior(
         self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
     ) -> Deadline | None:
-        """Decide Gaussians and steps of both stages of the fit; returns when the first has to end."""
+        """Decide Gaussians and steps of both stages of the fit.
+
+        Args:
+            volumes: posed slices and their volumes.
+            prior: [I, J, K] V_prior on their grid.
+            coarse_s: seconds that V_coarse and V_sharp took.
+            n_output_voxels: voxels of the volume to be written.
+
+        Returns:
+            Deadline of the first stage; None for no deadline.
+        """
 
     def for_fit_to_slices(self) -> Deadline | None:
         """When the second stage of the fit has to end."""
 
     def record(self) -> BudgetRecord | None:
-        """What was decided; None where nothing was."""
+        """The decisions; None where there were none."""
 
 
 @dataclass
@@ -78,7 +88,10 @@ class FixedPlan:
     def for_fit_to_prior(
         self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
     ) -> Deadline | None:
-        """No deadline."""
+        """No deadline.
+
+        Args: see `Plan`.
+        """
         return None
 
     def for_fit_to_slices(self) -> Deadline | None:
@@ -110,7 +123,10 @@ class RepeatedBudget(FixedPlan):
     def for_fit_to_prior(
         self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
     ) -> Deadline:
-        """Repeat the loops."""
+        """Repeat the loops.
+
+        Args: see `Plan`.
+        """
         return self.deadline
 
     def for_fit_to_slices(self) -> Deadline:
@@ -118,5 +134,5 @@ class RepeatedBudget(FixedPlan):
         return self.deadline
 
     def record(self) -> BudgetRecord:
-        """What the earlier run decided."""
+        """The decisions of the earlier run."""
         return self.earlier

@@ -1,4 +1,4 @@
-"""What the presets mean: one record of settings for the whole reconstruction."""
+"""The presets: one record of settings for the whole reconstruction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, la
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionSettings:
-    """Everything that decides a result, besides the data and the prior's weights.
+    """Everything that decides a result, apart from the data and the prior's weights.
 
     Args:
         resolution_mm: voxel size of the volume.
@@ -115,7 +115,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
     """The settings as they hold for a single stack, or for several.
 
     Args:
-        settings: that were asked for.
+        settings: as requested.
         n_stacks: with slices.
     """
     stage = settings.slice_stage

@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Stage(StrEnum):
-    """What a run goes through, in order; the value is what people and run.json read."""
+    """Stages of a run, in order; the values are shown to users and written to run.json."""
 
     LOADING = "loading"
     REGISTRATION = "registration"

@@ -2,7 +2,7 @@
 
 Before registration only the budget is known, so that it alone decides how registration searches; its loops
 end by the clock. After it the slices are in place, one optimiser step has been timed, and the most careful
-preset is taken whose steps fit. Every loop has a deadline besides, so that an estimate that was wrong costs
+preset is taken whose steps fit. Every loop also has a deadline, so that an estimate that was wrong costs
 steps and not the time that was promised.
 """
 
@@ -33,23 +33,23 @@ REGISTRATION_FROM_S = {"draft": 0.0, "fast": 22.0, "balanced": 40.0, "accurate":
 cores, from one preset to the next."""
 
 REGISTRATION_SHARE = 0.5
-"""Of the time left, the most that registration may take."""
+"""Largest share of the remaining time that registration may take."""
 
 PRIOR_STAGE_SHARE = 0.35
-"""Of the time for both stages of the fit, the most that the first may take."""
+"""Largest share of the time of both stages of the fit that the first may take."""
 
 STEPS_ENOUGH = 0.7
-"""A preset is taken if so many of its steps fit: more Gaussians than can be fitted are worse than fewer."""
+"""Share of a preset's steps that must fit for it to be taken: too many Gaussians to fit are worse than fewer."""
 
 COARSE_PER_VIEW = 1.2
 """Seconds of one view of the prior network over those of V_coarse and V_sharp on the same voxels."""
 
 VIEWS_SHARE = 0.2
-"""Of the time left, the most that views of the prior beyond the first may take."""
+"""Largest share of the remaining time that views of the prior beyond the first may take."""
 
 COARSE_AT_END = 0.9
 """Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
-output of as many voxels; the picture and the files take `WRITING_S` besides."""
+output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
@@ -57,10 +57,10 @@ TOO_LITTLE = 4.0
 """With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first."""
 
 SHARE_STEPS = 18
-"""A probe for the map of the prior's share costs as much as so many optimiser steps."""
+"""Optimiser steps that take as long as one probe for the map of the prior share."""
 
 PROBE_EVERY = 4
-"""Every so many slices are rendered to time a step."""
+"""One in this many slices is rendered to time a step."""
 
 COST_EXPONENT = 0.6
 """A step takes seconds as this power of the number of Gaussians in a head: smaller ones have fewer pixels."""
@@ -188,13 +188,13 @@ class TimeBudget:
         return self.fit_deadline.part(PRIOR_STAGE_SHARE)
 
     def record(self) -> BudgetRecord:
-        """What was decided, for run.json."""
+        """The decisions, for run.json."""
         loops = self.deadline.loop_record.loops if self.deadline.loop_record else []
         return BudgetRecord(seconds=self.given_s, loops=loops, **self.choices)
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:
-    """What both stages would take with the settings of a preset.
+    """Seconds of both stages with the settings of a preset.
 
     Args:
         preset: whose spacing, rounds and steps.
@@ -216,11 +216,17 @@ def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: f
 
 
 PRIOR_STEP, AMPLITUDE_STEP = 0.35, 0.8
-"""Seconds of a step of stage 1, and of one conjugate-gradient step for the peaks, over a step of stage 2."""
+"""Seconds of a step of stage 1, and of one conjugate-gradient step for the amplitudes, over a step of stage 2."""
 
 
 def timed_step(cloud: GaussianCloud, slices: Slices, rng: np.random.Generator) -> float:
-    """Seconds of one step of the slice stage, from a few steps on a part of the slices."""
+    """Time one step of the slice stage, in seconds, by a few steps on a subset of the slices.
+
+    Args:
+        cloud: to fit; left as it is.
+        slices: all slices; the result is scaled to their number.
+        rng: draws what the steps draw.
+    """
     part = slices.take(np.arange(0, len(slices), min(PROBE_EVERY, max(1, len(slices) // 4))))
     ones = np.ones(len(part))
     seconds = []

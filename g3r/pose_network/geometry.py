@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from g3r.geometry.quaternion import rotation_from_unit_quaternion
+
 MIN_SINGULAR_SUM = 0.05
 """Below it (two singular values cancel: the rotation is not determined) gradients are held back."""
 
@@ -48,37 +50,49 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Rotations [S, 3, 3] of vectors [S, 3]: the unit quaternion along (1, v / 2); about v rad when small."""
     quaternion = torch.nn.functional.normalize(torch.cat([torch.ones_like(vector[:, :1]), vector / 2], dim=1), dim=1)
-    w, x, y, z = quaternion.unbind(1)
-    entries = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(entries, 1).reshape(-1, 3, 3)
+    return rotation_from_unit_quaternion(quaternion)
 
 
 def group_mean(value: Tensor, group: Tensor, n_groups: int) -> Tensor:
-    """Means [G, ...] of values [S, ...] by their group's number [S]."""
+    """Average values by group; a group without values has mean 0.
+
+    Args:
+        value: [S, ...].
+        group: [S] group of each value, 0 to G - 1.
+        n_groups: G.
+
+    Returns:
+        [G, ...].
+    """
     total = value.new_zeros(n_groups, *value.shape[1:]).index_add(0, group, value)
     count = torch.bincount(group, minlength=n_groups).clamp_min(1).to(value.dtype)
     return total / count.reshape(-1, *[1] * (value.dim() - 1))
 
 
 def pixel_points_mm(size: int, pixel_mm: float, like: Tensor) -> Tensor:
-    """Positions [N * N, 3] of the pixels of a square image in its own frame."""
+    """Positions [N * N, 3] of the pixels of a square image in its own frame.
+
+    Args:
+        size: N, pixels per edge.
+        pixel_mm: pixel size.
+        like: gives dtype and device.
+    """
     at = (torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2) * pixel_mm
     x, y = torch.meshgrid(at, at, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
 
 
 def moved_points(rotation: Tensor, translation_mm: Tensor, points_mm: Tensor) -> Tensor:
-    """Points [P, 3] after each of S motions, [S, P, 3], whatever autocast is around it."""
+    """Apply S rigid motions to P points, in full precision under autocast too.
+
+    Args:
+        rotation: [S, 3, 3].
+        translation_mm: [S, 3].
+        points_mm: [P, 3], the same for all motions.
+
+    Returns:
+        [S, P, 3], in mm.
+    """
     with torch.autocast(points_mm.device.type, enabled=False):
         return points_mm @ rotation.transpose(1, 2) + translation_mm[:, None]
 

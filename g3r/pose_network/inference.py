@@ -17,7 +17,7 @@ N_REFINEMENTS = 2
 VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
 """Rotations by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
 
-The network sees all four and the answers are averaged, which takes a fifth off the error.
+The network sees all four and the results are averaged, which takes a fifth off the error.
 """
 VIEW_SCALE_MM = 3.0
 """Views further than this from the mean count less in it, in proportion."""
@@ -81,7 +81,7 @@ def stack_motions(atlas_from_slice: RigidPose, world_from_slice: RigidPose, stac
     """One motion per stack, atlas frame from world, that most of its slices agree with.
 
     The start is the slice whose own motion suits the others best in the median, so that a minority of
-    slices that are upside down has no say; then weighted least squares with weights 1 / distance.
+    slices that are upside down has no effect; then weighted least squares with weights 1 / distance.
 
     Args:
         atlas_from_slice: predicted poses [K].

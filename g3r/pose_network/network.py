@@ -22,7 +22,7 @@ from g3r.pose_network.geometry import (
 )
 
 WAVELENGTHS_MM = (200.0, 100.0, 50.0, 25.0)
-"""Of the codes of a slice's position along its stack."""
+"""Wavelengths of the codes of a slice's position along its stack."""
 TRANSLATION_SCALE_MM = 20.0
 RESIDUAL_SCALE_RAD = 0.3
 RESIDUAL_SCALE_MM = 8.0
@@ -44,7 +44,7 @@ Disturbance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class PoseStep(NamedTuple):
-    """What one step of the network says: poses atlas frame from image frame, and the votes behind them.
+    """Output of one step of the network: poses atlas frame from image frame, and the votes behind them.
 
     Attributes:
         rotation: [S, 3, 3].
@@ -157,7 +157,7 @@ class PoseNetwork(nn.Module):
         stack, set_of_stack = batch["stack"], batch["set_of_stack"]
         heads = smoothed(self.template.permute(3, 0, 1, 2))
         points = moved_points(rotation, translation_mm, plane)
-        # a quarter of the pixels is enough to tell an age
+        # a quarter of the pixels is enough to determine the age
         some = sample_rows(heads.permute(1, 2, 3, 0), points[:, ::4], spacing_mm)
         age = best_age(some, value[:, ::4], set_of_stack[stack], int(set_of_stack.max()) + 1)
         head = [

@@ -1,4 +1,7 @@
-"""The density gate of Eq. 7: where the geometry is dense, trust it; where it is sparse, trust the network."""
+"""The density gate of Eq. 7 lets more of the network's residual F through where the sampling density is low.
+
+The shipped network was trained on hardly any voxels that no slice had measured, and adds little there.
+"""
 
 import math
 
@@ -31,7 +34,7 @@ class DensityGate(nn.Module):
 
     Raises:
         ValueError: unless 0 <= alpha <= beta <= 1 and beta > 0, all finite. (A larger beta would only
-            rescale the unconstrained network; alpha > beta would trust the network where the data are dense.)
+            rescale the unconstrained network; alpha > beta would let most of it through where the data are dense.)
 
     Numerics: exp(-M) and expm1(-M) are bounded for every M >= 0, so the value and its gradient
         (alpha - beta) exp(-M) are finite for M = 0, 1e-30 and 1e6. M must not be negative: that is a

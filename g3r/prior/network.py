@@ -34,7 +34,7 @@ class ResidualRefiner(nn.Module):
     sub-pixel step comes back, and two light convolutions at full resolution see the input again.
 
     The density enters as c = 1 - exp(-M) rather than as M: M is unbounded (hundreds under an output grid
-    much finer than the slices), c lies in [0, 1], has slope 1 at 0, and is what the gate uses.
+    much finer than the slices), c is in [0, 1], has slope 1 at 0, and is what the gate uses.
 
     The last convolution starts at zero, so training starts from V_coarse.
 

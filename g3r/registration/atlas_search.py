@@ -1,4 +1,4 @@
-"""Where an unknown head lies: its stacks against atlas templates, in all orientations.
+"""Pose of an unknown head, from its stacks against atlas templates in all orientations.
 
 The search is exhaustive and cheap: a few thousand orientations of a few thousand pixels. It gives capture
 range (a head in any orientation, motion segments 25 degrees apart) and the standard orientation of the result.

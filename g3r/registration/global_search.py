@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What the search found.
+    """Result of the search.
 
     Args:
         motion: [K] world from header.

@@ -1,6 +1,6 @@
 """Motion segments between jerks: the most likely sequence of motions in time, among candidates.
 
-A fetus lies still, jerks, and lies still again. So the motions of a stack's slices, in the order of their
+A fetus keeps still, jerks, and keeps still again. So the motions of a stack's slices, in the order of their
 acquisition, are a few constant segments with small changes inside. Given the cost of each slice under each
 candidate motion, dynamic programming finds the sequence with the least sum of these costs and of a transition
 penalty for every change, which grows with the distance (Viterbi 1967). It needs no threshold for what a jerk

@@ -46,7 +46,7 @@ class NormalEquations:
 
 
 class SliceModel:
-    """What stays the same while poses change: pixels, PSF nodes, the volume.
+    """Data that stay the same while poses change: pixels, PSF nodes, the volume.
 
     Args:
         slices: K slices.

@@ -15,7 +15,7 @@ from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHA
 
 @dataclass(frozen=True)
 class StackQuality:
-    """The evidence for the poses of one stack.
+    """How well the slices of one stack are registered.
 
     Args:
         reliable: whether every figure is in the range of registered stacks; None for a single stack, which
@@ -70,7 +70,7 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
             lines.append(
                 f"{stack.name}: registration probably failed (correlation with the other stacks "
                 f"{one.held_out_correlation:.2f}, of its slices with the volume {one.median_slice_ncc:.2f}, "
-                f"{one.downweighted_share:.0%} of its slices fit badly); do not trust the volume"
+                f"{one.downweighted_share:.0%} of its slices fit badly); do not rely on the volume"
             )
     return lines
 
@@ -85,7 +85,7 @@ def registration_reliable(qualities: Sequence[StackQuality]) -> bool | None:
 def registration_summary(qualities: Sequence[StackQuality]) -> str:
     """One line about all stacks."""
     if registration_reliable(qualities) is None:
-        return "a single stack: no other stack checks where its slices lie"
+        return "a single stack: no other stack checks its poses"
     n_reliable = sum(bool(one.reliable) for one in qualities)
     figures = ", ".join(
         "none" if one.held_out_correlation is None else f"{one.held_out_correlation:.2f}" for one in qualities

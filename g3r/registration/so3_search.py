@@ -24,7 +24,7 @@ best by more than this. One stack alone is more ambiguous than the whole head.""
 
 SEGMENT_REACH_DEG = 70.0
 SEGMENT_TRANSLATION_MM = 7.0
-"""How far a motion segment may lie from its stack's orientation, and the lattice of translations tried."""
+"""How far a motion segment may be from its stack's orientation, and the lattice of translations tried."""
 
 
 def best_orientations(

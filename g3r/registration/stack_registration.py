@@ -62,7 +62,7 @@ def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
 
 
 def self_consistency(stack: Slices) -> float:
-    """Mean correlation of neighbouring slices of a stack, in [-1, 1]; high where the fetus lay still.
+    """Mean correlation of neighbouring slices of a stack, in [-1, 1]; high where the fetus kept still.
 
     Every slice is compared with its neighbour by the header through a nearest-pixel look-up.
     """

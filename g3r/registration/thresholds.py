@@ -6,8 +6,8 @@ stacks with volumes include the outline of the head.
 """
 
 IN_PLACE_CORRELATION = 0.75
-"""Held-out correlation of a stack above which other orientations are not searched: stacks that lie the wrong
-way reach 0.65, stacks in place 0.7 to 0.9."""
+"""Held-out correlation of a stack above which other orientations are not searched: wrongly oriented
+stacks reach 0.65, stacks in place 0.7 to 0.9."""
 
 RETRY_BELOW_CORRELATION = 0.68
 """Where a stack stays below this held-out correlation, the search starts again with other random numbers.
@@ -31,7 +31,7 @@ where nothing moved, which is noise, 0.02 to 0.05 with mild motion."""
 
 MIN_ATLAS_CORRELATION = 0.6
 """Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for
-simulated heads of 24 to 34 weeks, 0.4 for heads that lie the wrong way."""
+simulated heads of 24 to 34 weeks, 0.4 for wrongly oriented heads."""
 
 MIN_PRIOR_LOSS_REMOVED = 0.22
 """Share of the robust loss that registering a single stack to the prior must remove to be accepted: 0.10 to

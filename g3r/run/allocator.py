@@ -1,4 +1,4 @@
-"""What the C library does with memory that was freed: keep it for later, or give it back to the system."""
+"""Whether the C library keeps freed memory for later or returns it to the system."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ LARGE_BLOCK_BYTES = 1_000_000
 
 
 def release_memory() -> None:
-    """Give what was freed back to the system, where it can be asked to (glibc): some 0.05 s."""
+    """Return freed memory to the system, where glibc can: some 0.05 s."""
     trim = _libc_function("malloc_trim")
     if trim is not None:
         trim(ctypes.c_size_t(0))
 
 
 def release_memory_eagerly() -> bool:
-    """Have large blocks given back whenever they are freed, from now on; whether this system can.
+    """Return large blocks to the system whenever they are freed, from now on; True if this system can.
 
-    glibc keeps freed blocks of up to 32 MB, and where small ones lie between them they stay. Setting the
+    glibc keeps freed blocks of up to 32 MB, and those with small ones between them stay. Setting the
     threshold stops it from growing. Every block is then cleared by the system when it is taken: about a
     seventh more CPU time (docs/tradeoff.md).
     """

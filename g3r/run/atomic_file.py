@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
+
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
@@ -43,11 +45,24 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def remove_leftovers(folder: Path, suffix: str) -> None:
+    """Remove the temporary files of `atomic_path` in a folder whose process was killed.
+
+    Args:
+        folder: to look in.
+        suffix: of the files that were being written; others are left alone.
+    """
+    for temporary in folder.glob(f".*{suffix}"):
+        process = temporary.name.split(".")[1]
+        if process.isdigit() and not psutil.pid_exists(int(process)):
+            temporary.unlink(missing_ok=True)
+
+
 def sync(path: Path) -> None:
     """Wait until a file is on the disk.
 
     Raises:
-        OSError: the disk is full or broken, which some systems say no sooner.
+        OSError: the disk is full or broken, which some systems report only now.
     """
     descriptor = os.open(path, os.O_RDWR)  # Windows refuses to sync what is open for reading
     try:

@@ -31,6 +31,12 @@ class Clock:
         logger.info("%s: %.1f s", stage, self.seconds[stage])
 
     def add(self, stage: str, seconds: float, cpu_seconds: float) -> None:
-        """Record a stage that was timed elsewhere, such as in an earlier run."""
+        """Record a stage that was timed elsewhere, such as in an earlier run.
+
+        Args:
+            stage: its name.
+            seconds: wall-clock time.
+            cpu_seconds: processor time of all threads.
+        """
         self.seconds[str(stage)] = seconds
         self.cpu_seconds[str(stage)] = cpu_seconds

@@ -1,4 +1,4 @@
-"""What a run carries besides its data: stage store, clock, stop request, progress, and what it has to say."""
+"""Context of a run: stage store, clock, stop request, progress, notes and warnings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StoppedAt:
 
 @dataclass(kw_only=True)
 class RunContext:
-    """Runs the stages of one computation: times them, keeps what they give, and ends early when it is asked to.
+    """Runs the stages of one computation: times them, keeps what they give, and ends early when a stop is requested.
 
     A stop request before the first droppable or stoppable stage raises `KeyboardInterrupt`. Afterwards it
     sets `stopped_at`, and the caller makes its result of what there is.
@@ -45,7 +45,7 @@ class RunContext:
         progress: called with (stage, steps done, steps in all).
         clock: seconds of each stage.
         notes: remarks for the record.
-        warnings: what must be known before the result is believed; logged when the result is made.
+        warnings: about the result; logged when the result is made.
         stopped_at: where a stop request ended the run; None while it was not.
     """
 
@@ -59,7 +59,7 @@ class RunContext:
     _position: StoppedAt | None = field(default=None, init=False)
 
     def stage(self, name: str, make: Callable[[], Result]) -> Result:
-        """What a stage gives: from the store if it was finished in an earlier run, else made, timed and kept."""
+        """Result of a stage: from the store if an earlier run finished it, else computed, timed and stored."""
         return self._run(name, make)
 
     def droppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:

@@ -1,4 +1,4 @@
-"""How long loops go on: for so many steps, until a deadline, or until somebody asks for the end."""
+"""How long loops run: for a number of steps, until a deadline, or until a stop is requested."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _nobody() -> bool:
 
 @dataclass
 class LoopRecord:
-    """What the clock decided in the loops of a run, in their order, so that a later run can do the same.
+    """Decisions of the clock in the loops of a run, in order, so that a later run can repeat them.
 
     Attributes:
         loops: for each loop the fractions of its steps (see `timed_steps`).
@@ -41,7 +41,7 @@ class Deadline:
     Args:
         end_s: on the clock; infinity for none.
         clock: seconds that only go forwards.
-        is_stopped: whether the end is asked for at once, whatever the clock says.
+        is_stopped: whether a stop is requested, whatever the clock says.
         loop_record: remembers what the clock decided; None for nobody.
     """
 
@@ -52,7 +52,7 @@ class Deadline:
 
     @classmethod
     def after(cls, seconds: float, clock: Callable[[], float] = time.monotonic) -> Deadline:
-        """A deadline so many seconds from now."""
+        """A deadline in `seconds` from now."""
         return cls(clock() + seconds, clock)
 
     @property
@@ -65,7 +65,7 @@ class Deadline:
         return replace(self, end_s=self.clock() + share * max(0.0, self.remaining_s - reserve_s))
 
     def has_passed(self) -> bool:
-        """Whether no time is left, as the clock says now or said then."""
+        """Whether no time is left, by the clock, or as recorded."""
         if self.loop_record is None:
             return self.remaining_s <= 0
         known = self.loop_record.begin()
@@ -78,12 +78,12 @@ def timed_steps(n_steps: int, deadline: Deadline | None = None, least: int = 1) 
     """Numbers of steps, and the fraction of the whole that is done before each, from 0 to below 1.
 
     With a deadline the whole is what fits into the time left, as the steps so far suggest, so that a schedule
-    that follows the fraction runs to its end in any case. The fraction never falls.
+    that follows the fraction reaches its end in any case. The fraction never falls.
 
     Args:
-        n_steps: at most so many.
-        deadline: no step begins that would probably end after it, or once it is cut; None gives all steps.
-        least: so many steps are made even after the deadline, but not once it is cut.
+        n_steps: largest number of steps.
+        deadline: no step begins that would probably end after it, or once a stop is requested; None gives all steps.
+        least: steps that are made even after the deadline, but not once a stop is requested.
     """
     if deadline is None:
         for step in range(n_steps):

@@ -1,6 +1,6 @@
 """Where numba keeps compiled kernels, decided before any is declared.
 
-Numba looks for a folder that it may write when a kernel is declared: beside the source, then in the user's
+Numba looks for a folder that it may write when a kernel is declared: next to the source, then in the user's
 cache folder; where neither can be written (a read-only installation and home), it raises. Then a folder of
 this user among the temporary files takes their place. Nothing heavy is imported here.
 """
@@ -51,7 +51,7 @@ def _user_cache() -> Path:
 
 
 def _temporary_folder() -> str:
-    """A folder that nobody else can write: what lies in it is run as code."""
+    """A folder that nobody else can write: its content is run as code."""
     name = f"g3r-kernels-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
     folder = Path(tempfile.gettempdir()) / name
     try:

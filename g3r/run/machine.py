@@ -1,4 +1,4 @@
-"""What this machine offers to a run: cores and memory, on Linux, macOS and Windows."""
+"""Cores and memory that this machine offers, on Linux, macOS and Windows."""
 
 from __future__ import annotations
 
@@ -35,13 +35,25 @@ def use_threads(n_threads: int | None = None) -> int:
     import numba
     import torch
 
-    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    wanted = n_threads or min(available_cores(), most)
-    if wanted > most:
-        raise InputError(f"--threads {wanted}: this machine offers {most}; choose at most that")
+    offered = _offered_threads()
+    wanted = n_threads or min(available_cores(), offered)
+    if wanted > offered:
+        raise InputError(f"--threads {wanted}: this machine offers {offered}; choose at most that")
     numba.set_num_threads(wanted)
     torch.set_num_threads(wanted)
     return wanted
+
+
+def use_up_to(n_threads: int) -> int:
+    """Like `use_threads`, but with at most the threads that this process offers; returns their number."""
+    return use_threads(min(n_threads, _offered_threads()))
+
+
+def _offered_threads() -> int:
+    """The number of threads that numba was started with."""
+    import numba
+
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 def held_bytes() -> int:

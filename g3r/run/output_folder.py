@@ -105,7 +105,7 @@ class OutputFolder:
         try:
             self._new.mkdir()
             yield self._new
-            for path in self._new.iterdir():  # a full disk may say so no sooner
+            for path in self._new.iterdir():  # a full disk may be reported only now
                 sync(path)
             if self.is_mount:
                 self._half_backup.mkdir()
@@ -222,7 +222,7 @@ def check_output_folder(
     for path in inputs:
         try:
             is_output = Path(path).resolve() in outputs
-        except (OSError, ValueError, RuntimeError):  # who reads it says what is wrong
+        except (OSError, ValueError, RuntimeError):  # its reader reports what is wrong
             continue
         if is_output:
             raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")

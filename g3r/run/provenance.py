@@ -1,4 +1,4 @@
-"""What a result was made of: the bytes of its files, by their SHA-256, and the settings."""
+"""Inputs of a result: its files by their SHA-256, and the settings."""
 
 from __future__ import annotations
 

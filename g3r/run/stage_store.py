@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class FinishedStage:
-    """What a stage gave in an earlier run, and the seconds that it took then."""
+    """Result of a stage in an earlier run, and the seconds that it took."""
 
     value: Any
     seconds: float
@@ -62,7 +62,7 @@ class StageStore:
         self._begin(path, provenance or {})
 
     def read(self, name: str) -> FinishedStage | None:
-        """What an earlier run made of a stage; None where it has to be made."""
+        """Result of a stage in an earlier run; None where it has to be computed."""
         path = self._path(name)
         if path is None or not self.reads or not path.exists():
             return None
@@ -80,7 +80,14 @@ class StageStore:
         return as_stored(value)
 
     def write(self, name: str, value: Any, seconds: float, cpu_seconds: float) -> None:
-        """Keep what a stage gave; a full disk gives up the files, not the run."""
+        """Store the result of a stage. On a full disk the store is dropped and the run goes on.
+
+        Args:
+            name: of the stage.
+            value: its result.
+            seconds: wall-clock time that it took.
+            cpu_seconds: processor time that it took.
+        """
         path = self._path(name)
         if path is None:
             return

@@ -40,7 +40,7 @@ class StopRequest:
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def is_requested(self) -> bool:
-        """Whether the end was asked for."""
+        """Whether a stop was requested."""
         return self.signal is not None
 
     def postpone(self) -> None:
@@ -48,7 +48,7 @@ class StopRequest:
         self._postponed = True
 
     def with_deadline(self, deadline: Deadline | None) -> Deadline:
-        """A deadline that also comes when the end is asked for."""
+        """A deadline that also passes when a stop is requested."""
         return replace(deadline or Deadline(), is_stopped=self.is_requested)
 
     @property

@@ -1,4 +1,4 @@
-"""What the trainings share: the optimiser annealed over a budget, the throughput, and what an export needs."""
+"""Common part of the trainings: the optimiser annealed over a budget, the throughput, and what an export needs."""
 
 import inspect
 import math
@@ -17,8 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY, NetworkConfig
 from g3r.errors import InputError, cannot_be_written
-
-UNFINISHED = ".unfinished"
+from g3r.run.atomic_file import atomic_path, remove_leftovers
 
 
 class AnnealedModule(LightningModule):
@@ -38,7 +37,7 @@ class AnnealedModule(LightningModule):
     """
 
     kind: ClassVar[str]
-    """Of the exported model."""
+    """Kind of the exported model: prior or pose."""
     network: Any
 
     def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:
@@ -58,7 +57,7 @@ class AnnealedModule(LightningModule):
         raise NotImplementedError
 
     def own_description(self) -> dict[str, Any]:
-        """What the exported model needs apart from its weights, in plain values."""
+        """Values that the exported model needs apart from its weights, in plain values."""
         raise NotImplementedError
 
     def keep_hyperparameters(self, network: NetworkConfig) -> None:
@@ -100,7 +99,13 @@ class AnnealedModule(LightningModule):
         torch.manual_seed(int(seed >> np.uint64(1)))
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Log samples per second and the share of time spent waiting for data."""
+        """Log samples per second and the share of time spent waiting for data.
+
+        Args:
+            outputs: of the training step; not used.
+            batch: that was trained on.
+            batch_idx: its number in the epoch, from 0.
+        """
         self._throughput.end_batch(self.n_samples(batch))
         every = max(self.trainer.log_every_n_steps, 1)  # type: ignore[attr-defined]
         if (batch_idx + 1) % every == 0 or self.trainer.is_last_batch:
@@ -149,41 +154,30 @@ class WholeCheckpoints(TorchCheckpointIO):
     ) -> None:
         """Write a checkpoint, whole or not at all.
 
+        Args:
+            checkpoint: what Lightning keeps of the training.
+            path: of the file; folders are made.
+            storage_options: not used.
+
         Raises:
             InputError: it cannot be written.
         """
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(checkpoint, temporary)
-            os.replace(temporary, path)
+            with atomic_path(path) as temporary:
+                torch.save(checkpoint, temporary)
         except OSError as error:
             raise cannot_be_written(path, error) from None
         except RuntimeError as error:  # what torch makes of a full disk
             if "write" not in str(error):
                 raise
             raise InputError(f"{path}: cannot be written ({error}); free some space") from None
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
-        """Read a checkpoint to resume from; remove what its run, if dead, had not finished writing."""
-        for temporary in Path(path).parent.glob(f".*{UNFINISHED}"):
-            process = temporary.name.removesuffix(UNFINISHED).rpartition(".")[2]
-            if not (process.isdigit() and _is_alive(int(process))):
-                temporary.unlink(missing_ok=True)
+        """Read a checkpoint to resume from; remove what a killed run has left of those it was writing."""
+        remove_leftovers(Path(path).parent, Path(path).suffix)
         return super().load_checkpoint(path, *arguments, **options)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        pass
-    return True
 
 
 class _Throughput:

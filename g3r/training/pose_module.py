@@ -181,7 +181,7 @@ class PoseModule(AnnealedModule):
             ) from error
 
     def own_description(self) -> dict[str, Any]:
-        """What a `PoseModel` needs apart from its weights."""
+        """Values that a `PoseModel` needs apart from its weights."""
         return {"weeks": self.weeks}
 
 
@@ -196,7 +196,17 @@ def point_loss(step: PoseStep, batch: Batch) -> Tensor:
 
 
 def disturbed(rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses with errors of a random size for each head: common to a stack, and of each slice."""
+    """Draw poses with errors: one common to each stack, one of each slice, of a random size per head.
+
+    Args:
+        rotation: [S, 3, 3] poses to disturb.
+        translation_mm: [S, 3] of these poses.
+        stack: [S] stack of each slice.
+        set_of_stack: [T] head of each stack.
+
+    Returns:
+        Rotations [S, 3, 3] and translations [S, 3] in mm.
+    """
     n_stacks, n_sets, n = len(set_of_stack), int(set_of_stack.max()) + 1, len(stack)
 
     def normal(rows: int) -> Tensor:
@@ -220,7 +230,16 @@ def vote_loss(step: PoseStep, batch: Batch) -> Tensor:
 
 
 def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.ndarray]:
-    """Errors of one head's slices (mm, degrees) after the first step and at last, and of its stacks."""
+    """Errors (mm, degrees) of one head's slices after the first and the last step, and of its stacks.
+
+    Args:
+        first: [S] poses after the first step.
+        last: [S] poses after the last step.
+        batch: of this one head; see `PoseDataModule`.
+
+    Returns:
+        [S] or [T] errors by name, for S slices in T stacks.
+    """
     true = as_pose(batch["true_rotation"], batch["true_translation_mm"])
     stack = batch["stack"].cpu().numpy()
     rotation = batch["header_rotation"].double().cpu().numpy()
@@ -254,7 +273,16 @@ def summary(scores: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
 
 
 def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
-    """Slices of the first head above what the atlas template shows at their poses, [H, W] in [0, 1]."""
+    """Picture of slices of the first head above the atlas template at their poses.
+
+    Args:
+        pose: rotations [S, 3, 3] and translations [S, 3] in mm.
+        batch: that holds the slices.
+        network: that holds the template.
+
+    Returns:
+        [H, W] in [0, 1].
+    """
     rows = torch.linspace(0, len(batch["image"]) - 1, N_PANEL_SLICES).round().long().unique()
     image = batch["image"][rows, 0].float().cpu()
     points = pixel_points_mm(network.config.image_size, network.config.pixel_mm, pose[0])

@@ -79,7 +79,13 @@ class PriorModule(AnnealedModule):
         self._panels: dict[int, Tensor] = {}
 
     def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
-        """Return V_prior; see `DensityGatedPriorNetwork.forward`."""
+        """Return V_prior, [B, 1, I, J, K] (G3R Eq. 7).
+
+        Args:
+            v_coarse: [B, 1, I, J, K], with a 99th percentile of 1.
+            m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
+            v_sharp: [B, 1, I, J, K], on V_coarse's scale, or None where the network takes none.
+        """
         return self.network(v_coarse, m_rho, v_sharp)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -162,7 +168,7 @@ class PriorModule(AnnealedModule):
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
 
     def own_description(self) -> dict[str, Any]:
-        """What a `Prior` needs apart from its weights."""
+        """Values that a `Prior` needs apart from its weights."""
         return {"voxel_mm": self.voxel_mm}
 
 

@@ -25,7 +25,7 @@ RIDGE = 1e-4
 """Keeps coefficients finite that a small sample does not determine."""
 
 MIN_COEFFICIENT = {"log residual": 0.3}
-"""Coefficients are held at zero or above, this one at more: slices lie wrongly in few of the subjects of a
+"""Coefficients are held at zero or above, this one at more: few of the subjects have wrong poses in of a
 calibration, and a model that learnt from the others to ignore misfit would not see a bad registration."""
 
 

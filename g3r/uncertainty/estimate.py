@@ -27,13 +27,13 @@ MEANING = "expected absolute error of volume.nii.gz, in its intensity units"
 MOSTLY_PRIOR = 0.5
 """A voxel whose prior share is larger shows more of the prior than of the slices."""
 
-UNRELIABLE_NOTE = "registration is doubted: the uncertainty was calibrated on registered stacks and is too small here"
-UNCHECKED_NOTE = "a single stack: nothing but the prior checks where its slices lie"
+UNRELIABLE_NOTE = "registration is unreliable: the uncertainty is calibrated on registered stacks and too small here"
+UNCHECKED_NOTE = "a single stack: nothing but the prior checks its poses"
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """The map and what run.json says about it.
+    """The map and its entry of run.json.
 
     Attributes:
         expected_error: [I, J, K] in the volume's intensities; zero outside the mask.
@@ -46,7 +46,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class UncertaintyInputs:
-    """What is known of a result without the truth, in normalised intensities.
+    """Properties of a result that are known without the truth, in normalised intensities.
 
     Attributes:
         volume: [I, J, K].
@@ -95,7 +95,7 @@ def estimate_uncertainty(
     Args:
         given: the result.
         with_prior: whether a prior network was used: there is a calibration for each.
-        intensity: what 1 stands for; the map is multiplied by it.
+        intensity: intensity of 1 in the fit; the map is multiplied by it.
         reliable: whether the registration is; None where nothing checks it.
     """
     name = WITH_PRIOR if with_prior else WITHOUT_PRIOR

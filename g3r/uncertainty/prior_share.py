@@ -1,4 +1,4 @@
-"""Prior share: how far each voxel of a result depends on the prior, from the fit's answer to a change of the prior.
+"""Prior share: how far each voxel of a result depends on the prior, by the response of the fit to a change of it.
 
 If the prior had been wrong by some amount, how much of that would still be in the volume after the fit to the slices?
 Rendered pixels are linear in the amplitudes, so this can be asked of the finished fit: the
@@ -30,7 +30,7 @@ SMOOTHING_MM = 3.2
 
 ANSWER_ITERATIONS = 20
 ANSWER_DAMPING = 0.01
-"""Conjugate-gradient steps and pull towards the changed amplitudes that answer as the whole fit does: checked by
+"""Conjugate-gradient steps and pull towards the changed amplitudes that respond like the whole fit: checked by
 changing the prior volume itself and fitting again (tests/uncertainty/test_prior_share.py)."""
 
 
@@ -48,19 +48,20 @@ def estimate_prior_share(
 ) -> NDArray[np.float32]:
     """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
 
-    With r the share of a change of the prior that the slices leave standing, and c = 1 - exp(-M_rho) the
-    confidence, the answer is the larger of r and (1 - c)^2: Gaussians carry what slices say a little beyond
-    where they are, but a voxel that nothing measured rests on the prior all the same. The square is how r
-    falls with coverage where slices lie evenly. Shapes, poses, gains and slice weights are those of the finished fit.
+    With r the share of a change of the prior that the fit to the slices leaves in the result, and
+    c = 1 - exp(-M_rho) the confidence, the result is the larger of r and (1 - c)^2: Gaussians carry what the slices
+    determine a little beyond them, but a voxel that nothing measured depends on the prior in any case. The square
+    is how r falls with coverage where slices are evenly spaced. Shapes, poses, gains and slice weights are those of
+    the finished fit.
 
     Args:
         fit: of stage 2.
         density: M_rho on `density_grid`.
         density_grid: its grid.
-        mask: [I, J, K] on `grid`; the answer is 1 outside, where nothing was fitted.
-        grid: of the answer.
+        mask: [I, J, K] on `grid`; the result is 1 outside, where nothing was fitted.
+        grid: of the result.
         rng: draws the changes.
-        n_probes: number of random changes; their answers are averaged.
+        n_probes: number of random changes; the responses are averaged.
         cutoff_sigma: where the fit's Gaussians end.
         projection_bytes: see `solve_amplitudes`.
 
@@ -85,7 +86,7 @@ def remaining_share(
     cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
-    """r: how much of a random change of the amplitudes the slices leave standing, on a coarse grid over `grid`.
+    """r: how much of a random change of the amplitudes the slices leave in place, on a coarse grid over `grid`.
 
     The local regression of what is left on what was put in, <left, put in> / <put in, put in>, with means
     over a Gaussian neighbourhood and all probes; 1 where no Gaussian reaches.
@@ -111,7 +112,7 @@ def remaining_share(
     for _ in range(n_probes):
         change = torch.from_numpy(rng.standard_normal(len(fit.cloud)).astype(np.float32))
         probe = fit.cloud.with_amplitude(change)
-        answer = solve_amplitudes(
+        response = solve_amplitudes(
             probe,
             planes,
             nothing,
@@ -122,7 +123,7 @@ def remaining_share(
             cutoff_sigma=cutoff_sigma,
             projection_bytes=projection_bytes,
         )
-        put_in, left = volume(probe), volume(answer)
+        put_in, left = volume(probe), volume(response)
         together += gaussian_filter(left * put_in, sigma)
         square += gaussian_filter(put_in**2, sigma)
     floor = 1e-3 * float(square.max(initial=0))

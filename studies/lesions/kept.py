@@ -27,7 +27,7 @@ FIRST_SEED, DEVELOPMENT_SEED = 52_300, 51_300
 
 STACK_NUMBERS = (3, 1)
 WANTED_SHARE = 0.85
-"""Of what the fit without prior keeps."""
+"""Smallest accepted share, with the prior, of what the fit without prior keeps."""
 
 WITH_PRIOR, WITHOUT_PRIOR, PRIOR_ALONE = "with prior", "without prior", "prior alone"
 VARIANTS = (WITHOUT_PRIOR, WITH_PRIOR, PRIOR_ALONE)
@@ -54,7 +54,14 @@ def sliced(volume: str, seed: int) -> LesionSubject:
 
 
 def measure(subject: tuple[str, int], n_stacks: int, sections: Path | None, options: argparse.Namespace) -> Row:
-    """How much of each lesion of one head (volume, seed) is kept; sections of the first for the figure."""
+    """Measure how much of each lesion of one head is kept.
+
+    Args:
+        subject: atlas volume and seed of the head.
+        n_stacks: stacks to reconstruct from.
+        sections: .npz for sections of the volumes; None writes none.
+        options: of the command.
+    """
     settings = PRESETS[options.preset]
     # at the true poses no slice may move, or the two reconstructions of a pair would differ by that too
     settings = replace(

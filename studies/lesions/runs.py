@@ -41,13 +41,13 @@ class LesionSubject:
 
     @property
     def grid(self) -> VolumeGrid:
-        """Of the truth and the lesions."""
+        """Grid of the truth and the lesions."""
         return VolumeGrid(self.healthy.data.shape, self.healthy.affine)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LesionRun:
-    """What one head gave with one number of stacks.
+    """Result of one head with one number of stacks.
 
     Attributes:
         subject: the head.
@@ -113,7 +113,7 @@ def lesion_run(
     """Reconstruct a head twice by each variant and compare the difference with the lesions.
 
     Poses and gains of the slices are the true ones. A wrong pose blurs a lesion with and without prior alike;
-    here the question is what the prior does to what slices show, and both reconstructions have to stand in
+    here the question is what the prior does to what slices show, and both reconstructions have to be in
     one frame.
 
     Args:
@@ -145,7 +145,7 @@ def lesion_run(
 
 
 def true_motion(stacks: list[SimulatedStack]) -> Registration:
-    """What a registration without error would give for simulated stacks."""
+    """The error-free registration of simulated stacks."""
     slices = slices_from_stacks([one.stack for one in stacks])
     rotation = np.concatenate([one.true_pose.rotation for one in stacks])
     shift = np.concatenate([one.true_pose.translation_mm for one in stacks])

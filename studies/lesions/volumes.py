@@ -24,7 +24,7 @@ MIN_CONTRAST = 0.35
 """Between a sphere and the tissue that it replaces (mean of it), in the same unit."""
 
 MIN_DEPTH_MM = 7.0
-"""Of a sphere's middle below the rim of the mask: all of it and some tissue around it are brain."""
+"""Least depth of a sphere's centre below the rim of the mask: it and some tissue around it are all brain."""
 
 APART_MM = 16.0
 """Between the middles of two spheres, and of a sphere and the changed ventricle."""
@@ -75,7 +75,12 @@ def kept(change_found: NDArray[np.floating], lesion: Lesion) -> float:
 
 
 def load_labels(volume_file: Path, mask_file: Path, margin_voxels: int) -> TruthVolume:
-    """The label map beside an atlas volume, reoriented and cropped as `load_subject` and `cropped` do it.
+    """Load the label map of an atlas volume, reoriented and cropped like the volume itself.
+
+    Args:
+        volume_file: of the atlas volume; the label map is in the same folder.
+        mask_file: its brain mask.
+        margin_voxels: kept around the mask.
 
     Raises:
         InputError: no label map.
@@ -131,7 +136,7 @@ def draw_lesions(
 
 
 def with_lesions(truth: TruthVolume, lesions: Sequence[Lesion]) -> TruthVolume:
-    """The head with its lesions; they lie apart, so that what each changes adds up."""
+    """The head with its lesions; they are apart, so that their changes add up."""
     return replace(truth, data=truth.data + sum((one.change for one in lesions), np.zeros((), np.float32)))
 
 

@@ -1,4 +1,4 @@
-"""`python -m studies.motion.bias`: poses and volume under shading, with the shading estimated and not."""
+"""`python -m studies.motion.bias`: poses and volume under a bias field, estimated or ignored."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from studies.tables import Cell, table
 
 BIASES = (0.05, 0.15)
 VOLUMES = ("crl-sta/sta30", "spina-bifida/sb32-operated")
-"""A week left out of training, and a volume that training used for choosing only."""
+"""A week excluded from training, and a volume that training used for choosing only."""
 
 SEED = 33_000
-"""Seeds from here on belong to this study; a volume has the same at every strength of shading, so that
-motion, noise and the shape of the shading agree."""
+"""Seeds from here on belong to this study; a volume has the same at every strength of the bias field, so that
+motion, noise and the shape of the field agree."""
 
 VARIANTS: dict[str, Mapping[str, Any]] = {"estimated": {}, "not estimated": {"slice_stage.optimise_bias_field": False}}
-"""What is compared; options as `g3r.planning.presets.changed` reads them."""
+"""Variants compared; options as `g3r.planning.presets.changed` reads them."""
 
 
 def specs(n_repeats: int = 1) -> list[SubjectSpec]:
-    """The subjects: each volume with moderate motion, `n_repeats` times, at each strength of shading."""
+    """The subjects: each volume with moderate motion, `n_repeats` times, at each strength of the bias field."""
     return [
         SubjectSpec(
             name=f"bias-{bias:.2f}-{volume.rsplit('/', 1)[-1]}-{number}",
@@ -50,15 +50,22 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
             chosen = changed(settings, changes)
             if options.motion_only and chosen != settings and chosen.registration == settings.registration:
                 continue  # registration would do the same again
-            # without the fit, settings left as they are say nothing about the shading
+            # without the fit, settings left as they are say nothing about the bias field
             label = "-" if options.motion_only and not changes else variant
             yield Task(f"{spec.name}, {label}", measure, (spec, label, changes, options))
 
 
 def measure(spec: SubjectSpec, label: str, changes: Mapping[str, Any], options: argparse.Namespace) -> Row:
-    """One variant of one subject."""
+    """Measure one variant of one subject.
+
+    Args:
+        spec: of the subject.
+        label: of the variant.
+        changes: settings that differ from the preset, by dotted name.
+        options: of the command.
+    """
     _, row = run(simulated_case(spec, options.cache), options, changes, full=not options.motion_only)
-    return {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "shading": label, **row}
+    return {"volume": spec.volume, "seed": spec.seed, "bias": spec.bias, "bias_field": label, **row}
 
 
 def tables(record: Record) -> dict[str, str]:
@@ -67,7 +74,7 @@ def tables(record: Record) -> dict[str, str]:
         "volume": "{volume}",
         "seed": "{seed}",
         "bias": "{bias:.2f}",
-        "shading": "{shading}",
+        "bias field": "{bias_field}",
         "TRE median mm": "{median_mm:.2f}",
         "TRE p90 mm": "{p90_mm:.2f}",
         "PSNR dB": "{psnr_db:.2f}",
@@ -81,7 +88,7 @@ def tables(record: Record) -> dict[str, str]:
 
 STUDY = Study(
     name="motion.bias",
-    about="Reconstruct subjects with weak and strong shading, with the shading estimated and not.",
+    about="Reconstruct subjects with a weak and a strong bias field, estimated or ignored.",
     document="motion.md",
     shared=(*FITS, "--cache"),
     options={

@@ -14,12 +14,12 @@ from g3r.evaluation.pose_error import PoseTable, SliceKey
 from studies.tables import new_figure, save_figure
 
 INTERLEAVE = 2
-"""Of all cases: every other slice first."""
+"""Interleave of all cases: every other slice first."""
 
 JERK_MM = 2.5
 JERK_RATIO = 3.0
-"""A step between neighbours in time is a jerk if it moves the slices by so much, and by so many times the
-median step: the walks of all levels stay under, jerks of 6 degrees (4 mm at the rim of a head) do not."""
+"""A step between neighbours in time is a jerk if it is longer than this, and longer than the median step by this
+factor: the walks of all levels stay under, jerks of 6 degrees (4 mm at the rim of a head) do not."""
 
 MIN_SHOWN_MM = 0.01
 """Smaller errors are drawn here: a logarithm has no zero."""
@@ -33,11 +33,11 @@ COLOURS = {
     "network": "#e69f00",
     "stacks": "#56b4e9",
     "best start": "#f0e442",
-    "runs": "#cc79a7",
+    "segments": "#cc79a7",
     "slices": "#0072b2",
     "joint": "#d55e00",
 }
-SHOWN = ("headers", "best start", "runs", "slices", "joint")
+SHOWN = ("headers", "best start", "segments", "slices", "joint")
 """Those that the figure draws; more dots than these hide each other."""
 
 OTHER_COLOURS = ("#000000", "#7f3c8d", "#3969ac")

@@ -46,7 +46,7 @@ LAYERS = (
     Layer("network", {**_ONE_START, "registration.network": True}),
     Layer("stacks", {**_ONE_START, "registration.stacks": True}),
     Layer("best start", {"registration.segments": False, "registration.n_rounds": 0}),
-    Layer("runs", {"registration.n_rounds": 0}),
+    Layer("segments", {"registration.n_rounds": 0}),
     Layer("slices"),
     Layer("joint", full=True),
 )
@@ -56,13 +56,13 @@ WITHOUT: dict[str, Options] = {
     "template": {"registration.template": False},
     "network": {"registration.network": False},
     "stacks": {"registration.stacks": False},
-    "runs": {"registration.segments": False},
+    "segments": {"registration.segments": False},
     "slices": {"registration.n_rounds": 0},
     "joint": {"slice_stage.optimise_poses": False},
     "slices and joint": {"registration.n_rounds": 0, "slice_stage.optimise_poses": False},
-    "shading": {"slice_stage.optimise_bias_field": False},
+    "bias field": {"slice_stage.optimise_bias_field": False},
 }
-"""What is switched off, one at a time, in a whole reconstruction."""
+"""Layers switched off, one at a time, in a whole reconstruction."""
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
@@ -72,7 +72,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
-    """Errors after each layer, and scores with everything and with a layer left out."""
+    """Errors after each layer, and scores with everything and without a layer."""
     case = read_case(folder)
     header = case.header_error()
     layers: dict[str, Any] = {"headers": {**header.figures(), "per_slice_mm": _listed(header.per_slice_mm)}}
@@ -104,7 +104,7 @@ def _say(case: str, what: str, row: Row) -> None:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Errors and seconds after each layer, volumes with a layer left out."""
+    """Errors and seconds after each layer, volumes without a layer."""
     rows = [{"case": case, **row} for case, row in record["rows"].items()]
     layers = list(dict.fromkeys(name for row in rows for name in row["layers"]))
     variants = list(dict.fromkeys(name for row in rows for name in row["without"]))
@@ -120,7 +120,7 @@ def tables(record: Record) -> dict[str, str]:
         cells("layers", "{[median_mm]:.2f} / {[p90_mm]:.2f}", {name: name for name in layers}),
         "Wall seconds from the stacks to the end of that layer (of the last: to the volume):",
         cells("layers", "{[seconds]:.0f}", {name: name for name in layers[1:]}),
-        "PSNR of the volume in dB (and median TRE in mm) with everything, and with one thing left out:",
+        "PSNR of the volume in dB (and median TRE in mm) with everything, and without one thing:",
         cells("without", "{[psnr_db]:.2f} ({[median_mm]:.2f})", titles),
     ]
     return {"layers": "\n\n".join(parts)}
@@ -128,11 +128,11 @@ def tables(record: Record) -> dict[str, str]:
 
 STUDY = Study(
     name="motion.layers",
-    about="Pose errors after each layer of registration, and the volume with a layer left out, on the cases.",
+    about="Pose errors after each layer of registration, and the volume without a layer, on the cases.",
     document="motion.md",
     picture="motion-tre.png",
     shared=(*FITS, "--cases"),
-    options={"--no-without": {"action": "store_true", "help": "skip the runs with a layer left out"}},
+    options={"--no-without": {"action": "store_true", "help": "skip the runs without a layer"}},
     settings=lambda options: {"without": not options.no_without},
     tasks=tasks,
     tables=tables,

@@ -1,4 +1,4 @@
-"""`python -m studies.motion.sweep`: random subjects at each level of motion, registered and judged."""
+"""`python -m studies.motion.sweep`: random subjects at each level of motion, registered and compared with the truth."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
 
 FIRST_SEED = 44_000
 """Seeds 44000-44299 belong to the published table: no training and no choice may use them. (41000-41299 did
-until they had shown that stacks with jerks must not go back to their runs.)"""
+until they had shown that stacks with jerks must not return to their motion segments.)"""
 
 TURNED_SEED = 42_000
 """The same for subjects in a random orientation (`--turned`)."""
 
 DEVELOPMENT_SEED = 31_000
-"""Seeds 31000-31299 were looked at while registration was made (`--development`); so judge by others."""
+"""Seeds 31000-31299 were looked at while registration was made (`--development`); so measure on others."""
 
 
 def specs(
@@ -43,7 +43,7 @@ def specs(
     Args:
         levels: of motion.
         n_subjects: at each level.
-        turned: whether heads lie in random orientations.
+        turned: whether heads are in random orientations.
         development: whether they may be looked at.
     """
     first = TURNED_SEED if turned else FIRST_SEED
@@ -71,7 +71,7 @@ def measure(spec: SubjectSpec, options: argparse.Namespace) -> Row:
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         _, row = run(case, options, full=options.full)
-    except G3RError as error:  # a refusal is an honest answer: nothing was moved, and the user was told
+    except G3RError as error:  # a refusal counts as a row: nothing was moved, and the user was warned
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
         row = pose_row(header, [str(error)], seconds, cpu_seconds)
     shown = {"level": spec.motion, "seed": spec.seed, "turned": spec.turned}
@@ -109,7 +109,7 @@ def sweep_text(record: Record, rows: dict[str, Row]) -> str:
         [
             f"Preset `{record['preset']}`, {what}; {record['jobs']} at a time, {record['threads']} threads each. "
             "TRE in mm; seconds, headers and PSNR are medians over subjects; bad: median TRE not under 1 mm; "
-            f"upright: the result stands within {UPRIGHT_DEG:g} degrees of the atlas.",
+            f"upright: the result is within {UPRIGHT_DEG:g} degrees of the atlas.",
             table(summary, SUMMARY | summary_psnr),
             details("Every subject", table(({"name": name, **row} for name, row in rows.items()), EACH | each_psnr)),
         ]
@@ -173,7 +173,7 @@ STUDY = Study(
     options={
         "--levels": {"nargs": "+", "choices": LEVELS, "default": list(LEVELS), "help": "of motion"},
         "--subjects": {"type": int, "choices": range(1, MAX_SUBJECTS + 1), "default": 10, "metavar": "N"},
-        "--turned": {"action": "store_true", "help": "heads lie in random orientations"},
+        "--turned": {"action": "store_true", "help": "heads are in random orientations"},
         "--full": {"action": "store_true", "default": False, "help": "whole reconstructions, with PSNR"},
         "--motion-only": {"action": "store_false", "dest": "full", "default": False, "help": "registration alone"},
     },

@@ -46,7 +46,7 @@ FITS_COMPARED: dict[str, Mapping[str, Any]] = {
     "prior as initialisation": {"distillation": False},
     "with distillation": {},
 }
-"""What is fitted, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
+"""Variants of the fit, as changes of the settings (see `g3r.planning.presets.changed`); the last is the product."""
 
 VARIANTS = ("V_coarse", "V_sharp", "prior alone", *FITS_COMPARED)
 """In the order of the table."""
@@ -67,7 +67,13 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure_subject(spec: SubjectSpec, n_stacks: int, options: argparse.Namespace) -> Row:
-    """One subject from its first stacks."""
+    """Measure one subject from its first stacks.
+
+    Args:
+        spec: of the subject.
+        n_stacks: stacks to use.
+        options: of the command.
+    """
     row = measure(simulated_case(spec, options.cache, n_stacks), options)
     return {"subject": spec.name, "n_stacks": n_stacks, "volume": spec.volume, **row}
 
@@ -88,7 +94,7 @@ def measure(case: SimulatedCase, options: argparse.Namespace) -> Row:
         tre[name] = error.median_mm
         volumes = {name: (result.volume, result.grid)}
         if name == BASELINE:
-            # what stands in for a prior
+            # what replaces a prior
             volumes |= {"V_coarse": (result.coarse, result.prior_grid), "V_sharp": (result.prior, result.prior_grid)}
         elif name == VARIANTS[-1]:
             volumes["prior alone"] = result.prior, result.prior_grid
@@ -165,7 +171,14 @@ def differences_db(rows: Sequence[Row], variant: str, n_stacks: int) -> list[flo
 
 
 def values(rows: Sequence[Row], variant: str, n_stacks: int, key: str) -> list[float]:
-    """One score of a variant, subject by subject; arguments as of `differences_db`."""
+    """One score of a variant, subject by subject.
+
+    Args:
+        rows: one per subject and number of stacks.
+        variant: name of the variant.
+        n_stacks: only rows with this number of stacks.
+        key: name of the score.
+    """
     return [row["scores"][variant][key] for row in rows if row["n_stacks"] == n_stacks]
 
 

@@ -50,7 +50,13 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
-    """Scores of each volume of the first `n_stacks` stacks; poses are true, so nothing is aligned."""
+    """Scores of each volume of the first `n_stacks` stacks; poses are true, so nothing is aligned.
+
+    Args:
+        folder: of the case.
+        n_stacks: stacks to use.
+        options: of the command.
+    """
     prior = Prior.load(options.ckpt)
     case = read_case(folder)
     n_views = PRESETS[options.preset].prior_views

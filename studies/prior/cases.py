@@ -31,7 +31,7 @@ def measure_case(folder: Path, options: argparse.Namespace) -> Row:
 
 
 def gain(row: Row) -> str:
-    """What the prior brings; a loss is marked (!)."""
+    """Gain by the prior; a loss is marked (!)."""
     value = row["scores"][PRODUCT]["psnr_db"] - row["scores"][BASELINE]["psnr_db"]
     return marked(f"{value:+.2f}", value >= -MAX_LOSS_DB)
 

@@ -12,7 +12,7 @@ from studies.tables import new_figure, save_figure, stacks
 
 COLOURS = ("#9a9a9a", "#c58a3a", "#2f9e6e", "#4a4a4a", "#5b8fd6", "#c0392b", "#8e5bb5", "#17a2b8")
 SIDEWAYS = 0.05
-"""Points of different lines stand this far beside each other, in numbers of stacks."""
+"""Sideways distance between the points of different lines, in numbers of stacks."""
 
 
 def draw_ablation(rows: Sequence[Mapping[str, Any]], variants: Sequence[str], baseline: str, path: Path) -> None:

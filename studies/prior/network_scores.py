@@ -1,4 +1,4 @@
-"""How trained variants of the prior network are judged: errors by number of stacks, seconds, size."""
+"""How trained variants of the prior network are compared: errors by number of stacks, seconds, size."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXPORTED = "prior.safetensors"
 
 
 BASELINES = {"V_coarse": "coarse", "V_sharp": "sharp"}
-"""What the network starts from, by its name in a validation volume."""
+"""Inputs of the network, by their names in a validation volume."""
 
 
 @functools.cache

@@ -14,8 +14,9 @@ from typing import Any
 
 import yaml
 
-from g3r.bench.record import available_cores, machine
+from g3r.bench.record import machine
 from g3r.errors import InputError
+from g3r.run.machine import available_cores
 from studies.harness import Record, Row, Study, Task, positive
 from studies.prior.figures import draw_networks
 from studies.prior.network_scores import (
@@ -42,7 +43,7 @@ class Variant:
     Args:
         name: of its folder, and in tables.
         what: how it differs, in words.
-        options: of the network, beside those of the configuration.
+        options: of the network, in addition to the configuration.
         is_size: whether it belongs to the curve of error against seconds.
     """
 
@@ -74,7 +75,7 @@ def configuration() -> dict[str, Any]:
 
 
 def settings(options: argparse.Namespace) -> Record:
-    """What all variants share; a table made later takes it from the record."""
+    """Settings that all variants share; a later table reads them from the record."""
     if options.no_train:
         return {}
     epochs = epochs_of(options.steps, configuration(), options.train_args)
@@ -82,7 +83,7 @@ def settings(options: argparse.Namespace) -> Record:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """What the network starts from, and the variants."""
+    """The inputs of the network and the variants."""
     if options.no_train:
         return
     config = configuration()
@@ -103,7 +104,17 @@ def baseline(name: str, data: tuple[Path, Path, int]) -> Row:
 
 
 def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], options: argparse.Namespace) -> Row | None:
-    """Train and score one variant."""
+    """Train and score one variant.
+
+    Args:
+        variant: to train.
+        n_epochs: of training.
+        data: the first three arguments of `validation_volumes`.
+        options: of the command.
+
+    Returns:
+        The row of the record, or None when training failed.
+    """
     run = options.output / variant.name
     checkpoint, seconds = _train(variant, run, n_epochs, [*_data_arguments(*data), *options.train_args])
     if checkpoint is None:
@@ -156,7 +167,7 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
 
 
 def _data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
-    """What all variants are told about their data."""
+    """Arguments about the data, the same for all variants."""
     listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
     return [
         f"--data.source={source}",

@@ -27,7 +27,7 @@ MARGIN_MM = 5.0
 
 @dataclass(frozen=True)
 class PriorVolumes:
-    """What the network is given and answers, [I, J, K] in normalised intensities.
+    """Inputs and output of the network, [I, J, K] in normalised intensities.
 
     Attributes:
         by_name: `V_coarse` (Eq. 6), `V_sharp` and `V_prior` (Eq. 7).
@@ -43,7 +43,7 @@ class PriorVolumes:
 
 
 def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
-    """The first stacks' slices where they were truly taken; slices of unknown pose are left out."""
+    """The first stacks' slices where they were truly taken; slices of unknown pose are excluded."""
     slices = slices_from_stacks(case.stacks[:n_stacks])
     row_of = {key: row for row, key in enumerate(case.true.keys)}
     keys = list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))

@@ -67,7 +67,14 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, way: str, n_steps: int, options: argparse.Namespace) -> Row:
-    """One fit, after a registration that all of a case share."""
+    """Measure one fit; all fits of a case share its registration.
+
+    Args:
+        folder: of the case.
+        way: key of `WAYS`.
+        n_steps: of the slice stage.
+        options: of the command.
+    """
     case = read_case(folder)
     motion = registered_once(folder, options.preset, options.ckpt)
     own = changed(PRESETS[options.preset], {**WAYS[way], "slice_stage.n_steps": n_steps})

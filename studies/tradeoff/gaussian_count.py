@@ -41,7 +41,7 @@ USUAL_LATTICE = (4.5, 3.6, 2.9, 2.4)
 
 
 def ball(voxel_mm: float) -> Subject:
-    """A ball of intensity 1 in its mask: sharp edge, voxels at the rim by the share that lies inside."""
+    """A ball of intensity 1 in its mask: sharp edge, voxels at the rim by the share inside."""
     half = BALL_RADIUS_MM + 2
     grid = VolumeGrid.isotropic([-half] * 3, [half] * 3, voxel_mm)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
@@ -205,7 +205,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(name: str, voxel_mm: float) -> Row:
-    """Both curves of a subject; the one of the atlas is left out without test data."""
+    """Both curves of a subject; that of the atlas needs the test data."""
     try:
         subject = SUBJECTS[name](voxel_mm)
     except InputError:

@@ -77,7 +77,7 @@ def _phantom(weeks: int, n_stacks: int, folder: Path) -> SimulatedCase:
 
 
 def _arguments_for(one: Configuration, case: SimulatedCase, output: Path) -> list[str]:
-    """Of g3r-infer."""
+    """Arguments of g3r-infer."""
     return [
         *infer_arguments(case, one.preset, output),
         "--threads",
@@ -92,8 +92,8 @@ def stated(one: Configuration, folder: Path) -> Row:
     """Stated and measured bytes of one run of the command."""
     case = _phantom(one.weeks, one.n_stacks, folder)
     run = run_infer(_arguments_for(one, case, folder / "out"), folder / "out")
-    said = run.record.memory
-    assert said is not None
+    memory = run.record.memory
+    assert memory is not None
     return {
         "weeks": one.weeks,
         "stacks": one.n_stacks,
@@ -101,8 +101,8 @@ def stated(one: Configuration, folder: Path) -> Row:
         "voxel_mm": one.voxel_mm,
         "threads": one.threads,
         "more": " ".join(one.more),
-        "stated_bytes": said.stated_bytes,
-        "stage": said.stage,
+        "stated_bytes": memory.stated_bytes,
+        "stage": memory.stage,
         "measured_bytes": run.peak_bytes,
     }
 
@@ -129,12 +129,12 @@ def _row(case: SimulatedCase, name: str, arguments: Sequence[str], output: Path,
         run = run_infer([*arguments, *([] if limit is None else ["--max-memory", str(limit)])], output)
     except InputError as error:
         return row | {"refused": str(error)}
-    said = run.record.memory
-    assert said is not None
+    memory = run.record.memory
+    assert memory is not None
     return row | {
-        "stated_bytes": said.stated_bytes,
+        "stated_bytes": memory.stated_bytes,
         "measured_bytes": run.peak_bytes,
-        "changes": said.changes,
+        "changes": memory.changes,
         "seconds": round(run.seconds, 1),
         "cpu_seconds": round(run.cpu_seconds, 1),
         "psnr_db": quality_of_folder(case, output).psnr_db,

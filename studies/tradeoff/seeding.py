@@ -25,7 +25,14 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
 
 
 def measure(folder: Path, name: str, bound: float | None, options: argparse.Namespace) -> Row:
-    """One reconstruction, after a registration that all ways share; without a bound from a lattice."""
+    """Measure one reconstruction; all ways of a case share its registration.
+
+    Args:
+        folder: of the case.
+        name: of the bound in the record.
+        bound: of adaptive seeding; None seeds on a lattice.
+        options: of the command.
+    """
     case = read_case(folder)
     settings = PRESETS[options.preset]
     motion = registered_once(folder, options.preset, options.ckpt)

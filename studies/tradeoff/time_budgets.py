@@ -40,7 +40,14 @@ def compiled(arguments: tuple[str, ...], output: Path) -> None:
 
 
 def measure(folder: Path, budget_s: float, thickness_mm: float | None, output: Path) -> Row:
-    """One run of the command."""
+    """Measure one run of the command under a time budget.
+
+    Args:
+        folder: of the case.
+        budget_s: the time budget in seconds.
+        thickness_mm: of the slices; None where the case records it.
+        output: folder for the results.
+    """
     case = load_case(folder, thickness_mm)
     plain = infer_arguments(case, "draft", output)
     compiled(tuple(plain), output)

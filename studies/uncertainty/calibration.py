@@ -80,7 +80,7 @@ def fit(options: argparse.Namespace) -> Row:
 
 
 def check(options: argparse.Namespace) -> Row:
-    """Judge the shipped coefficients on subjects left out."""
+    """Check the shipped coefficients on subjects that they were not fitted to."""
     found = reconstructed(options, fitting=False)
     judgement = check_record(found, calibration()[model_name(options)])
     return {"preset": options.preset, "weights": _weights(options), **judgement}
@@ -118,7 +118,7 @@ def _weights(options: argparse.Namespace) -> str | None:
 STUDY = Study(
     name="uncertainty.calibration",
     about="fit: fit the coefficients of uncertainty.nii.gz to simulated subjects of the validation atlas and "
-    "write them into the package. check: compare stated uncertainty and error on subjects left out. "
+    "write them into the package. check: compare stated uncertainty and error on other subjects. "
     "Subjects and their registrations are kept in --cache.",
     document="prior.md",
     picture="uncertainty-calibration.png",

@@ -24,11 +24,11 @@ from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import stacks
 
 Subject = tuple[SubjectSpec, int]
-"""With the number of its stacks that are used."""
+"""A subject and the number of its stacks that are used."""
 
 
 def _subjects(*chosen: tuple[str, int, str, int]) -> list[Subject]:
-    """Of volume, stacks, motion and seed."""
+    """Subjects from volume, number of stacks, motion and seed."""
     return [(SubjectSpec(volume=volume, motion=motion, seed=seed), n) for volume, n, motion, seed in chosen]
 
 
@@ -59,7 +59,7 @@ CHECK_SUBJECTS = _subjects(
     ("crl-sta/sta34", 3, "mild", 52_208),
     ("crl-sta/sta24", 1, "mild", 52_209),
 )
-"""The same of the subjects that they are checked on: weeks left out of every training and choice."""
+"""Subjects that the coefficients are checked on: weeks excluded from every training and choice."""
 
 UNREGISTERED = _subjects(("crl-sta/sta24", 3, "moderate", 52_250))[0]
 """One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
@@ -87,9 +87,9 @@ class Judged:
         error: [n] volume minus truth, in normalised intensities.
         psnr_db: of the volume.
         median_mm: error of the poses.
-        reliable: whether the record trusts the registration.
+        reliable: whether the record calls the registration reliable.
         registered: whether there was one.
-        seconds: of reconstruction and judgement; registration comes from the cache.
+        seconds: of reconstruction and comparison; registration comes from the cache.
         map_seconds: of the map alone, processor time.
     """
 
@@ -170,7 +170,7 @@ def relative_error(
 
 
 def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]]:
-    """What the map of a result was made of."""
+    """Predictors of the map of a result."""
     scale = np.float32(result.intensity_scale)
     fit = SliceFit(
         cloud=result.cloud,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from studies.tables import new_figure, save_figure, stacks
-from studies.uncertainty.judgement import LEFT_OUT_SHARES
+from studies.uncertainty.judgement import REMOVED_SHARES
 
 COLOURS = {1: "#c0392b", 2: "#c58a3a", 3: "#2f6fb0"}
 
@@ -63,14 +63,14 @@ def _calibration(panel: Any, record: Mapping[str, Any], n: int) -> None:
 
 def _sparsification(panel: Any, record: Mapping[str, Any]) -> None:
     """Mean error of the voxels kept, relative to that of all."""
-    left_out = 100 * LEFT_OUT_SHARES
+    removed = 100 * REMOVED_SHARES
     for n, one in record["by_stacks"].items():
         colour = COLOURS.get(int(n), "#4a4a4a")
         for key, style, what in (("stated", "-", "by uncertainty"), ("ideal", ":", "by the error itself")):
             kept = np.array(one["sparsification"][key]) / one["mean_error"]
-            panel.plot(left_out, kept, style, color=colour, label=f"{stacks(int(n))}, {what}")
+            panel.plot(removed, kept, style, color=colour, label=f"{stacks(int(n))}, {what}")
     panel.axhline(1, color="#444444", ls="--", lw=1, label="at random (a constant)")
-    panel.set_xlabel("most uncertain voxels left out, %")
+    panel.set_xlabel("most uncertain voxels removed, %")
     panel.set_ylabel("mean error of the others / of all")
     panel.set_ylim(0, 1.08)
     panel.set_title("does it rank the errors?", fontsize=11)

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 N_BINS = 10
 COVERAGE_FACTORS = (1.0, 2.0, 3.0)
 EXPONENTIAL_COVERAGE = tuple(1 - np.exp(-np.array(COVERAGE_FACTORS)))
-"""What errors of exponential size would show."""
+"""Coverage of exponentially distributed errors."""
 
-LEFT_OUT_SHARES = np.linspace(0, 0.95, 20)
-"""Shares of the most uncertain voxels left out, for the sparsification curve."""
+REMOVED_SHARES = np.linspace(0, 0.95, 20)
+"""Shares of the most uncertain voxels removed, for the sparsification curve."""
 
 
 def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
             "n_stacks": one.n_stacks,
             "psnr_db": one.psnr_db,
             "poses_mm": one.median_mm,
-            "trusted": one.reliable,
+            "reliable": one.reliable,
             "registered": one.registered,
             "seconds": one.seconds,
             "map_seconds": one.map_seconds,
@@ -58,7 +58,7 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
     Returns:
         `mean_stated`, `mean_error`; `coverage`: share of voxels whose error is under 1, 2 and 3 times the
         stated; `spearman`: rank correlation; `gain_over_constant`: share of the way from a constant to the
-        true order by which the mean error of the voxels kept falls as the most uncertain are left out (area
+        true order by which the mean error of the voxels kept falls as the most uncertain are removed (area
         under the sparsification curve; 0 for a constant, 1 for the errors themselves); `bins`: ten equally
         large groups by the stated value, each its mean `stated`, `mean_error` and `rms_error`;
         `sparsification`: the curves.
@@ -90,9 +90,9 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
 
 
 def sparsification(by: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean error of the voxels that are kept as those with the largest `by` are left out [20]."""
+    """Mean error of the voxels that are kept as those with the largest `by` are removed [20]."""
     total = np.cumsum(size[np.argsort(by, kind="stable")])
-    n_kept = np.maximum(np.round((1 - LEFT_OUT_SHARES) * len(size)).astype(int), 1)
+    n_kept = np.maximum(np.round((1 - REMOVED_SHARES) * len(size)).astype(int), 1)
     return np.asarray(total[n_kept - 1] / n_kept, dtype=np.float64)
 
 
@@ -165,7 +165,7 @@ EACH: dict[str, Cell] = {
     "subject": "{subject}",
     "PSNR dB": "{psnr_db:.1f}",
     "poses mm": "{poses_mm:.2f}",
-    "trusted": lambda row: {True: "yes", False: "no", None: "unknown"}[row["trusted"]],
+    "reliable": lambda row: {True: "yes", False: "no", None: "unknown"}[row["reliable"]],
     **SIZES,
     **RANKS,
 }

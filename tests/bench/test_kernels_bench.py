@@ -70,5 +70,5 @@ def test_a_scene_fills_the_head() -> None:
     scene = head_scene(500)
     assert len(scene.cloud) == 500
     assert len(np.unique(scene.slices.stack_id)) == 3
-    pairs = find_overlaps(scene.cloud, scene.slices.planes, CUTOFF_SIGMA)
-    assert len(pairs) > 10 * 500
+    overlaps = find_overlaps(scene.cloud, scene.slices.planes, CUTOFF_SIGMA)
+    assert len(overlaps) > 10 * 500

@@ -7,16 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from g3r.bench.record import (
-    available_cores,
-    between_markers,
-    machine,
-    machine_line,
-    markdown_table,
-    put_between_markers,
-    write_json,
-)
+from g3r.bench.record import between_markers, machine, machine_line, markdown_table, put_between_markers, write_json
 from g3r.errors import InputError
+from g3r.run.machine import available_cores
 
 
 def test_machine_says_what_seconds_depend_on() -> None:

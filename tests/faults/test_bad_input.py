@@ -69,7 +69,7 @@ def pairs(folder: Path) -> dict[str, tuple[list[Path], str, str]]:
         "a link to it": ([first, folder / "link.nii.gz"], "link.nii.gz", "is given twice"),
         "a copy of it": ([first, folder / "copy.nii.gz"], "copy.nii.gz", "same image as stack.nii.gz"),
         "its image with another header": ([first, turned], "turned.nii.gz", "same image as stack.nii.gz"),
-        "10 m away": ([first, far], "far.nii.gz", "lies 10000 mm from stack.nii.gz"),
+        "10 m away": ([first, far], "far.nii.gz", "is 10000 mm from stack.nii.gz"),
     }
 
 

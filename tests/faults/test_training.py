@@ -123,10 +123,10 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
         one.refused()
     with tally.case():
         for process in ("4194399", str(os.getpid())):  # nobody's, and a living one's
-            (tmp_path / f".last.ckpt.{process}.unfinished").write_text("")
+            (tmp_path / f".{process}.last.ckpt").write_text("")
         assert torch.equal(keeper.load_checkpoint(path, weights_only=True)["a"], torch.ones(3))
         left = {one.name for one in tmp_path.iterdir()}
-        assert left == {"last.ckpt", f".last.ckpt.{os.getpid()}.unfinished"}
+        assert left == {"last.ckpt", f".{os.getpid()}.last.ckpt"}
 
 
 CONFIG = """

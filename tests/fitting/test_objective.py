@@ -182,7 +182,7 @@ def test_no_pair_is_missed_while_things_move(volume: np.ndarray) -> None:
             finder = OverlapFinder(len(shapes))
             needed = finder.find(shapes, planes, state.rotation, state.center_mm, CUTOFF_SIGMA)
             for k in range(len(planes)):
-                kept = held.pairs.gaussian[held.pairs.start[k] : held.pairs.start[k + 1]]
+                kept = held.overlaps.gaussian[held.overlaps.start[k] : held.overlaps.start[k + 1]]
                 now = needed.gaussian[needed.start[k] : needed.start[k + 1]]
                 assert np.isin(now, kept).all()
         scene.parameters.step(loss, 0.1)

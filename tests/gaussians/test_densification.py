@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.gaussians import GaussianCloud, render
-from g3r.gaussians.cloud import rotation_from_quaternion
 from g3r.gaussians.densification import (
     FIRST_SHARE,
     concatenated,
@@ -21,6 +20,7 @@ from g3r.gaussians.densification import (
     with_duplicates_merged,
 )
 from g3r.geometry import VolumeGrid
+from g3r.geometry.quaternion import rotation_from_quaternion
 from tests.gaussians.scenes import cloud_of
 
 AFFINE = np.eye(4)

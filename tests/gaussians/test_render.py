@@ -91,10 +91,10 @@ def test_overlap_lists_with_a_margin_give_the_same_pixels_and_stay_valid() -> No
     assert len(tight) < len(wide)
     assert (np.diff(wide.start) >= np.diff(tight.start)).all()
     plain = render(cloud, planes)
-    assert torch.equal(render(cloud, planes, pairs=tight), plain)
-    assert torch.equal(render(cloud, planes, pairs=wide), plain)
+    assert torch.equal(render(cloud, planes, overlaps=tight), plain)
+    assert torch.equal(render(cloud, planes, overlaps=wide), plain)
     moved = GaussianCloud.of([cloud.mean_mm + 0.3, *cloud.parameters[1:]], cloud.origin_mm)
-    assert torch.equal(render(moved, planes, pairs=wide), render(moved, planes))
+    assert torch.equal(render(moved, planes, overlaps=wide), render(moved, planes))
 
 
 def test_two_thread_counts_agree() -> None:

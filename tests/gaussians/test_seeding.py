@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.gaussians import render
-from g3r.gaussians.cloud import rotation_from_quaternion
 from g3r.gaussians.seeding import MAX_ANISOTROPY, SCALE_PER_SPACING, seed_cloud
 from g3r.geometry import VolumeGrid
+from g3r.geometry.quaternion import rotation_from_quaternion
 
 AFFINE = np.eye(4)
 AFFINE[:3, :3] = Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix() * [-1.0, 1, 1]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from g3r.acquisition.planes import Planes
 from g3r.gaussians import GaussianCloud
-from g3r.gaussians.cloud import rotation_from_quaternion
+from g3r.geometry.quaternion import rotation_from_quaternion
 
 REACH = 6.5
 """Sigmas out to which integrals go; what lies beyond is 1e-10 of the whole."""

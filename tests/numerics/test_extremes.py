@@ -86,9 +86,8 @@ def flat(psf: bool, n: int = 6, tilt_rad: float = 3e-4, aside_mm: float = 0.01) 
 
 def apart(distance_mm: float) -> Scene:
     """Planes that meet no Gaussian, so far from them."""
-    scene = head_scene()
-    shift = RigidPose.from_rotvec([[0.0, 0, 0]], [[distance_mm, 0, 0]])
-    return Scene(scene.cloud, scene.planes.moved(shift))
+    scene, motion = head_scene(), RigidPose.from_rotvec([[0.0, 0, 0]], [[distance_mm, 0, 0]])
+    return Scene(scene.cloud, scene.planes.moved(motion))
 
 
 def astray() -> Scene:
@@ -228,11 +227,11 @@ def test_as_the_psf_goes_to_zero_slices_become_the_volume(sigma_mm: float, tally
 def test_pairs_of_flat_gaussians_are_not_missed() -> None:
     """In float32 the variance across a disc drowns in that along it; the search has to allow for that."""
     scene = flat(False, 40, 1e-5, 0.03)
-    pairs = find_overlaps(single(scene.cloud), scene.planes, 3.2)
+    overlaps = find_overlaps(single(scene.cloud), scene.planes, 3.2)
     for k in range(len(scene.planes)):
         shown = render(scene.cloud.take(torch.tensor([k])), scene.planes.take([k]), backend="reference")
         assert shown.max() > 0.3 * scene.cloud.amplitude[k]
-        assert k in pairs.gaussian[pairs.start[k] : pairs.start[k + 1]]
+        assert k in overlaps.gaussian[overlaps.start[k] : overlaps.start[k + 1]]
 
 
 def test_a_cloud_whose_origin_is_far_from_it_loses_no_pair() -> None:
@@ -272,11 +271,8 @@ def test_clouds_that_are_not_numbers_are_refused(name: str, tally: Tally) -> Non
 def test_calls_that_make_no_sense_are_refused(backend: str, tally: Tally) -> None:
     scene = head_scene()
     cloud, n = single(scene.cloud), len(scene.planes)
-    bad: list[dict[str, Any]] = [
-        {"twist": torch.full((n, 6), torch.nan)},
-        {"log_gain": torch.full((n,), torch.inf)},
-        {"attenuation": "other"},
-    ]
+    twist, log_gain = torch.full((n, 6), torch.nan), torch.full((n,), torch.inf)
+    bad: list[dict[str, Any]] = [{"twist": twist}, {"log_gain": log_gain}, {"attenuation": "other"}]
     for options in bad:
         with tally.refusal():
             render(cloud, scene.planes, backend=backend, **options)
@@ -288,8 +284,8 @@ def test_calls_that_make_no_sense_are_refused(backend: str, tally: Tally) -> Non
 
 def test_a_sigma_of_more_pixels_than_integers_hold_is_refused(tally: Tally) -> None:
     scene = head_scene()
-    log_scale = torch.full_like(scene.cloud.log_scale, np.log(0.99 * SIGMA_RANGE_MM[1]))
-    cloud = GaussianCloud.of([scene.cloud.mean_mm, log_scale, *scene.cloud.parameters[2:]], ORIGIN_MM)
+    mean, log_scale, *rest = scene.cloud.parameters
+    cloud = GaussianCloud.of([mean, torch.full_like(log_scale, np.log(0.99 * SIGMA_RANGE_MM[1])), *rest], ORIGIN_MM)
     with tally.case():
         pixels = render(single(cloud), scene.planes, cutoff_sigma=6.0)
         assert (pixels - cloud.amplitude.sum()).abs().max() < 1e-4 * cloud.amplitude.sum()

@@ -81,10 +81,10 @@ def test_images_are_linear_in_the_peaks(
     scene, _ = scene_and_ratio
     cloud = single(scene.cloud)
     other = cloud.with_amplitude(torch.from_numpy(np.random.default_rng(seed).normal(size=len(cloud))).float())
-    pairs = find_overlaps(cloud, scene.planes, 3.2)
+    overlaps = find_overlaps(cloud, scene.planes, 3.2)
     with tally.case():
         first, second, both = (
-            render(c, scene.planes, pairs=pairs)
+            render(c, scene.planes, overlaps=overlaps)
             for c in (cloud, other, cloud.with_amplitude(cloud.amplitude + factor * other.amplitude))
         )
         size = float(cloud.amplitude.abs().sum() + abs(factor) * other.amplitude.abs().sum())

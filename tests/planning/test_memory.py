@@ -141,8 +141,8 @@ def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices)
     assert all("choose a coarser --resolution" in line for line in refused if "--no-prior" not in line)
 
 
-def test_records_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
-    """Many Gaussians: the records of their pairs lead."""
+def test_projections_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
+    """Many Gaussians: their projections take the most."""
     many = replace(DRAFT, gaussian_spacing_pixels=0.3, use_prior=False)
     free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
     assert free.stage == "fit to slices"
@@ -150,7 +150,7 @@ def test_records_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
     kept = plan.settings.slice_stage.projection_bytes
     assert MIN_PROJECTION_BYTES <= kept < many.slice_stage.projection_bytes
     assert plan.settings.prior_stage.projection_bytes == kept
-    assert any("pairs kept in" in change for change in plan.changes)
+    assert any("projections kept in" in change for change in plan.changes)
 
 
 @pytest.fixture

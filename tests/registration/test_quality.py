@@ -71,7 +71,7 @@ def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -
     for line, stack, one in zip(lines, stacks, found, strict=True):
         assert line.startswith(f"{stack.name}: registration probably failed")
         assert f"{one.held_out_correlation:.2f}" in line
-        assert "do not trust" in line
+        assert "do not rely on" in line
     assert registration_summary(found).startswith("0 of 3")
 
 

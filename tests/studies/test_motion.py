@@ -74,7 +74,7 @@ def test_layer_tables_leave_gaps_where_nothing_was_measured() -> None:
 
 
 def test_bias_table() -> None:
-    row = {"volume": "v", "bias": 0.15, "shading": "estimated", "seed": 7, "median_mm": 0.5, "p90_mm": 1.0}
+    row = {"volume": "v", "bias": 0.15, "bias_field": "estimated", "seed": 7, "median_mm": 0.5, "p90_mm": 1.0}
     row |= {"warned": False, "psnr_db": 28.0, "ssim": 0.97, "seconds": 26.4}
     alone = {name: value for name, value in row.items() if name not in ("psnr_db", "ssim")}
     text = bias.tables(SETTINGS | {"rows": {"a": row, "b": alone}})["bias"]

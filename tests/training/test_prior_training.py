@@ -46,8 +46,7 @@ def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
 def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
     """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
     generator = torch.Generator().manual_seed(seed)
-    truth = smooth_noise(generator, size)
-    density = 3 * smooth_noise(generator, size)
+    truth, density = smooth_noise(generator, size), 3 * smooth_noise(generator, size)
     error = -0.5 * torch.exp(-density) * truth + 0.02 * torch.randn(truth.shape, generator=generator)
     mask = torch.ones_like(truth)
     mask[:, :3] = 0
