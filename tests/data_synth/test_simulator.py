@@ -121,7 +121,7 @@ def test_orientations_and_handedness() -> None:
 
 def test_generator_decides_everything() -> None:
     def make(seed: int, n: int = 2) -> list[SimulatedStack]:
-        state = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002 - the global state must stay untouched
+        state = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002 - must not change
         settings = orthogonal_settings(n, "severe")
         stacks = simulate_stacks(smooth_volume(), BALL, AFFINE, settings, np.random.default_rng(seed))
         np.testing.assert_array_equal(state, np.random.get_state(legacy=False)["state"]["key"])  # noqa: NPY002

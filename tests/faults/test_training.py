@@ -94,6 +94,7 @@ def test_a_training_is_the_same_when_repeated(whole: dict[int, float], tmp_path:
 
 
 @pytest.mark.faults
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
 @pytest.mark.parametrize("end_at", [4, 11])
 def test_a_training_that_ended_goes_on_at_the_same_losses(
     whole: dict[int, float], tmp_path: Path, tally: Tally, end_at: int
@@ -130,7 +131,9 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
 
 CONFIG = """
 seed_everything: 5
-model: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
+model:
+  class_path: g3r.training.prior_module.PriorModule
+  init_args: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:

@@ -110,11 +110,7 @@ SCENES: dict[str, tuple[Callable[[], Scene], float]] = {
         for s in (0.02, 0.3, 100.0)
         for t in (0.0, 0.1, 2.2, 20.0)
     },
-    **{
-        f"axis ratio {r:g}{', PSF' * psf}": (partial(slender, r, psf), r)
-        for r in (30.0, 1000.0)
-        for psf in (False, True)
-    },
+    **{f"axis ratio {r:g}{', PSF' * p}": (partial(slender, r, p), r) for r in (30.0, 1000.0) for p in (False, True)},
     "flat discs in V(x)": (lambda: flat(False), 5000.0),
     "flat discs in thin slices": (lambda: flat(True), 5000.0),
     **{f"slices of {t:g} mm": (partial(of_thickness, t), 3.0) for t in (0.1, 20.0)},

@@ -31,6 +31,7 @@ from tests.training.small_runs import assert_export_refuses, in_memory, logged, 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/pose.yaml"
+Trained = tuple[Path, Path, PoseModule]
 
 
 def sample(seed: int, n_stacks: int = 2, n_slices: int = 5) -> dict[str, torch.Tensor]:
@@ -78,7 +79,7 @@ class TinyData(lightning.LightningDataModule):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseModule]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A run of one epoch: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
@@ -89,7 +90,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseM
     return folder, folder / "last.ckpt", module
 
 
-def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, PoseModule]) -> None:
+def test_tensorboard_has_scalars_and_the_panel(trained: Trained) -> None:
     log = logged(trained[0] / "run" / "version_0")
     scores = {"val/slice_mm", "val/slice_deg", "val/stack_deg", "val/stacks_within_20deg", "val/stack_mm_1"}
     train = {"train/mm_step0", "train/mm_step1", "train/vote_step0", "train/samples_per_second"}
@@ -97,22 +98,20 @@ def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, PoseMo
     assert len(log.Tags()["images"]) == 1
 
 
-def test_the_template_is_the_data_module_s(trained: tuple[Path, Path, PoseModule]) -> None:
+def test_the_template_is_the_data_module_s(trained: Trained) -> None:
     heads = torch.from_numpy(TinyData().template().volume)
     torch.testing.assert_close(trained[2].network.template.permute(3, 0, 1, 2), heads)
     assert trained[2].weeks == [25.0, 26.0]
 
 
-def test_resuming_goes_on(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
+def test_resuming_goes_on(trained: Trained, tmp_path: Path) -> None:
     module = PoseModule(**SMALL)
     run = trainer(tmp_path, max_epochs=2)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 6
 
 
-def test_export_gives_the_same_network(
-    trained: tuple[Path, Path, PoseModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, checkpoint, module = trained
     path = tmp_path / "pose.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
@@ -139,7 +138,7 @@ def test_export_gives_the_same_network(
     ],
 )
 def test_export_refuses(
-    trained: tuple[Path, Path, PoseModule],
+    trained: Trained,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     alter: Callable[[dict[str, Any]], object],
@@ -157,7 +156,7 @@ def test_data_that_do_not_fit(tmp_path: Path, settings: dict[str, Any], message:
         trainer(tmp_path, max_epochs=1).fit(PoseModule(**SMALL), TinyData(**settings))
 
 
-def test_resuming_with_another_template_is_refused(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
+def test_resuming_with_another_template_is_refused(trained: Trained, tmp_path: Path) -> None:
     module = PoseModule(**SMALL)
     with pytest.raises(InputError, match="resume with the same data"):
         trainer(tmp_path, max_epochs=2).fit(module, TinyData(n_ages=3), ckpt_path=trained[1], weights_only=True)
@@ -198,7 +197,7 @@ def test_disturbed_poses_stay_rigid_and_some_heads_stay_as_they_are() -> None:
     assert 5 < changed.all(1).sum() < n_heads - 5
 
 
-def test_starting_from_other_weights(trained: tuple[Path, Path, PoseModule], tmp_path: Path) -> None:
+def test_starting_from_other_weights(trained: Trained, tmp_path: Path) -> None:
     fresh = PoseModule(**SMALL, start_from=str(trained[1]))
     for one, other in zip(fresh.network.parameters(), trained[2].network.parameters(), strict=True):
         torch.testing.assert_close(one, other.cpu())

@@ -35,6 +35,7 @@ from tests.training.small_runs import assert_export_refuses, in_memory, logged, 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
+Trained = tuple[Path, Path, training.PriorModule]
 
 
 def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
@@ -68,7 +69,7 @@ class TinyData(lightning.LightningDataModule):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, training.PriorModule]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A run of two steps: its folder, its checkpoint, its module."""
     folder = tmp_path_factory.mktemp("training")
     torch.manual_seed(0)
@@ -79,7 +80,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, train
     return folder, folder / "last.ckpt", module
 
 
-def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, training.PriorModule]) -> None:
+def test_tensorboard_has_scalars_and_the_panel(trained: Trained) -> None:
     log = logged(trained[0] / "run" / "version_0")
     scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
@@ -89,20 +90,18 @@ def test_tensorboard_has_scalars_and_the_panel(trained: tuple[Path, Path, traini
     assert (image.height, image.width) == (16, 7 * 16)
 
 
-def test_training_moves_the_weights(trained: tuple[Path, Path, training.PriorModule]) -> None:
+def test_training_moves_the_weights(trained: Trained) -> None:
     assert float(trained[2].network.refiner.head.weight.detach().abs().max()) > 0
 
 
-def test_resuming_goes_on(trained: tuple[Path, Path, training.PriorModule], tmp_path: Path) -> None:
+def test_resuming_goes_on(trained: Trained, tmp_path: Path) -> None:
     module = training.PriorModule(replace(NETWORK, alpha=0.1), warmup_steps=1)
     run = trainer(tmp_path, max_steps=3)
     run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
     assert run.global_step == 3
 
 
-def test_export_gives_the_same_network(
-    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, checkpoint, module = trained
     path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
@@ -118,7 +117,7 @@ def test_export_gives_the_same_network(
 
 
 def test_export_does_not_overwrite_unless_told(
-    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "prior.safetensors"
     path.write_text("precious")
@@ -149,7 +148,7 @@ def spoil(content: dict[str, Any]) -> None:
     ],
 )
 def test_export_refuses(
-    trained: tuple[Path, Path, training.PriorModule],
+    trained: Trained,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     alter: Callable[[dict[str, Any]], object],
@@ -159,7 +158,7 @@ def test_export_refuses(
 
 
 def test_export_wants_the_ending_of_its_format(
-    trained: tuple[Path, Path, training.PriorModule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export.main([str(trained[1]), str(tmp_path / "prior.pt")]) == 3
     assert "expected a name that ends in .safetensors" in capsys.readouterr().err
