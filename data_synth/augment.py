@@ -86,16 +86,22 @@ def transformed(volume: TruthVolume, transform: tio.Transform, rng: np.random.Ge
 def applied(transform: tio.Transform, subject: tio.Subject, rng: np.random.Generator) -> Any:
     """Apply a torchio transform whose random numbers come from `rng`.
 
-    torchio draws from torch's global generator; it is seeded here and put back afterwards.
+    torchio draws from torch's global generator; it is seeded here and put back afterwards. One thread: torch's powers
+    differ in the last bit where the shares of two threads meet, and numba changes the number of torch's threads.
 
     Args:
         transform: to apply.
         subject: torchio's.
         rng: source of the seed.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**62)))
-        return transform(subject)
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(rng.integers(2**62)))
+            return transform(subject)
+    finally:
+        torch.set_num_threads(n_threads)
 
 
 def _other_anatomy(volume: TruthVolume, rng: np.random.Generator) -> TruthVolume:

@@ -72,9 +72,9 @@ def test_a_row_per_volume_and_a_bar_for_maps(tmp_path: Path) -> None:
     volumes = {"coarse": ball(), "density": 3 * ball(radius=9), "volume": ball(radius=9)}
     save_sections(tmp_path / "three.png", volumes, AFFINE, ball(radius=10), title="three rows")
     save_sections(tmp_path / "one.png", {"volume": ball()}, AFFINE, ball(radius=10))
-    three, one = Image.open(tmp_path / "three.png"), Image.open(tmp_path / "one.png")
-    assert 2.3 < three.height / one.height < 3
-    assert np.asarray(three.convert("HSV"))[..., 1].max() > 200, "the density row is in colour"
+    with Image.open(tmp_path / "three.png") as three, Image.open(tmp_path / "one.png") as one:
+        assert 2.3 < three.height / one.height < 3
+        assert np.asarray(three.convert("HSV"))[..., 1].max() > 200, "the density row is in colour"
 
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e-30, 1e30, np.nan])
