@@ -70,7 +70,7 @@ class SubjectCache:
     def load(self, epoch: int, index: int) -> SyntheticSubject | None:
         """The subject of that number, or None where it is not kept (or its file is damaged)."""
         try:
-            with np.load(self._path(epoch, index), allow_pickle=False) as file:
+            with self._path(epoch, index).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 found = {name: file[name] for name in file.files}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None

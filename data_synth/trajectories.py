@@ -48,7 +48,7 @@ def load_trajectories(path: str | Path) -> list[RecordedTrajectory]:
         InputError: no such file, another kind of file, or a trajectory that is not [T, 3].
     """
     try:
-        with np.load(path) as content:
+        with open(path, "rb") as stream, np.load(stream) as content:
             arrays = {name: np.asarray(content[name], dtype=np.float64) for name in content.files}
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as npz; expected rot_* (rad) and trans_* (mm)") from error

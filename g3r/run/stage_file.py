@@ -55,7 +55,7 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
     known = {record.__name__: record for record in records}
     damaged = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         return _unpacked(json.loads(arrays.pop(TREE).tobytes()), arrays, known)
     except damaged as error:
