@@ -54,7 +54,7 @@ def draw_lesions_kept(subject: str, sections: Mapping[int, Path], variants: Sequ
     size = ((n_columns + 0.4) * PANEL_INCHES, (len(names) + 0.35) * PANEL_INCHES)
     figure = new_figure(size, facecolor="black")
     panels = figure.subplots(len(names), n_columns, squeeze=False)
-    columns = [(n, np.load(file), kind) for n, file in sections.items() for kind in HALF_WIDTH_MM]
+    columns = [(n, _arrays(file), kind) for n, file in sections.items() for kind in HALF_WIDTH_MM]
     for column, (n, shown, kind) in enumerate(columns):
         for row, name in enumerate(names):
             panel = panels[row, column]
@@ -83,3 +83,8 @@ def _section(
     reach = np.ceil(half_mm / grid.spacing_mm).astype(int)
     plane = np.pad(volume[:, :, center[2]], ((reach[0], reach[0]), (reach[1], reach[1])))
     return plane[center[0] : center[0] + 2 * reach[0] + 1, center[1] : center[1] + 2 * reach[1] + 1]
+
+
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    with np.load(file) as data:
+        return dict(data)
