@@ -145,7 +145,8 @@ def test_as_a_process(command: str, tmp_path: Path, tally: Tally) -> None:
     words, code = REAL[command]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tally.case() as case:
-        line = [sys.executable, "-m", f"g3r.cli.{command}", *words]
+        module = "data_synth.cli" if command == "simulate" else f"g3r.cli.{command}"
+        line = [sys.executable, "-m", module, *words]
         root = Path(infer.__code__.co_filename).parents[2]
         done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, env=_environment(root))
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
