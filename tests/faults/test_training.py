@@ -137,7 +137,7 @@ model:
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
-    {spacing_mm: 2.0, patch_size: 24, patches_per_subject: 2, batch_size: 3, subjects_per_epoch: 5,
+    {spacing_mm: 3.0, patch_size: 24, patches_per_subject: 2, batch_size: 3, subjects_per_epoch: 5,
      val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1}
 trainer:
   accelerator: cpu
