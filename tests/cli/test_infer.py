@@ -19,19 +19,8 @@ from g3r.evaluation.pose_error import read_poses, slice_points, target_registrat
 from g3r.gaussians import GaussianCloud
 from g3r.output.files import OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.planning.presets import PRESETS, ReconstructionSettings
+from tests.faults.small_case import WHOLE
 
-OUTPUTS = {
-    "volume.nii.gz",
-    "mask.nii.gz",
-    "prior.nii.gz",
-    "coarse.nii.gz",
-    "density.nii.gz",
-    "uncertainty.nii.gz",
-    "gaussians.npz",
-    "slices.tsv",
-    "run.json",
-    "sections.png",
-}
 QUICK = ("--preset", "draft", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 
 
@@ -62,7 +51,7 @@ def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_every_output_is_there_and_nothing_else(reconstructed: Path) -> None:
-    assert {path.name for path in reconstructed.iterdir()} == OUTPUTS == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
+    assert {path.name for path in reconstructed.iterdir()} == WHOLE == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
     assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
 
 
@@ -146,7 +135,7 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
     assert (tmp_path / "volume.nii.gz").read_text() == "mine"
     forced = run("infer", *inputs(subject), *QUICK, "--output", tmp_path, "--force")
     assert forced.returncode == 0, forced.stderr
-    assert {path.name for path in tmp_path.iterdir()} == OUTPUTS | {"notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == WHOLE | {"notes.txt"}
     # the same seed on one thread gives the same volume
     np.testing.assert_array_equal(
         load_volume(tmp_path / "volume.nii.gz").data, load_volume(reconstructed / "volume.nii.gz").data
@@ -157,7 +146,7 @@ def test_from_python_in_three_lines(subject: Path, tmp_path: Path) -> None:
     stacks = [load_stack(s, m, 4.0) for s, m in zip(files(subject, "stack"), files(subject, "mask"), strict=True)]
     result = GaussianReconstructor(settings=quick_settings()).reconstruct(stacks)
     result.save(tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WHOLE
     assert result.volume.shape == result.grid.shape
 
 
@@ -261,7 +250,7 @@ def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path) -> 
     # a later result without the prior leaves no map of another behind
     done = run("infer", *inputs(subject), *QUICK, "--force", "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUTS
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WHOLE
 
 
 # -- refusals --------------------------------------------------------------------------------------
