@@ -15,6 +15,8 @@ from data_synth.data_module import VALIDATION_SEED, SyntheticDataModule
 from data_synth.heads import phantom_subjects
 from data_synth.prior_samples import Patches, SyntheticSubjects
 from data_synth.subject_dataset import EpochSampler
+from data_synth.template import atlas_templates
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
 
 MIXED_SUBJECTS = 4
@@ -22,10 +24,10 @@ MIXED_SUBJECTS = 4
 
 
 class StackSynthesisDataModule(SyntheticDataModule):
-    """Patches of (V_coarse, M_rho, V_sharp, truth, mask) from an atlas folder or the built-in phantom.
+    """Patches of a subject's volumes from an atlas folder or the built-in phantom.
 
-    A batch is a dict of float32 tensors [B, 1, I, J, K] with the keys `coarse`, `density`, `sharp`, `truth`
-    and `mask`, and `n_stacks`, int64 [B].
+    A batch is a dict of float32 tensors [B, 1, I, J, K] with the keys `coarse`, `density`, `share`, `sharp`,
+    `template`, `outline`, `truth` and `mask`, and `n_stacks`, int64 [B].
 
     Args:
         phantom_share: share (0 to 1) of phantoms among the training subjects of an atlas folder.
@@ -40,6 +42,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
             is filled, ghosts or a spike (`data_synth.artefacts`); 0 for none.
         distinct_epochs: after this many epochs the same subjects come again, in other patches; 0 for never.
         cache: folder that keeps synthetic subjects once made (about 15 MB each); None keeps none.
+        template_spacing_mm: voxel size of the atlas template.
         common: see `SyntheticDataModule`.
 
     Raises:
@@ -59,6 +62,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
         artefact_share: float = 0.02,
         distinct_epochs: int = 0,
         cache: str | None = None,
+        template_spacing_mm: float = 1.6,
         **common: Any,
     ) -> None:
         super().__init__(**common)
@@ -75,17 +79,28 @@ class StackSynthesisDataModule(SyntheticDataModule):
                 "patches; raise subjects_per_epoch"
             )
         self.spacing_mm = spacing_mm
+        self._template: AtlasTemplate | None = None
+
+    def template(self) -> AtlasTemplate:
+        """The atlas template of the training subjects, which the network carries."""
+        if self._template is None:
+            self._template = atlas_templates(
+                self.subjects(self.hparams["val_subjects"])[0], self.hparams["template_spacing_mm"]
+            )
+        return self._template
 
     def make_sets(self) -> tuple[SyntheticSubjects, SyntheticSubjects]:
         """Patches of subjects that differ from epoch to epoch, and central cubes of the same few each time."""
         h: Any = self.hparams
         train, val = self.subjects(h.val_subjects)
+        template = self.template()
         n_phantoms = round(len(train) * h.phantom_share / (1 - h.phantom_share)) if h.source != "phantom" else 0
         # spread over the names, which mostly sort by age
         step = max(1, len(val) // h.val_subjects)
         common = {"spacing_mm": h.spacing_mm, "artefact_share": h.artefact_share, "cache": h.cache}
         return SyntheticSubjects(
             [*train, *phantom_subjects(n_phantoms, h.seed, "training")],
+            template,
             length=h.subjects_per_epoch,
             seed=h.seed,
             patch_size=h.patch_size,
@@ -94,6 +109,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
             **common,
         ), SyntheticSubjects(
             val[step // 2 :: step][: h.val_subjects],
+            template,
             length=h.val_subjects,
             seed=h.seed + VALIDATION_SEED,
             patch_size=h.val_crop,

@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from data_synth.artefacts import with_artefacts
 from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
-from data_synth.heads import Subject, load_volume_of
+from data_synth.heads import Subject, load_volume_of, weeks_of
 from data_synth.mask_errors import SKULL_RIM_SHARE, SMALL_MASK_SHARE, with_mask_errors, with_skull_rim
 from data_synth.protocol_sampling import draw_settings
 from data_synth.registration_errors import ResidualKind, draw_residual_kind, mean_motion, residual_errors
 from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 from data_synth.subject_cache import SubjectCache, SyntheticSubject
 from data_synth.subject_dataset import SubjectDataset
+from data_synth.uneven_coverage import with_uneven_coverage
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
+from g3r.acquisition.coverage import brain_share, coverage
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
+from g3r.acquisition.template_fit import fit_template
 from g3r.geometry import RigidPose, VolumeGrid
 
-IMAGE_KEYS = ("coarse", "density", "sharp", "truth", "mask")
+IMAGE_KEYS = ("coarse", "density", "share", "sharp", "template", "outline", "truth", "mask")
 Patches = dict[str, Tensor]
 """`IMAGE_KEYS` float32 [P, 1, I, J, K] and `n_stacks` int64 [P]."""
 
@@ -38,6 +44,15 @@ UNKNOWN_MOTION_SHARE = 0.6
 """How often nothing is known of how the slices of a single stack moved against each other."""
 NOTICED_SHARE = 0.7
 """How often a slice without signal has been given a low weight."""
+DISTRUSTED_SHARE = 0.15
+"""How often registration gave a run of up to `DISTRUSTED_SLICES` slices of a subject no weight."""
+DISTRUSTED_SLICES = 4
+
+OTHER_AGE_WEEKS = (2.0, 4.5)
+"""Templates are drawn among those whose age differs by so much: a nearer one was made of the subject itself, or of one
+that is nearly the same image, and no subject in use will find one as alike."""
+START_DEG, START_MM, START_SCALE = 2.0, 1.5, 0.03
+"""Standard deviations of the place of the template before it is fitted, per axis, and of the log of its size."""
 
 
 class SyntheticSubjects(SubjectDataset[Patches]):
@@ -55,11 +70,13 @@ class SyntheticSubjects(SubjectDataset[Patches]):
             from the middle of the grid.
         distinct: after this many epochs the same subjects come again, cut into other patches; 0 for never.
         cache: folder that keeps subjects once made; None keeps none.
+        template: to fit to the seen part of each head.
     """
 
     def __init__(
         self,
         subjects: Sequence[Subject],
+        template: AtlasTemplate,
         *,
         spacing_mm: float,
         length: int,
@@ -72,6 +89,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         cache: str | Path | None = None,
     ) -> None:
         super().__init__(subjects, length, seed, in_order)
+        self.template = template
         self.spacing_mm = spacing_mm
         self.patch_size = patch_size
         self.n_patches = n_patches
@@ -115,7 +133,16 @@ class SyntheticSubjects(SubjectDataset[Patches]):
             truth = augmented(truth, self.augmentation, rng)
         truth = _padded(cropped(truth, MARGIN_VOXELS), self.patch_size)
         n_stacks = 1 + index % MAX_VALIDATION_STACKS if self.in_order else None
-        return synthesise(truth, rng, n_stacks, self.artefact_share)
+        head = self._template_head(weeks_of(self.subjects[which]), rng)
+        return synthesise(truth, head, rng, n_stacks, self.artefact_share)
+
+    def _template_head(self, weeks: float, rng: np.random.Generator) -> TemplateHead:
+        """The template to fit: of the subject's age to validate, of another one to train."""
+        apart = np.abs(self.template.weeks - weeks)
+        nearest, furthest = OTHER_AGE_WEEKS
+        others = np.flatnonzero((apart >= nearest) & (apart <= furthest))
+        chosen = int(apart.argmin()) if self.in_order or not len(others) else int(rng.choice(others))
+        return TemplateHead(self.template.volume[chosen], self.template.grid)
 
 
 def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int]) -> list[NDArray[np.int64]]:
@@ -132,13 +159,31 @@ def patch_corners(mask: NDArray[np.bool_], size: int, n: int, seed: Sequence[int
     return list(np.clip(center - size // 2, 0, np.array(mask.shape) - size))
 
 
+@dataclass(frozen=True)
+class TemplateHead:
+    """One head of an atlas template, in the atlas frame.
+
+    Args:
+        volume: [I, J, K] float32, zero outside the brain.
+        grid: about the origin.
+    """
+
+    volume: NDArray[np.float32]
+    grid: VolumeGrid
+
+
 def synthesise(
-    truth: TruthVolume, rng: np.random.Generator, n_stacks: int | None = None, artefact_share: float = 0.0
+    truth: TruthVolume,
+    template: TemplateHead,
+    rng: np.random.Generator,
+    n_stacks: int | None = None,
+    artefact_share: float = 0.0,
 ) -> SyntheticSubject:
     """One training subject from a truth volume: stacks with random settings, pose errors, G3R Eq. 6.
 
     Args:
         truth: the head.
+        template: fitted to what the slices saw.
         rng: source of randomness.
         n_stacks: drawn when None.
         artefact_share: see `with_artefacts`.
@@ -155,26 +200,49 @@ def synthesise(
         stacks = with_artefacts(stacks, artefact_share, rng.spawn(1)[0])
     if kind < SKULL_RIM_SHARE + SMALL_MASK_SHARE:
         stacks = with_mask_errors(stacks, rng, grow=kind < SKULL_RIM_SHARE)
+    stacks = with_uneven_coverage(stacks, rng)
     slices = slices_from_stacks([one.stack for one in stacks])
     grid = VolumeGrid(truth.data.shape, truth.affine)
     found = _registered_poses(stacks, settings, slices, grid.center_mm, residual, rng)
-    weight = _pixel_weights(stacks, slices, rng)
+    slice_weight = _slice_weights(stacks, slices, rng)
+    weight = slice_weight[slices.pixel_plane]
     slices = slices.with_pose(found)
-    coarse, density = coarse_and_density(slices, grid, weight=weight)
+    coarse, masked = coarse_and_density(slices, grid, weight=weight)
+    density = coverage(slices, grid, slice_weight)
+    share = brain_share(masked, density)
     sharp = sharpened_volume(slices, grid, coarse, weight=weight)
-    scale = np.float32(normalisation_scale(coarse, density))
+    scale = np.float32(normalisation_scale(coarse, masked))
     inside = np.where(truth.mask, truth.data, 0) / scale
+    sharp = sharp / scale
+    placed = _placed(template, truth, rng)
+    fitted = fit_template(template.volume, placed, sharp, share, np.minimum(density, 1), grid)
     return SyntheticSubject(
         coarse=coarse / scale,
         density=density,
-        sharp=sharp / scale,
+        share=share,
+        sharp=sharp,
+        template=fitted.values,
+        outline=fitted.inside,
         truth=inside.astype(np.float32),
         mask=truth.mask,
         affine=truth.affine,
         name=truth.name,
-        n_stacks=len(stacks),
+        n_stacks=slices.n_stacks,
         residual=residual,
     )
+
+
+def _placed(template: TemplateHead, truth: TruthVolume, rng: np.random.Generator) -> VolumeGrid:
+    """The template's grid at the head, about as registration places it."""
+    head_grid = VolumeGrid(truth.data.shape, truth.affine)
+    here, there = head_grid.world(np.argwhere(truth.mask)), template.grid.world(np.argwhere(template.volume > 0))
+    scale = here.std() / there.std() * np.exp(rng.normal(0, START_SCALE))
+    turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0, START_DEG, 3))).as_matrix()
+    affine = np.eye(4)
+    affine[:3, :3] = scale * turn @ template.grid.affine[:3, :3]
+    shift_mm = here.mean(0) + rng.normal(0, START_MM, 3)
+    affine[:3, 3] = shift_mm + scale * turn @ (template.grid.affine[:3, 3] - there.mean(0))
+    return VolumeGrid(template.grid.shape, affine)
 
 
 def _registered_poses(
@@ -195,11 +263,15 @@ def _registered_poses(
     return residual_errors(residual, slices.stack_id, exact.translation_mm, rng) @ exact
 
 
-def _pixel_weights(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Weight of each masked pixel: registration mostly notices slices without signal."""
+def _slice_weights(stacks: Sequence[SimulatedStack], slices: Slices, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Weight [K] of each slice: registration mostly notices slices without signal, and at times distrusts others."""
     dropout = np.array([stacks[s].dropout[k] for s, k in zip(slices.stack_id, slices.slice_index, strict=True)])
     noticed = dropout & (rng.random(len(dropout)) < NOTICED_SHARE)
-    return np.where(noticed, rng.uniform(0, 0.3, len(dropout)), 1.0)[slices.pixel_plane]
+    weight = np.where(noticed, rng.uniform(0, 0.3, len(dropout)), 1.0)
+    if rng.random() < DISTRUSTED_SHARE and len(slices) > 3 * DISTRUSTED_SLICES:
+        first = int(rng.integers(len(slices) - DISTRUSTED_SLICES))
+        weight[first : first + int(rng.integers(1, DISTRUSTED_SLICES + 1))] = 0
+    return weight
 
 
 def _per_slice(

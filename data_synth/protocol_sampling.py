@@ -10,7 +10,7 @@ from data_synth.motion import LEVELS
 from data_synth.registration_errors import ResidualKind
 from data_synth.simulator import Orientation, StackSettings
 
-N_STACKS_SHARE = {1: 0.3, 2: 0.17, 3: 0.32, 4: 0.09, 5: 0.06, 6: 0.06}
+N_STACKS_SHARE = {1: 0.35, 2: 0.2, 3: 0.3, 4: 0.07, 5: 0.04, 6: 0.04}
 DROPOUT_SHARE_IF_GROSS = 0.03
 
 
@@ -49,8 +49,10 @@ def draw_settings(residual: ResidualKind, rng: np.random.Generator, n_stacks: in
 
 
 def _draw_gap_mm(thickness_mm: float, rng: np.random.Generator) -> float:
-    """Slices mostly touch; otherwise there are gaps, or slices overlap by up to a half."""
+    """Slices mostly touch; otherwise there are gaps, some as wide as the slices, or slices overlap by up to a half."""
     kind = rng.random()
-    if kind < 0.55:
+    if kind < 0.5:
         return 0.0
-    return float(rng.uniform(0.0, 1.5)) if kind < 0.85 else -float(rng.uniform(0.1, 0.5)) * thickness_mm
+    if kind < 0.74:
+        return float(rng.uniform(0.0, 1.5))
+    return float(rng.uniform(0.5, 1.0) if kind < 0.88 else -rng.uniform(0.1, 0.5)) * thickness_mm

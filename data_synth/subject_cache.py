@@ -14,7 +14,7 @@ from data_synth.registration_errors import ResidualKind
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
-SYNTHESIS_VERSION = 2
+SYNTHESIS_VERSION = 3
 """Raised whenever the synthesis changes, so that subjects of an earlier one are not taken."""
 
 
@@ -24,8 +24,11 @@ class SyntheticSubject:
 
     Args:
         coarse: [I, J, K] V_coarse.
-        density: [I, J, K] M_rho.
+        density: [I, J, K] M_rho, over whole slices.
+        share: [I, J, K] of the density whose masks say brain.
         sharp: [I, J, K] V_sharp.
+        template: [I, J, K] an atlas template fitted to what the slices saw.
+        outline: [I, J, K] share of brain in it.
         truth: [I, J, K], zero outside the mask.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
@@ -36,7 +39,10 @@ class SyntheticSubject:
 
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
+    share: NDArray[np.float32]
     sharp: NDArray[np.float32]
+    template: NDArray[np.float32]
+    outline: NDArray[np.float32]
     truth: NDArray[np.float32]
     mask: NDArray[np.bool_]
     affine: NDArray[np.float64]

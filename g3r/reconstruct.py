@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.foreground import Foreground
+from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
@@ -18,6 +19,7 @@ from g3r.errors import InputError
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
+from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose, VolumeGrid
@@ -44,6 +46,8 @@ STORED_RECORDS = (
     PriorCloud,
     SliceFit,
     Slices,
+    FieldsOfView,
+    Foreground,
     Planes,
     RigidPose,
     Orientation,
@@ -193,9 +197,12 @@ class GaussianReconstructor:
 
     def _volumes(self, poses: Registration, run: RunContext) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
-        return run.stage(
-            Stage.COARSE, lambda: InitialVolumes.of(poses.slices, poses.gain, poses.weight, self._voxel_mm)
-        )
+        return run.stage(Stage.COARSE, lambda: self._volumes_of(poses.slices, poses.gain, poses))
+
+    def _volumes_of(self, slices: Slices, gain: NDArray[np.float64], poses: Registration) -> InitialVolumes:
+        placed = placed_template(self.prior, poses.orientation)
+        box_mm = placed.box_mm() if placed else None
+        return InitialVolumes.of(slices, gain, poses.weight, self._voxel_mm, box_mm)
 
     @property
     def _voxel_mm(self) -> float:
@@ -206,38 +213,35 @@ class GaussianReconstructor:
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         report = run.report(Stage.PRIOR)
         report(0, 1)
-        values = run.stage(Stage.PRIOR, lambda: self._prior_values(volumes, plan.settings))
+        prior = run.stage(Stage.PRIOR, lambda: self._prior_volume(volumes, poses, plan.settings))
         report(1, 1)
-        prior = PriorVolume(volumes=volumes, values=values, gain=poses.gain, scale=volumes.scale)
         if volumes.slices.n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
-            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses.weight, plan.settings))
+            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses, plan.settings))
         run.notes.append(NOTE_ON_SINGLE[prior.accepted])
         return prior
 
-    def _prior_values(self, volumes: InitialVolumes, settings: ReconstructionSettings) -> NDArray[np.float32]:
-        if self.prior is None:
-            return volumes.sharp
+    def _prior_volume(
+        self, volumes: InitialVolumes, poses: Registration, settings: ReconstructionSettings
+    ) -> PriorVolume:
         tiling = Tiling(settings.prior_whole_voxels, settings.prior_tile_voxels, settings.prior_halo_voxels)
-        values = self.prior.estimate(
-            volumes.coarse, volumes.density, volumes.sharp, n_views=settings.prior_views, tiling=tiling
-        )
+        placed = placed_template(self.prior, poses.orientation)
+        found = prior_volume(volumes, poses.gain, self.prior, placed, n_views=settings.prior_views, tiling=tiling)
         release_memory()  # the most that is ever freed at a time
-        return values
+        return found
 
     def _slices_to_prior(
-        self, prior: PriorVolume, weight: NDArray[np.float64], settings: ReconstructionSettings
+        self, prior: PriorVolume, poses: Registration, settings: ReconstructionSettings
     ) -> PriorVolume:
         """The slices registered to the prior volume, and the prior volume that they give there."""
         before = prior.volumes
         slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
         if not accepted:
             return replace(prior, gain=gain, accepted=False)
-        volumes = InitialVolumes.of(slices, gain, weight, self._voxel_mm)
-        values = self._prior_values(volumes, settings)
-        scale = prior.scale * volumes.scale
-        return PriorVolume(volumes=volumes, values=values, gain=gain, scale=scale, accepted=True)
+        volumes = self._volumes_of(slices, gain, poses)
+        after = self._prior_volume(volumes, poses, settings)
+        return replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
 
     def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud | None:
         """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None where a stop was requested."""
@@ -245,7 +249,7 @@ class GaussianReconstructor:
 
         def fit() -> PriorCloud:
             n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
-            deadline = plan.for_fit_to_prior(volumes, prior.values, coarse_s, n_output_voxels)
+            deadline = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels)
             settings = plan.settings
             return fit_to_prior(
                 prior,

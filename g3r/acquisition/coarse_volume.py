@@ -12,7 +12,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
-DENSITY_CONVENTION = "dimensionless-thickness-v1"
+DENSITY_CONVENTION = "dimensionless-whole-slice-v2"
 """M = 1 where one gapless stack covers once; see `coarse_and_density`."""
 
 INTENSITY_CONVENTION = "p99-coarse-v1"

@@ -118,6 +118,33 @@ class Planes:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FieldsOfView:
+    """What whole slices cover, of which `Slices` keep only the part around the mask.
+
+    Args:
+        extent_mm: [K, 2, 2] lowest and highest in-plane position along x and y, in the frame of the cropped plane.
+        spacing_mm: [K] distance to the next slice of the stack along the normal, positive where numbers rise with it.
+        n_beyond: [K, 2] slices with signal before the first and after the last masked one of a stack, which were
+            looked at and hold no brain; zero for all other slices.
+    """
+
+    extent_mm: NDArray[np.float64]
+    spacing_mm: NDArray[np.float64]
+    n_beyond: NDArray[np.int64]
+
+    @classmethod
+    def of_planes(cls, planes: Planes) -> FieldsOfView:
+        """The planes themselves, and nothing beyond them."""
+        half = planes.shape * planes.spacing_mm / 2
+        n = len(planes)
+        return cls(extent_mm=np.stack([-half, half], axis=-1), spacing_mm=np.ones(n), n_beyond=np.zeros((n, 2), int))
+
+    def take(self, index: Selection) -> FieldsOfView:
+        """Those of some of the slices."""
+        return FieldsOfView(**{field: getattr(self, field)[index] for field in self.__dataclass_fields__})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Slices:
     """The acquired slices of all stacks: planes with their pixels, permuted and taken as one record.
 
@@ -129,6 +156,7 @@ class Slices:
         slice_index: [K] number of the slice in its stack.
         thickness_mm: [K].
         header_pose: [K] poses by the file's header.
+        view: what the whole slices cover; None where no more is known than the planes.
     """
 
     planes: Planes
@@ -138,9 +166,10 @@ class Slices:
     slice_index: NDArray[np.int64]
     thickness_mm: NDArray[np.float64]
     header_pose: RigidPose
+    view: FieldsOfView | None = None
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
+        for name in set(self.__dataclass_fields__) - {"view"}:
             expected = self.planes.n_pixels if name in ("value", "mask") else len(self.planes)
             if len(getattr(self, name)) != expected:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries; expected {expected}")
@@ -155,6 +184,11 @@ class Slices:
     def n_stacks(self) -> int:
         """Number of stacks with at least one slice."""
         return len(np.unique(self.stack_id))
+
+    @property
+    def fields_of_view(self) -> FieldsOfView:
+        """What the whole slices cover."""
+        return FieldsOfView.of_planes(self.planes) if self.view is None else self.view
 
     @cached_property
     def pixel_index(self) -> NDArray[np.int64]:
@@ -185,6 +219,7 @@ class Slices:
             slice_index=self.slice_index[chosen],
             thickness_mm=self.thickness_mm[chosen],
             header_pose=self.header_pose.take(chosen),
+            view=None if self.view is None else self.view.take(chosen),
         )
 
     def with_pose(self, pose: RigidPose) -> Slices:

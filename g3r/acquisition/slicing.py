@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
@@ -28,16 +29,17 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         raise InputError("no stack given; pass at least one")
     rotation, center, spacing, shape, psf = [], [], [], [], []
     values, masks, stack_id, slice_index, thickness = [], [], [], [], []
+    extent, distance, beyond = [], [], []
     for number, stack in enumerate(stacks):
         axes = stack.affine[:3, :3] / stack.spacing_mm
         # the header's third axis may be left-handed; the normal's sign does not matter to a symmetric PSF
         frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
         left, _, right = np.linalg.svd(frame)
         frame = left @ right
-        for k in range(stack.image.shape[2]):
+        used = np.flatnonzero(stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS)
+        n_beyond = _slices_beyond(stack, used)
+        for k in used:
             inside = stack.mask[:, :, k]
-            if inside.sum() < MIN_SLICE_PIXELS:
-                continue
             box = bounding_box(inside)
             middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
             rotation.append(frame)
@@ -50,6 +52,10 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             stack_id.append(number)
             slice_index.append(k)
             thickness.append(stack.thickness_mm)
+            whole = np.array([(-0.5, n - 0.5) for n in inside.shape]) - np.array(middle[:2])[:, None]
+            extent.append(whole * stack.spacing_mm[:2, None])
+            distance.append(stack.spacing_mm[2] * np.sign(frame[:, 2] @ axes[:, 2]))
+            beyond.append([n_beyond[0] if k == used[0] else 0, n_beyond[1] if k == used[-1] else 0])
     if not rotation:
         raise InputError(f"{stacks[0].name}: no slice with {MIN_SLICE_PIXELS} masked pixels; check the masks")
     planes = Planes(
@@ -67,7 +73,21 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         slice_index=np.array(slice_index, dtype=np.int64),
         thickness_mm=np.array(thickness),
         header_pose=planes.pose,
+        view=FieldsOfView(
+            extent_mm=np.array(extent), spacing_mm=np.array(distance), n_beyond=np.array(beyond, dtype=np.int64)
+        ),
     )
+
+
+def _slices_beyond(stack: Stack, used: NDArray[np.int64]) -> tuple[int, int]:
+    """How many slices with signal follow each other beyond the first and the last used one, outwards."""
+    if not len(used):
+        return 0, 0
+    # a slice of one value was not acquired, or was blanked
+    dark = stack.image.min((0, 1)) == stack.image.max((0, 1))
+    before, after = dark[: used[0]][::-1], dark[used[-1] + 1 :]
+    counts = [int(np.argmax(side)) if side.any() else len(side) for side in (before, after)]
+    return counts[0], counts[1]
 
 
 def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:

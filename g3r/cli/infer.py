@@ -157,6 +157,9 @@ def _print_summary(result: ReconstructionResult, folder: Path) -> None:
     print(f"picture: {folder / 'sections.png'}")
     if result.record.registration:
         print(f"poses:   {result.record.registration.summary}")
+    unseen = result.record.unseen.line() if result.record.unseen else None
+    if unseen:
+        print(f"unseen:  {unseen}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
 
 

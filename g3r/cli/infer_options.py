@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from g3r._version import __version__
 from g3r.planning import PRESET_NAMES
 
-DEFAULTS = {"preset": "balanced", "space": "standard", "resolution": 0.8, "seed": 0}
+DEFAULTS = {"preset": "balanced", "space": "standard", "unseen": "fill", "resolution": 0.8, "seed": 0}
 """Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
 
 
@@ -41,6 +41,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--space",
         choices=("standard", "scanner"),
         help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
+    )
+    parser.add_argument(
+        "--unseen",
+        choices=("fill", "blank"),
+        help="what to show of the brain where no slice looked: an estimate (fill, the default) or zeros (blank)",
     )
     parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
     parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")

@@ -143,6 +143,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         resolution_mm=options.resolution,
         seed=options.seed,
         use_prior=not options.no_prior,
+        fill_unseen=options.unseen == "fill",
     )
 
 

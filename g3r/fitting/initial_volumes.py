@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
-from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.coverage import brain_share, coverage
+from g3r.acquisition.foreground import Foreground, foreground
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
@@ -19,6 +20,9 @@ from g3r.registration import Registration
 MARGIN_MM = 5.0
 """Margin of the prior's grid around the masked pixels."""
 
+CUT_OFF_MM = 6.0
+"""How far beyond the masked pixels a head of the template's size must reach to count as cut off there."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class InitialVolumes:
@@ -27,24 +31,31 @@ class InitialVolumes:
     Attributes:
         slices: given intensities over `scale`.
         coarse: V_coarse [I, J, K] (G3R Eq. 6).
-        density: M_rho [I, J, K] (G3R Eq. 6).
+        density: M_rho [I, J, K] (G3R Eq. 6), of whole slices.
+        masked_density: [I, J, K], of the masked pixels alone, to which the fit is made.
         sharp: V_sharp [I, J, K], the least-squares volume.
-        mask: foreground [I, J, K].
-        grid: of all four.
+        foreground: what the slices' masks say of each voxel.
+        grid: of all these.
         scale: what intensities were divided by.
     """
 
     slices: Slices
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
+    masked_density: NDArray[np.float32]
     sharp: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    foreground: Foreground
     grid: VolumeGrid
     scale: float
 
     @classmethod
     def of(
-        cls, slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
+        cls,
+        slices: Slices,
+        gain: NDArray[np.float64],
+        weight: NDArray[np.float64],
+        voxel_mm: float,
+        expected_box_mm: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     ) -> InitialVolumes:
         """The volumes of slices in their poses.
 
@@ -53,16 +64,44 @@ class InitialVolumes:
             gain: [K] intensity factors.
             weight: [K] slice weights.
             voxel_mm: voxel size of the grid.
+            expected_box_mm: lowest and highest corner [3] of where the whole head is expected; where that is far
+                beyond the masked pixels, the grid reaches there.
         """
-        grid = grid_around(slices, voxel_mm, margin_mm=MARGIN_MM)
+        grid = _with_room(grid_around(slices, voxel_mm, margin_mm=MARGIN_MM), expected_box_mm)
         slice_weight = weight[slices.pixel_plane]
-        coarse, density = coarse_and_density(slices, grid, gain, slice_weight)
+        coarse, masked = coarse_and_density(slices, grid, gain, slice_weight)
         sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
-        scale = normalisation_scale(coarse, density)
+        scale = normalisation_scale(coarse, masked)
         slices = slices.scaled(1 / scale)
-        mask = foreground_mask(slices, grid, weight)
         coarse, sharp = coarse / np.float32(scale), sharp / np.float32(scale)
-        return cls(slices=slices, coarse=coarse, density=density, sharp=sharp, mask=mask, grid=grid, scale=scale)
+        return cls(
+            slices=slices,
+            coarse=coarse,
+            density=coverage(slices, grid, weight),
+            masked_density=masked,
+            sharp=sharp,
+            foreground=foreground(slices, grid, weight),
+            grid=grid,
+            scale=scale,
+        )
+
+    @property
+    def share(self) -> NDArray[np.float32]:
+        """Share [I, J, K] of the density whose masks say brain."""
+        return brain_share(self.masked_density, self.density)
+
+
+def _with_room(grid: VolumeGrid, box_mm: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> VolumeGrid:
+    """The grid, larger on the sides where a box reaches `CUT_OFF_MM` beyond the pixels that it was made for."""
+    if box_mm is None:
+        return grid
+    low, high = grid.world([0, 0, 0]), grid.world(np.array(grid.shape) - 1)
+    inner_low, inner_high = low + MARGIN_MM, high - MARGIN_MM
+    new_low = np.where(box_mm[0] < inner_low - CUT_OFF_MM, box_mm[0] - MARGIN_MM, low)
+    new_high = np.where(box_mm[1] > inner_high + CUT_OFF_MM, box_mm[1] + MARGIN_MM, high)
+    if (new_low == low).all() and (new_high == high).all():
+        return grid
+    return VolumeGrid.isotropic(new_low, new_high, float(grid.spacing_mm[0]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +110,10 @@ class PriorVolume:
 
     Attributes:
         volumes: the slices as they are fitted, and the volumes that they give.
-        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp where no network is used.
+        values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp, smoothly continued, where no network is used.
+        brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
+        mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
+        has_template: whether an atlas template was fitted, for V_prior to show where no slice looked.
         gain: [K] intensity factors of the slices.
         scale: what intensities were divided by since registration.
         accepted: whether slices of a single stack moved to the prior; None where that was not tried.
@@ -79,6 +121,9 @@ class PriorVolume:
 
     volumes: InitialVolumes
     values: NDArray[np.float32]
+    brain: NDArray[np.float32] | None
+    mask: NDArray[np.bool_]
+    has_template: bool
     gain: NDArray[np.float64]
     scale: float
     accepted: bool | None = None

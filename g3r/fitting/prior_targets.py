@@ -42,7 +42,7 @@ def fit_to_prior(
     if adaptive is not None:
         cloud, found = fit_adaptive(
             values,
-            volumes.mask,
+            prior.mask,
             volumes.grid,
             finest_spacing_mm=spacing_mm,
             settings=adaptive,
@@ -53,9 +53,9 @@ def fit_to_prior(
         )
         counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
         return PriorCloud(cloud, found.loss, counts)
-    cloud = seed_cloud(values, volumes.mask, volumes.grid, spacing_mm)
+    cloud = seed_cloud(values, prior.mask, volumes.grid, spacing_mm)
     counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-    target = VolumeTarget.of(values, volumes.mask.astype(np.float32), volumes.grid)
+    target = VolumeTarget.of(values, prior.mask.astype(np.float32), volumes.grid)
     cloud, history = fit_prior(cloud, target, stage, rng, progress=progress, deadline=deadline)
     return PriorCloud(cloud, history, counts)
 
@@ -64,9 +64,10 @@ def distillation_target(prior: PriorVolume) -> VolumeTarget:
     """The prior volume with the weight of each voxel in the fit to the slices (the last term of G3R Eq. 9).
 
     The prior counts where slices are sparse; where they are dense they know better. It was made of the same slices:
-    from several stacks only 1 - c of what it says there is its own.
+    from several stacks only 1 - c of what it says there is its own. The density is that of the masked pixels, which
+    are all that the fit sees.
     """
     volumes = prior.volumes
     power = 1 if volumes.slices.n_stacks == 1 else 2
-    unmeasured = np.maximum((1 - confidence(volumes.density)) ** power, MIN_DISTILLATION)
-    return VolumeTarget.of(prior.values, (unmeasured * volumes.mask).astype(np.float32), volumes.grid)
+    unmeasured = np.maximum((1 - confidence(volumes.masked_density)) ** power, MIN_DISTILLATION)
+    return VolumeTarget.of(prior.values, (unmeasured * prior.mask).astype(np.float32), volumes.grid)

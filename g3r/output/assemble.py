@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.coverage import UNSEEN_BELOW
+from g3r.acquisition.foreground import foreground
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
@@ -33,6 +34,7 @@ from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
 from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
 from g3r.uncertainty.prior_share import estimate_prior_share
+from g3r.uncertainty.unseen import UnseenPart
 
 logger = logging.getLogger(__name__)
 
@@ -82,8 +84,14 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     fit = found.fit or _no_fit(found)
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.clock(Stage.VOLUME):
-        mask = volumes.mask if grid is volumes.grid else foreground_mask(fit.slices, grid, fit.weight)
+        mask = found.prior.mask if grid is volumes.grid else _mask_on(grid, found.prior, fit)
         volume = _volume(found, mask, grid, settings)
+        density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
+        unseen = mask & (density < UNSEEN_BELOW)
+        unseen_part = UnseenPart.of(unseen, mask, grid.voxel_volume_mm3, shown=_shown_unseen(found.prior, settings))
+    line = unseen_part.line()
+    if line:
+        run.warnings.append(line)
     if run.stopped_at:
         run.notes.append(PARTIAL_NOTE)
     else:
@@ -100,6 +108,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                     cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
+                prior_share[unseen] = 1.0
                 release_memory()
         with run.clock(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
@@ -120,9 +129,13 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             )
         uncertainty, uncertainty_record = estimated.expected_error, estimated.record
     intensity = np.float32(found.intensity)
+    if not settings.fill_unseen:
+        volume, mask = volume * ~unseen, mask & ~unseen
+        uncertainty = None if uncertainty is None else uncertainty * ~unseen
     return ReconstructionResult(
         volume=volume * intensity,
         mask=mask,
+        unseen=unseen,
         grid=grid,
         prior=found.prior.values * intensity,
         coarse=volumes.coarse * intensity,
@@ -136,8 +149,22 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         ncc=found.registration.ncc,
         uncertainty=uncertainty,
         prior_share=prior_share,
-        record=_record(found, fit, qualities, plan, run, uncertainty_record),
+        record=replace(_record(found, fit, qualities, plan, run, uncertainty_record), unseen=unseen_part),
     )
+
+
+def _mask_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> NDArray[np.bool_]:
+    """The brain mask on another grid, from the slices as the fit left them."""
+    brain = prior.brain
+    likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
+    return foreground(fit.slices, grid, fit.weight).completed(likely)
+
+
+def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
+    """What the volume shows where no slice looked, in words."""
+    if not settings.fill_unseen:
+        return "blank"
+    return "estimate from other brains" if prior.has_template else "smooth continuation"
 
 
 def _no_fit(found: StageResults) -> SliceFit:

@@ -15,6 +15,7 @@ OUTPUT_NAMES = (
     "density.nii.gz",
     "uncertainty.nii.gz",
     "prior_share.nii.gz",
+    "unseen.nii.gz",
     "gaussians.npz",
     "slices.tsv",
     "run.json",

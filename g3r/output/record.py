@@ -25,6 +25,7 @@ from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality, registrat
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
 from g3r.run.provenance import FileHash
+from g3r.uncertainty.unseen import UnseenPart
 
 MAX_RECORD_BYTES = 50_000_000
 
@@ -150,6 +151,7 @@ class RunRecord:
         gaussians: how their number came about.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
+        unseen: the part of the brain that no slice saw.
         uncertainty: what `uncertainty.nii.gz` means; None where the run was interrupted.
         resumed: stages that were taken from an earlier run.
         partial: whether the run was interrupted, at `stopped_at`.
@@ -172,6 +174,7 @@ class RunRecord:
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)
     loss: dict[str, list[Any]] = field(default_factory=dict)
+    unseen: UnseenPart | None = None
     uncertainty: dict[str, Any] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)

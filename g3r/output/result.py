@@ -42,6 +42,7 @@ class ReconstructionResult:
 
     Attributes:
         volume, mask: [I, J, K] on `grid`.
+        unseen: [I, J, K] on `grid`, the part of the brain that no slice saw; inside the mask if it is shown at all.
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
@@ -56,6 +57,7 @@ class ReconstructionResult:
 
     volume: NDArray[np.float32]
     mask: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
     grid: VolumeGrid
     prior: NDArray[np.float32]
     coarse: NDArray[np.float32]
@@ -111,7 +113,7 @@ class ReconstructionResult:
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def _write(self, folder: Path) -> None:
-        maps = {name: self.grid for name in ("volume", "mask", "uncertainty", "prior_share")}
+        maps = {name: self.grid for name in ("volume", "mask", "unseen", "uncertainty", "prior_share")}
         maps |= {name: self.prior_grid for name in ("prior", "coarse", "density")}
         with ThreadPoolExecutor() as pool:  # compression runs while the sections are drawn
             saved = [
@@ -149,6 +151,7 @@ class ReconstructionResult:
             maps=CAPTIONS,
             captions=CAPTIONS,
             ranges=ranges,
+            marked=self.unseen,
             title=self._title(),
         )
 
@@ -159,6 +162,9 @@ class ReconstructionResult:
             lines.append(f"PARTIAL: {self.record.stopped_at}")
         if self.record.registration and self.record.registration.reliable is False:
             lines.append("REGISTRATION UNRELIABLE: do not rely on this volume (see run.json)")
+        unseen = self.record.unseen.line() if self.record.unseen else None
+        if unseen:
+            lines.append(f"outlined: {unseen}")
         return "; ".join(lines)
 
 

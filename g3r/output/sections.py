@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import nibabel as nib
 import numpy as np
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 BACKGROUND = "#000000"
 INK = "#c8c8c8"
 FAINT_INK = "#8a8a8a"
+MARK = "#35c4e8"
+"""Outlines what no slice saw."""
 
 MARGIN_MM = 6.0
 """Shown around the mask."""
@@ -74,6 +76,7 @@ def save_sections(
     maps: Collection[str] = ("density",),
     captions: Mapping[str, str] | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
+    marked: ArrayLike | None = None,
     title: str = "",
 ) -> None:
     """Write a PNG of the three central sections of each volume, in the order given.
@@ -91,6 +94,7 @@ def save_sections(
         maps: names of the volumes that are maps.
         captions: what a row shows, in a few words next to its name.
         ranges: values of the two ends of the bar, for maps that have natural ones.
+        marked: [I, J, K], a part of the volume that is outlined in every section.
         title: a line above.
 
     Raises:
@@ -122,7 +126,10 @@ def save_sections(
         )
         for name, data in canonical.items()
     ]
-    figure = _draw(rows, inside[box], center, spacing_mm, title)
+    outlined = np.zeros(inside.shape, bool)
+    if marked is not None:
+        outlined = nib.orientations.apply_orientation(np.asarray(marked) > 0, orientation)
+    figure = _draw(rows, inside[box], outlined[box], center, spacing_mm, title)
     _write(figure, Path(path))
 
 
@@ -140,6 +147,7 @@ def _crop(
 def _draw(
     volumes: Sequence[Row],
     inside: NDArray[np.bool_],
+    outlined: NDArray[np.bool_],
     center: NDArray[np.intp],
     spacing_mm: NDArray[np.float64],
     title: str,
@@ -181,6 +189,9 @@ def _draw(
             image = panel.imshow(
                 shown, cmap=colors, vmin=low, vmax=high, origin="lower", extent=extent, interpolation="bilinear"
             )
+            part = _section(outlined, view, center)
+            if part.any() and not part.all():
+                panel.contour(part, levels=[0.5], colors=[MARK], linewidths=0.8, origin="lower", extent=extent)
             slack = (height_mm - size_mm[view.up]) / 2
             panel.set_ylim(-slack, size_mm[view.up] + slack)
             panel.set_axis_off()
@@ -213,7 +224,7 @@ def _side_text(figure: Figure, x: float, y: float, text: str, *, color: str, fon
     figure.text(x, y, text, rotation=90, color=color, fontsize=fontsize, ha="center", va="center")
 
 
-def _section(data: NDArray[np.float32], view: View, center: NDArray[np.intp]) -> NDArray[np.float32]:
+def _section(data: NDArray[Any], view: View, center: NDArray[np.intp]) -> NDArray[Any]:
     """The plane [up, across] of a RAS volume, the across axis reversed: R (or A) comes to the left."""
     plane = np.take(data, int(center[view.normal]), axis=view.normal)
     return plane[::-1, :].T

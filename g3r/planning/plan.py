@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.planning.presets import ReconstructionSettings
 from g3r.run.deadline import Deadline, LoopRecord
 
@@ -50,14 +47,11 @@ class Plan(Protocol):
     def for_prior(self, coarse_s: float) -> None:
         """Decide the number of views; `coarse_s` is what V_coarse and V_sharp took."""
 
-    def for_fit_to_prior(
-        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
-    ) -> Deadline | None:
+    def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline | None:
         """Decide Gaussians and steps of both stages of the fit.
 
         Args:
-            volumes: posed slices and their volumes.
-            prior: [I, J, K] V_prior on their grid.
+            prior: V_prior and the posed slices that it was made of.
             coarse_s: seconds that V_coarse and V_sharp took.
             n_output_voxels: voxels of the volume to be written.
 
@@ -85,9 +79,7 @@ class FixedPlan:
     def for_prior(self, coarse_s: float) -> None:
         """Nothing to decide."""
 
-    def for_fit_to_prior(
-        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
-    ) -> Deadline | None:
+    def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline | None:
         """No deadline.
 
         Args: see `Plan`.
@@ -120,9 +112,7 @@ class RepeatedBudget(FixedPlan):
         """Repeat the loops."""
         return self.deadline
 
-    def for_fit_to_prior(
-        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
-    ) -> Deadline:
+    def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline:
         """Repeat the loops.
 
         Args: see `Plan`.

@@ -36,6 +36,7 @@ class ReconstructionSettings:
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
+        fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         seed: of every random choice.
     """
 
@@ -52,6 +53,7 @@ class ReconstructionSettings:
     share_probes: int = 2
     use_prior: bool = True
     distillation: bool = True
+    fill_unseen: bool = True
     seed: int = 0
 
 

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.initial_volumes import InitialVolumes, gaussian_spacing_mm
+from g3r.fitting.initial_volumes import PriorVolume, gaussian_spacing_mm
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
@@ -128,19 +127,16 @@ class TimeBudget:
         self.settings = replace(self.settings, prior_views=views)
         self.choices["prior_views"] = views
 
-    def for_fit_to_prior(
-        self, volumes: InitialVolumes, prior: NDArray[np.float32], coarse_s: float, n_output_voxels: int
-    ) -> Deadline:
+    def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline:
         """Take the most careful preset whose Gaussians and steps fit, with the deadline of the first stage.
 
         Args:
-            volumes: posed slices and their volumes.
-            prior: [I, J, K] on their grid.
+            prior: V_prior and the posed slices that it was made of.
             coarse_s: what making the volumes took.
             n_output_voxels: of the volume to be written.
         """
-        settings = self.settings
-        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.size)
+        settings, volumes = self.settings, prior.volumes
+        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.values.size)
         if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
             # timing a step would take the time of the steps themselves
             reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)
@@ -148,7 +144,7 @@ class TimeBudget:
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
             return self._take("draft", PRESETS["draft"].share_probes, reserve_s)
         probed = PRESETS["fast"].gaussian_spacing_pixels
-        cloud = seed_cloud(prior, volumes.mask, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
+        cloud = seed_cloud(prior.values, prior.mask, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):

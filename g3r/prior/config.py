@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
+
+from g3r.geometry import VolumeGrid
 
 MAX_LEVELS = 16
 MAX_CHANNELS = 4096
 MAX_UNITS = 64
 """Beyond these a network takes minutes to build."""
+
+MAX_TEMPLATE_EDGE = 512
+MAX_SPACING_MM = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +30,12 @@ class PriorNetworkConfig:
         alpha: gate at high density; the paper's value is the default.
         beta: gate at zero density; the paper's value is the default.
         use_gate: False sets G = 1 everywhere (an ablation).
-        use_density: False hides the density from F (an ablation); the gate still uses it.
+        use_density: False hides the densities from F (an ablation); gate and base still use the coverage.
         use_sharp: True shows V_sharp to F, in addition to V_coarse; False is Eq. 7 as printed.
         sharp_base: True adds the residual to V_sharp instead of V_coarse (an ablation).
+        use_template: True shows the fitted template to F, and puts it under the residual where no slice looked.
+        template_shape: [A, I, J, K] of the atlas template: A ages on one grid. A training replaces it by its data's.
+        template_spacing_mm: the template's voxel size.
 
     Raises:
         ValueError: no level, different numbers of levels, a count out of range, or `sharp_base` without `use_sharp`.
@@ -39,6 +50,9 @@ class PriorNetworkConfig:
     use_density: bool = True
     use_sharp: bool = True
     sharp_base: bool = False
+    use_template: bool = True
+    template_shape: tuple[int, ...] = (1, 2, 2, 2)
+    template_spacing_mm: float = 1.6
 
     def __post_init__(self) -> None:
         limited = [(n, MAX_CHANNELS) for n in (*self.channels, self.tail_channels)]
@@ -50,11 +64,20 @@ class PriorNetworkConfig:
             )
         if self.sharp_base and not self.use_sharp:
             raise ValueError("sharp_base needs use_sharp")
+        right = len(self.template_shape) == 4 and all(1 <= n <= MAX_TEMPLATE_EDGE for n in self.template_shape)
+        if not right or not 0 < self.template_spacing_mm <= MAX_SPACING_MM:
+            raise ValueError(f"template of {self.template_shape} voxels of {self.template_spacing_mm} mm")
 
     @property
     def n_inputs(self) -> int:
-        """Volumes that F sees: V_coarse, and as chosen the confidence and V_sharp."""
-        return 1 + self.use_density + self.use_sharp
+        """Volumes that F sees: V_coarse, and as chosen two confidences, V_sharp and the template."""
+        return 1 + 2 * self.use_density + self.use_sharp + self.use_template
+
+    @property
+    def template_grid(self) -> VolumeGrid:
+        """The template's grid, centred on the origin of the atlas frame."""
+        far = (np.array(self.template_shape[1:]) - 1) / 2 * self.template_spacing_mm
+        return VolumeGrid.isotropic(-far, far, self.template_spacing_mm)
 
     @property
     def stride(self) -> int:
@@ -62,6 +85,8 @@ class PriorNetworkConfig:
         return 2 ** len(self.channels)
 
     def min_values(self) -> float:
-        """A lower bound on the number of the network's weights: its residual units and its tail."""
+        """A lower bound on the number of the network's weights: its template, its residual units and its tail."""
         levels = zip(self.channels, self.units, strict=True)
-        return 27 * (sum(2 * n * width**2 for width, n in levels) + self.tail_channels**2)
+        return math.prod(self.template_shape) + 27 * (
+            sum(2 * n * width**2 for width, n in levels) + self.tail_channels**2
+        )

@@ -1,22 +1,34 @@
 """The Density-Gated Prior Network (DGPN) of G3R Sec. 2.3."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.gate import DensityGate
+from g3r.prior.inputs import PriorInputs
 from g3r.prior.network import ResidualRefiner
 
 
+class PriorOutput(NamedTuple):
+    """V_prior, and the logit of each voxel being brain; [B, 1, I, J, K] both."""
+
+    volume: Tensor
+    brain_logit: Tensor
+
+
 class DensityGatedPriorNetwork(nn.Module):
-    """The structural prior: V_prior = V_coarse + G(c) F(V_coarse, V_sharp, M_rho), Eq. 7 with one more input.
+    """The structural prior: V_prior = base + G(c) F, Eq. 7 with a base that reaches into what no slice saw.
 
-    `use_sharp=False` is Eq. 7 as printed, F(V_coarse, M_rho). V_sharp is what the slices determine by
-    themselves (`sharpened_volume`): F need not learn to invert the slice profile (docs/prior.md).
+    The paper's base is V_coarse, which is zero where nothing was measured. Here it is V_sharp where slices looked and
+    an atlas template, fitted to what they saw, where none did (`PriorInputs.base`). `sharp_base=False,
+    use_sharp=False, use_template=False` is Eq. 7 as printed, but for the bound: |F| < 1, so that alpha is the
+    most by which the network may change a densely measured voxel, in units of the brightest tissue.
 
-    With the paper's alpha = 0.05 and beta = 1 the gate passes the whole residual at zero density, 10 % of
-    it under three gapless stacks (M = 3) and 5 % at high density. The shipped network was trained on hardly any
-    unmeasured voxels and adds little there.
+    The network carries the atlas template that its training used; fitting it is the caller's work
+    (`g3r.acquisition.template_fit`).
 
     Args:
         config: see `PriorNetworkConfig`.
@@ -25,6 +37,8 @@ class DensityGatedPriorNetwork(nn.Module):
         ValueError: from `DensityGate`.
     """
 
+    template: Tensor
+
     def __init__(self, config: PriorNetworkConfig) -> None:
         super().__init__()
         self.config = config
@@ -32,22 +46,21 @@ class DensityGatedPriorNetwork(nn.Module):
         self.refiner = ResidualRefiner(config)
         # only for speed: convolutions on a CPU take half the time with channels innermost
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        self.register_buffer("template", torch.zeros(*config.template_shape))
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
-        """Return V_prior (G3R Eq. 7).
+    def set_template(self, volume: Tensor) -> None:
+        """Take over an atlas template [A, I, J, K] on a grid about the origin; no weight depends on its shape."""
+        self.config = replace(self.config, template_shape=tuple(volume.shape))
+        # as it is stored, so that a training sees what its users will
+        self.template = volume.half().to(self.template)
 
-        Args:
-            v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
-            m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
-            v_sharp: [B, 1, I, J, K], on V_coarse's scale; see `sharpened_volume`. Only with `use_sharp`.
-
-        Returns:
-            V_prior, [B, 1, I, J, K], in the units of `v_coarse`.
+    def forward(self, given: PriorInputs) -> PriorOutput:
+        """Return V_prior in the units of V_coarse (G3R Eq. 7), and the brain's logit.
 
         Raises:
-            ValueError: `use_sharp` without V_sharp.
+            ValueError: a volume that the network needs is missing.
         """
-        residual = self.refiner(v_coarse, m_rho, v_sharp)
-        base = v_sharp if self.config.sharp_base else v_coarse
-        assert base is not None  # the refiner has refused it
-        return base + (self.gate(m_rho) * residual if self.config.use_gate else residual)
+        residual, logit = self.refiner(given)
+        if self.config.use_gate:
+            residual = self.gate(given.density) * residual
+        return PriorOutput(given.base(self.config) + residual, given.base_logit(self.config) + logit)

@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from g3r.errors import NumericalError
-from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
+from g3r.prior.inputs import PriorInputs
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,35 @@ VIEWS = ((), (0, 1), (1, 2), (0, 2), (0,), (1,), (2,), (0, 1, 2))
 """Axes that are mirrored: half turns first, which show the network a head and not a mirror image."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PriorMaps:
+    """Volumes [I, J, K] of one grid that a prior is made from; see `PriorInputs`."""
+
+    coarse: NDArray[np.float32]
+    density: NDArray[np.float32]
+    share: NDArray[np.float32] | None = None
+    sharp: NDArray[np.float32] | None = None
+    template: NDArray[np.float32] | None = None
+    outline: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.coarse.shape
+        wrong = {name: one.shape for name, one in vars(self).items() if one is not None and one.shape != shape}
+        if len(shape) != 3 or min(shape) < 1 or wrong:
+            raise ValueError(f"expected 3D volumes of one shape; got {shape} and {wrong}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatedPrior:
+    """V_prior and the probability of each voxel being brain, float32 [I, J, K]."""
+
+    volume: NDArray[np.float32]
+    brain: NDArray[np.float32]
+
+
 def estimate_prior(
-    network: DensityGatedPriorNetwork,
-    v_coarse: NDArray[np.float32],
-    m_rho: NDArray[np.float32],
-    v_sharp: NDArray[np.float32] | None = None,
-    *,
-    n_views: int = 1,
-    tiling: Tiling = DEFAULT_TILING,
-) -> NDArray[np.float32]:
+    network: DensityGatedPriorNetwork, maps: PriorMaps, *, n_views: int = 1, tiling: Tiling = DEFAULT_TILING
+) -> EstimatedPrior:
     """Return V_prior for a whole volume (Eq. 7).
 
     The network was trained on heads lying in any of the 48 symmetric ways, and its errors differ between
@@ -55,18 +76,15 @@ def estimate_prior(
 
     Args:
         network: on any device; its mode is left as it is.
-        v_coarse: [I, J, K], already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
-        m_rho: [I, J, K], dimensionless density M >= 0.
-        v_sharp: [I, J, K], on V_coarse's scale; needed by networks with `use_sharp`.
+        maps: intensities already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
         n_views: number of mirror images and half turns to average over, 1 to 8.
         tiling: how large volumes are cut.
 
     Returns:
-        V_prior, float32 [I, J, K], in the units of `v_coarse`.
+        V_prior in the units of V_coarse, and the brain's probability.
 
     Raises:
-        ValueError: the volumes are not 3D of one shape, a needed one is missing, or the number of views is not
-            1 to 8.
+        ValueError: a needed volume is missing, or the number of views is not 1 to 8.
         NumericalError: the result is not finite.
 
     Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
@@ -74,48 +92,55 @@ def estimate_prior(
         none but rounding for a halo of the receptive radius, below 1e-3 of the intensity scale for 64 voxels
         (tests/prior/test_inference.py).
     """
-    if v_coarse.ndim != 3 or v_coarse.shape != m_rho.shape or min(v_coarse.shape) < 1:
-        raise ValueError(f"expected two 3D volumes of one shape; got {v_coarse.shape} and {m_rho.shape}")
-    volumes = [v_coarse, m_rho]
-    if network.config.use_sharp:
-        if v_sharp is None or v_sharp.shape != v_coarse.shape:
-            raise ValueError(f"this prior needs V_sharp of shape {v_coarse.shape}")
-        volumes.append(v_sharp)
     if not 1 <= n_views <= len(VIEWS):
         raise ValueError(f"{n_views} views; expected 1 to {len(VIEWS)}")
     stride = network.config.stride
-    whole = v_coarse.size <= tiling.max_whole_voxels
+    shape_given = maps.coarse.shape
+    whole = maps.coarse.size <= tiling.max_whole_voxels
     # only with whole strides does a mirrored tile fall on the same sub-sampled grid as the mirrored volume
-    far_end = [(0, -extent % stride) for extent in v_coarse.shape]
-    volumes = [np.pad(np.asarray(volume, np.float32), far_end) for volume in volumes]
-    shape = volumes[0].shape
+    far_end = [(0, -extent % stride) for extent in shape_given]
+    volumes = {
+        name: np.pad(np.asarray(volume, np.float32), far_end)
+        for name, volume in vars(maps).items()
+        if volume is not None
+    }
+    shape = volumes["coarse"].shape
     edge = max(shape) if whole else _round_up(tiling.tile_voxels, stride)
     halo = 0 if whole else _round_up(tiling.halo_voxels, stride)
     device = next(network.parameters()).device
 
-    prior = np.empty(shape, np.float32)
+    prior, brain = np.empty(shape, np.float32), np.empty(shape, np.float32)
     with torch.inference_mode():
         for core, seen in _tiles(shape, edge, halo):
-            inputs = [
-                torch.from_numpy(np.ascontiguousarray(volume[seen], np.float32)).to(device)[None, None]
-                for volume in volumes
-            ]
-            seen_prior = sum(_view(network, inputs, axes) for axes in VIEWS[:n_views]) / n_views
+            inputs = PriorInputs(
+                **{
+                    name: torch.from_numpy(np.ascontiguousarray(volume[seen], np.float32)).to(device)[None, None]
+                    for name, volume in volumes.items()
+                }
+            )
+            views = [_view(network, inputs, axes) for axes in VIEWS[:n_views]]
             inside = tuple(
                 slice(wanted.start - given.start, wanted.stop - given.start)
                 for wanted, given in zip(core, seen, strict=True)
             )
-            prior[core] = seen_prior[0, 0].float().cpu().numpy()[inside]  # type: ignore[index]
-    prior = prior[tuple(slice(extent) for extent in v_coarse.shape)]
-    if not np.isfinite(prior).all():
+            prior[core] = _mean([one.volume for one in views])[inside]
+            brain[core] = _mean([torch.sigmoid(one.brain_logit) for one in views])[inside]
+    box = tuple(slice(extent) for extent in shape_given)
+    prior, brain = np.ascontiguousarray(prior[box]), np.ascontiguousarray(brain[box])
+    if not (np.isfinite(prior).all() and np.isfinite(brain).all()):
         raise NumericalError("the prior network returned NaN or infinity; check the stacks' intensities")
-    return np.ascontiguousarray(prior)
+    return EstimatedPrior(volume=prior, brain=brain)
 
 
-def _view(network: DensityGatedPriorNetwork, inputs: Sequence[torch.Tensor], axes: tuple[int, ...]) -> torch.Tensor:
+def _view(network: DensityGatedPriorNetwork, inputs: PriorInputs, axes: tuple[int, ...]) -> PriorOutput:
     """The prior as the network sees it with some axes mirrored, mirrored back."""
     dims = [2 + axis for axis in axes]
-    return network(*[volume.flip(dims) for volume in inputs]).flip(dims)
+    found = network(inputs.flip(dims))
+    return PriorOutput(found.volume.flip(dims), found.brain_logit.flip(dims))
+
+
+def _mean(views: Sequence[torch.Tensor]) -> NDArray[np.float32]:
+    return (sum(views) / len(views))[0, 0].float().cpu().numpy()  # type: ignore[index]
 
 
 def _round_up(value: int, multiple: int) -> int:

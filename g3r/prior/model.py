@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.coarse_volume import DENSITY_CONVENTION, INTENSITY_CONVENTION
 from g3r.acquisition.least_squares import SHARP_CONVENTION
-from g3r.checkpoints.plain_values import number
+from g3r.checkpoints.plain_values import number, numbers
 from g3r.checkpoints.trained_model import TrainedModel
 from g3r.checkpoints.weights_file import SHIPPED_PRIOR
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import DEFAULT_TILING, Tiling, estimate_prior
+from g3r.prior.inference import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling, estimate_prior
 
 VOXEL_MM_RANGE = (0.1, 10.0)
 VOXEL_MM_TOLERANCE = 1e-3
@@ -30,13 +32,15 @@ class Prior(TrainedModel):
 
     Attributes:
         voxel_mm: isotropic voxel size that it was trained at, and is used at.
+        weeks: gestational age of each head of the network's template.
 
     Raises:
-        ValueError: a voxel size out of range.
+        ValueError: a voxel size out of range, or another number of ages than the template has.
     """
 
     network: DensityGatedPriorNetwork
     voxel_mm: float
+    weeks: tuple[float, ...]
 
     kind: ClassVar = "prior"
     shipped: ClassVar = SHIPPED_PRIOR
@@ -52,40 +56,43 @@ class Prior(TrainedModel):
         low, high = VOXEL_MM_RANGE
         if not (math.isfinite(self.voxel_mm) and low <= self.voxel_mm <= high):
             raise ValueError(f"voxel size is {self.voxel_mm} mm; expected {low} to {high} mm")
+        if len(self.weeks) != self.network.config.template_shape[0]:
+            raise ValueError(f"{len(self.weeks)} ages for a template of {self.network.config.template_shape[0]}")
 
     @classmethod
     def own_facts(cls, description: Mapping[str, Any]) -> dict[str, Any]:
-        """The voxel size."""
-        return {"voxel_mm": number(description, "voxel_mm")}
+        """The voxel size and the template's ages."""
+        return {"voxel_mm": number(description, "voxel_mm"), "weeks": numbers(description, "weeks")}
 
     def own_description(self) -> dict[str, Any]:
-        """The voxel size."""
-        return {"voxel_mm": float(self.voxel_mm)}
+        """The voxel size and the template's ages."""
+        return {"voxel_mm": float(self.voxel_mm), "weeks": [float(week) for week in self.weeks]}
+
+    @staticmethod
+    def stored(name: str, value: Tensor) -> Tensor:
+        """Half the bytes for the template, whose intensities need no more digits."""
+        return value.half() if name == "template" else value
+
+    @cached_property
+    def template(self) -> AtlasTemplate:
+        """The atlas template that was fitted to the subjects of the training."""
+        config = self.network.config
+        return AtlasTemplate(self.network.template.numpy(), config.template_grid.affine, np.array(self.weeks))
 
     def in_words(self) -> str:
         """Voxel size and gate."""
         return f"voxels of {self.voxel_mm:g} mm, alpha {self.network.config.alpha:g}"
 
-    def estimate(
-        self,
-        v_coarse: NDArray[np.float32],
-        m_rho: NDArray[np.float32],
-        v_sharp: NDArray[np.float32] | None = None,
-        *,
-        n_views: int = 1,
-        tiling: Tiling = DEFAULT_TILING,
-    ) -> NDArray[np.float32]:
-        """Return V_prior for a whole volume of `voxel_mm`, float32 [I, J, K]; see `estimate_prior`.
+    def estimate(self, maps: PriorMaps, *, n_views: int = 1, tiling: Tiling = DEFAULT_TILING) -> EstimatedPrior:
+        """Return V_prior for a whole volume of `voxel_mm`; see `estimate_prior`.
 
         Args:
-            v_coarse: [I, J, K], divided by its `normalisation_scale`.
-            m_rho: [I, J, K], dimensionless density M >= 0.
-            v_sharp: [I, J, K], on V_coarse's scale.
+            maps: intensities divided by their `normalisation_scale`.
             n_views: mirror images over which the prior is averaged, 1 to 8.
             tiling: how large volumes are cut.
 
         Raises:
-            ValueError: volumes that do not fit together, or another number of views.
+            ValueError: a volume that the network needs is missing, or another number of views.
             NumericalError: the result is not finite.
         """
-        return estimate_prior(self.network, v_coarse, m_rho, v_sharp, n_views=n_views, tiling=tiling)
+        return estimate_prior(self.network, maps, n_views=n_views, tiling=tiling)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from g3r.prior.config import PriorNetworkConfig
-from g3r.prior.gate import confidence_from_density
+from g3r.prior.inputs import PriorInputs
 
 # No normalisation layer anywhere: instance statistics would make a voxel's value depend on how the volume
 # was cut into tiles, and on how much empty background a patch has.
@@ -27,16 +27,18 @@ SLAB_ROWS = 16
 
 
 class ResidualRefiner(nn.Module):
-    """A 3D residual network F(V_coarse, M_rho) that is cheap on a CPU.
+    """A 3D residual network F that is cheap on a CPU; a second output says how likely a voxel is brain.
 
     The full-resolution grid is where a CPU spends its time, so it is left at once: 2x2x2 voxels become
     channels (space to depth), a U-shape of residual units works at 1/2, 1/4, 1/8 ... resolution, a
     sub-pixel step comes back, and two light convolutions at full resolution see the input again.
 
-    The density enters as c = 1 - exp(-M) rather than as M: M is unbounded (hundreds under an output grid
-    much finer than the slices), c is in [0, 1], has slope 1 at 0, and is what the gate uses.
+    Densities enter as c = 1 - exp(-M) rather than as M: M is unbounded (hundreds under an output grid
+    much finer than the slices), c is in [0, 1], has slope 1 at 0, and is what the gate uses. There are two: the
+    coverage, and the part of it whose masks say brain.
 
-    The last convolution starts at zero, so training starts from V_coarse.
+    F is bounded by tanh: with the gate, alpha is the most by which the network may change a densely measured
+    voxel, in units of the brightest tissue. The last convolution starts at zero, so training starts from the base.
 
     Args:
         config: of the whole prior network; F takes what concerns it.
@@ -61,7 +63,7 @@ class ResidualRefiner(nn.Module):
                 self.decoder.append(_residual_units(width, count))
         self.to_full = _subpixel_upsample(channels[0], config.tail_channels)
         self.tail = Convolution(3, config.tail_channels + config.n_inputs, config.tail_channels, **_BLOCK)
-        self.head = nn.Conv3d(config.tail_channels, 1, kernel_size=3, padding=1)
+        self.head = nn.Conv3d(config.tail_channels, 2, kernel_size=3, padding=1)
         self._initialise()
 
     def _initialise(self) -> None:
@@ -81,28 +83,21 @@ class ResidualRefiner(nn.Module):
                 _tie_subpixels(module.conv_block, factor=8)
         nn.init.zeros_(self.head.weight)  # its bias is zero already
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
-        """Return the ungated residual F.
+    def forward(self, given: PriorInputs) -> tuple[Tensor, Tensor]:
+        """Return the ungated residual F in (-1, 1), and the logit of a voxel being brain.
+
+        Any size works, it is padded with zeros at the far end inside.
 
         Args:
-            v_coarse: [B, 1, I, J, K], normalised so that its 99th percentile in the support is 1.
-            m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
-            v_sharp: [B, 1, I, J, K], on V_coarse's scale; needed with `use_sharp`, ignored without.
+            given: the volumes; those that the configuration leaves out are ignored.
 
         Returns:
-            [B, 1, I, J, K]; any size works, it is padded with zeros at the far end inside.
+            Two of [B, 1, I, J, K].
 
         Raises:
-            ValueError: `use_sharp` without V_sharp.
+            ValueError: a volume that the network needs is missing.
         """
-        given = [v_coarse]
-        if self.config.use_density:
-            given.append(confidence_from_density(m_rho))
-        if self.config.use_sharp:
-            if v_sharp is None:
-                raise ValueError("this network needs V_sharp")
-            given.append(v_sharp)
-        inputs = torch.cat(given, 1)
+        inputs = torch.cat(given.shown(self.config), 1)
         size = inputs.shape[2:]
         far_end = [padding for extent in reversed(size) for padding in (0, -extent % self.config.stride)]
         inputs = functional.pad(inputs, far_end)
@@ -116,8 +111,8 @@ class ResidualRefiner(nn.Module):
         features = self.encoder[-1](features)
         for up, decode in zip(reversed(self.up), reversed(self.decoder), strict=True):
             features = decode(_channels_last(up(features)) + skips.pop())
-        residual = self._in_slabs(features, inputs)
-        return residual[:, :, : size[0], : size[1], : size[2]]
+        out = self._in_slabs(features, inputs)[:, :, : size[0], : size[1], : size[2]]
+        return torch.tanh(out[:, :1]), out[:, 1:]
 
     def _at_full_resolution(self, features: Tensor, inputs: Tensor) -> Tensor:
         """The last layers: features at half resolution and the inputs to F."""
@@ -133,7 +128,7 @@ class ResidualRefiner(nn.Module):
         n_rows = features.shape[2]
         if torch.is_grad_enabled() or n_rows <= SLAB_ROWS + 2:
             return self._at_full_resolution(features, inputs)
-        out = torch.empty_like(inputs[:, :1])
+        out = torch.empty_like(inputs[:, :2])
         for begin in range(0, n_rows, SLAB_ROWS):
             # all slabs but have one shape, the last overlapping: kernels are set up, and kept, for each shape
             low = min(max(begin - 1, 0), n_rows - SLAB_ROWS - 2)

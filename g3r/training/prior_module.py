@@ -1,7 +1,8 @@
 """Training of the prior network."""
 
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
@@ -9,14 +10,18 @@ from torch import Tensor
 from g3r.checkpoints.trained_model import TRAINING_ENTRY
 from g3r.errors import InputError
 from g3r.prior.config import PriorNetworkConfig
-from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
+from g3r.prior.inputs import PriorInputs
 from g3r.prior.model import VOXEL_MM_TOLERANCE, Prior
 from g3r.training.annealed_module import AnnealedModule
-from g3r.training.prior_batches import Batch, loss_weight, random_cube_symmetry, weighted_l1
+from g3r.training.prior_batches import Batch, loss_weight, prior_inputs, prior_loss, random_cube_symmetry, weighted_l1
 from g3r.training.prior_validation import (
     PANEL_TAG,
+    VALIDATED,
     ValidationScores,
+    l1_by_confidence,
     panel,
+    psnr_by_place,
     stack_numbers,
     stacks_suffix,
     validation_means,
@@ -28,17 +33,16 @@ DEFAULT_NETWORK = PriorNetworkConfig()
 class PriorModule(AnnealedModule):
     """Supervised training of V_prior against the true volume.
 
-    Loss: mean absolute error, weighted 1 in the brain mask and `background_weight` elsewhere. Only the
-    mask is used later, and V_coarse ends in a bright halo around it: with a larger weight of the background
-    (0.1, and 1 within 3 voxels of the mask, was tried) the network learnt to trim the halo and nothing else.
-    The small weight that remains keeps the output bounded there.
+    Loss: `prior_loss`, weighted by `loss_weight`. Only the mask is used later, and V_coarse ends in a bright halo
+    around it: with a larger weight of the background (0.1, and 1 within 3 voxels of the mask, was tried) the network
+    learnt to trim the halo and nothing else.
 
     Args:
         network: see `PriorNetworkConfig`.
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
-        background_weight: loss weight outside the brain mask, 0 to 1.
+        background_weight: loss weight outside the brain mask, 0 to 1; see `loss_weight`.
         augment_orientation: rotate and mirror each training batch by a random symmetry of the cube, so that
             the prior does not depend on the orientation in which a subject is reconstructed.
         voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
@@ -77,27 +81,26 @@ class PriorModule(AnnealedModule):
         self.voxel_mm = voxel_mm
         self._scores = ValidationScores()
         self._panels: dict[int, Tensor] = {}
+        self.weeks = [0.0] * network.template_shape[0]
 
-    def forward(self, v_coarse: Tensor, m_rho: Tensor, v_sharp: Tensor | None = None) -> Tensor:
-        """Return V_prior, [B, 1, I, J, K] (G3R Eq. 7).
-
-        Args:
-            v_coarse: [B, 1, I, J, K], with a 99th percentile of 1.
-            m_rho: [B, 1, I, J, K], dimensionless density M >= 0.
-            v_sharp: [B, 1, I, J, K], on V_coarse's scale, or None where the network takes none.
-        """
-        return self.network(v_coarse, m_rho, v_sharp)
+    def forward(self, given: PriorInputs) -> PriorOutput:
+        """Return V_prior and the brain's logit, [B, 1, I, J, K] (G3R Eq. 7)."""
+        return cast(PriorOutput, self.network(given))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the weighted L1 error of one batch; log it and V_coarse's."""
+        """Return the loss of one batch; log it, the error by confidence, and V_coarse's."""
         if self.augment_orientation:
             batch = random_cube_symmetry(batch)
-        weight = loss_weight(batch["mask"], self.background_weight)
-        loss = weighted_l1(self(batch["coarse"], batch["density"], batch["sharp"]), batch["truth"], weight)
+        weight = loss_weight(batch, self.background_weight)
+        found = self(prior_inputs(batch))
+        loss = prior_loss(found, batch, weight)
         n_samples = batch["truth"].shape[0]
-        self.log("train/l1_prior", loss, prog_bar=True, batch_size=n_samples)
-        coarse_loss = weighted_l1(batch["coarse"], batch["truth"], weight)
-        self.log("train/l1_coarse", coarse_loss, batch_size=n_samples)
+        self.log("train/loss", loss, prog_bar=True, batch_size=n_samples)
+        with torch.no_grad():
+            for name, value in l1_by_confidence(found.volume, batch).items():
+                self.log(f"train/l1_prior_{name}", value, batch_size=n_samples)
+            self.log("train/l1_prior", weighted_l1(found.volume, batch["truth"], weight), batch_size=n_samples)
+            self.log("train/l1_coarse", weighted_l1(batch["coarse"], batch["truth"], weight), batch_size=n_samples)
         return loss
 
     def n_samples(self, batch: Batch) -> int:
@@ -110,9 +113,9 @@ class PriorModule(AnnealedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the prior of every sample in its mask, and V_sharp and V_coarse for comparison."""
-        prior = self(batch["coarse"], batch["density"], batch["sharp"]).to(batch["truth"].dtype)
-        volumes = {"prior": prior, "sharp": batch["sharp"], "coarse": batch["coarse"]}
-        self._scores.add(volumes, batch, loss_weight(batch["mask"], self.background_weight))
+        prior = self(prior_inputs(batch)).volume.to(batch["truth"].dtype)
+        volumes = {"prior": prior, **{name: batch[name] for name in VALIDATED[1:]}}
+        self._scores.add(volumes, batch, loss_weight(batch, self.background_weight))
         for b, n in enumerate(stack_numbers(batch)):
             if n not in self._panels:
                 gate = self.network.gate if self.network.config.use_gate else None
@@ -121,11 +124,8 @@ class PriorModule(AnnealedModule):
     def on_validation_epoch_end(self) -> None:
         """Log mean L1, PSNR (dB), SSIM and gain, over all and by number of stacks; send the images."""
         # summed over the processes, so that all of them log, and keep, the same
-        sums = self.all_gather(self._scores.sums.to(self.device, torch.float32))
-        assert isinstance(sums, Tensor)
-        if sums.ndim > self._scores.sums.ndim:
-            sums = sums.sum(0)
-        for name, value in validation_means(sums).items():
+        sums, squares = (self._over_processes(one) for one in (self._scores.sums, self._scores.squares))
+        for name, value in {**validation_means(sums), **psnr_by_place(squares)}.items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr_gain")
         for logger in self.loggers:
             if isinstance(logger, TensorBoardLogger):
@@ -136,6 +136,30 @@ class PriorModule(AnnealedModule):
                         global_step=self.global_step,
                         dataformats="HW",
                     )
+
+    def _over_processes(self, sums: Tensor) -> Tensor:
+        """The sum over all processes."""
+        gathered = self.all_gather(sums.to(self.device, torch.float32))
+        assert isinstance(gathered, Tensor)
+        return gathered.sum(0) if gathered.ndim > sums.ndim else gathered
+
+    def setup(self, stage: str) -> None:
+        """Take the atlas template from the data module.
+
+        Raises:
+            InputError: a template on another grid than the network's.
+        """
+        data: Any = getattr(self.trainer, "datamodule", None)
+        if hasattr(data, "template"):
+            template = data.template()
+            self.network.set_template(torch.from_numpy(template.volume))
+            config = self.network.config
+            if not np.allclose(template.affine, config.template_grid.affine, atol=1e-3):
+                raise InputError(
+                    f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
+                    "pass --model.network.template_spacing_mm"
+                )
+            self.weeks = [float(week) for week in template.weeks]
 
     def on_fit_start(self) -> None:
         """Take the voxel size from the data module.
@@ -169,7 +193,7 @@ class PriorModule(AnnealedModule):
 
     def own_description(self) -> dict[str, Any]:
         """Values that a `Prior` needs apart from its weights."""
-        return {"voxel_mm": self.voxel_mm}
+        return {"voxel_mm": self.voxel_mm, "weeks": self.weeks}
 
 
 def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
@@ -184,6 +208,8 @@ def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
     other = Prior.load(path)
     own = network.state_dict()
     for name, given in other.network.state_dict().items():
+        if name == "template":  # the data module's is taken
+            continue
         into = own.get(name)
         fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]
         if into is None or not fits or into.shape[2:] != given.shape[2:] or into.numel() < given.numel():
@@ -196,7 +222,8 @@ def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
             into[:, : given.shape[1]] = given
         else:
             into.copy_(given)
-    if other.network.config.sharp_base != network.config.sharp_base:
+    mine, theirs = network.config, other.network.config
+    if (mine.sharp_base, mine.use_template) != (theirs.sharp_base, theirs.use_template):
         torch.nn.init.zeros_(network.refiner.head.weight)
         torch.nn.init.zeros_(network.refiner.head.bias)  # type: ignore[arg-type]
     return other.voxel_mm

@@ -1,21 +1,31 @@
 """Validation of the prior's training: scores of every volume, by number of stacks, and a row of images."""
 
+import math
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from g3r.evaluation.metrics import score
 from g3r.prior.gate import DensityGate, confidence_from_density
 from g3r.training.prior_batches import Batch, weighted_l1
 
-VALIDATED = ("prior", "sharp", "coarse")
+VALIDATED = ("prior", "sharp", "coarse", "template")
 """Volumes that are scored: the network's, and what it starts from."""
 METRICS = ("l1", "psnr", "ssim")
 MAX_STACKS = 12
 """More are counted as this many."""
-PANEL_TAG = "coarse, sharp, confidence, gate, prior, truth, 4 x error"
+PANEL_TAG = "coarse, sharp, template, confidence, gate, prior, truth, 4 x error"
+
+CONFIDENCE_BINS = {"unseen": 0.05, "hardly_seen": 0.3, "thinly_seen": 0.6, "seen": np.inf}
+"""Bins of the confidence c by name, with their upper ends."""
+RIM_MM = 3.0
+ASSUMED_VOXEL_MM = 0.8
+PLACES = ("rim", "deep")
+"""The outermost `RIM_MM` of the brain, and the rest."""
 
 
 class ValidationScores:
@@ -23,6 +33,7 @@ class ValidationScores:
 
     def __init__(self) -> None:
         self.sums = torch.zeros(MAX_STACKS + 1, len(VALIDATED), len(METRICS), 2, dtype=torch.float64)
+        self.squares = torch.zeros(len(CONFIDENCE_BINS), len(PLACES), len(VALIDATED), 2, dtype=torch.float64)
 
     def add(self, volumes: Mapping[str, Tensor], batch: Batch, weight: Tensor) -> None:
         """Score every sample of a batch.
@@ -39,6 +50,47 @@ class ValidationScores:
                     if metric in found:
                         for row in {0, n}:
                             self.sums[row, v, m] += torch.tensor([found[metric], 1.0], dtype=torch.float64)
+                squared = (volumes[name][b, 0] - batch["truth"][b, 0]).double().cpu() ** 2
+                for k, bins in enumerate(confidence_bins(batch["density"][b, 0].cpu())):
+                    for p, place in enumerate(_places(batch["mask"][b, 0])):
+                        chosen = squared[bins & place]
+                        self.squares[k, p, v] += torch.tensor([float(chosen.sum()), len(chosen)], dtype=torch.float64)
+
+
+def confidence_bins(density: Tensor) -> list[Tensor]:
+    """Masks of the voxels in each of `CONFIDENCE_BINS`, of the density's shape."""
+    c = confidence_from_density(density)
+    ends = [-np.inf, *CONFIDENCE_BINS.values()]
+    return [(c >= low) & (c < high) for low, high in pairwise(ends)]
+
+
+def l1_by_confidence(volume: Tensor, batch: Batch) -> dict[str, Tensor]:
+    """Mean absolute error of a batch's brain in each of `CONFIDENCE_BINS` that it has voxels in."""
+    error, brain = (volume - batch["truth"]).abs(), batch["mask"] > 0.5
+    chosen = {name: bins & brain for name, bins in zip(CONFIDENCE_BINS, confidence_bins(batch["density"]), strict=True)}
+    return {name: error[one].mean() for name, one in chosen.items() if bool(one.any())}
+
+
+def psnr_by_place(squares: Tensor) -> dict[str, float]:
+    """PSNR (dB, of an intensity of 1) over all volumes by name: `psnr_prior_unseen_deep` and so on.
+
+    Args:
+        squares: [bins, places, volumes, 2], sums of squared errors and numbers of voxels.
+    """
+    found = {}
+    for of_bin, bin_name in zip(squares.double().cpu(), CONFIDENCE_BINS, strict=True):
+        for of_place, place in zip(of_bin, PLACES, strict=True):
+            for (total, count), name in zip(of_place.tolist(), VALIDATED, strict=True):
+                if count and total > 0:
+                    found[f"psnr_{name}_{bin_name}_{place}"] = 10 * math.log10(count / total)
+    return found
+
+
+def _places(mask: Tensor) -> list[Tensor]:
+    """Masks of the rim and of the rest of a brain [I, J, K], whose voxels are taken to be of `ASSUMED_VOXEL_MM`."""
+    inside = (mask > 0.5).cpu().numpy()
+    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1, 1:-1] * ASSUMED_VOXEL_MM
+    return [torch.from_numpy(inside & (depth <= RIM_MM)), torch.from_numpy(inside & (depth > RIM_MM))]
 
 
 def sample_scores(volume: Tensor, truth: Tensor, mask: Tensor, weight: Tensor) -> dict[str, float]:
@@ -108,6 +160,7 @@ def panel(batch: Batch, prior: Tensor, gate: DensityGate | None) -> Tensor:
     row = [
         volumes["coarse"],
         volumes["sharp"],
+        volumes["template"],
         confidence_from_density(density),
         torch.ones_like(density) if gate is None else gate(density),
         shown,

@@ -1,0 +1,113 @@
+"""Parts of a head that no slice looks at: runs of missing slices, and fields of view that cut the head."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.stacks import Stack
+
+EVEN_SHARE = 0.3
+"""Share of subjects of whom all slices are there."""
+CUT_SHARE = 0.5
+"""Share of the others whose stacks are cut by their fields of view; the rest misses slices. One in five has both."""
+BOTH_SHARE = 0.2
+CONCERNED_SHARE = 0.75
+"""Share of the stacks of an uneven subject that miss something."""
+MISSING_SLICES = (1, 8)
+"""Length of a run of missing slices; a stack keeps at least `MIN_SLICES` of the masked ones."""
+MIN_SLICES = 4
+CUT = (0.2, 0.6)
+"""Share of the head's extent that a field of view leaves out."""
+SAME_SIDE_SHARE = 0.6
+"""Share of cut subjects whose stacks all miss the same side of the head, as when the plan was too small."""
+
+
+def with_uneven_coverage(stacks: Sequence[SimulatedStack], rng: np.random.Generator) -> list[SimulatedStack]:
+    """Stacks of which some miss slices, or are cut by their fields of view.
+
+    Missing slices stay in the stack and are zero, as blanked slices are in files, so that numbers and poses of
+    slices keep their meaning. A cut along the slices does the same with all slices beyond; a cut in plane makes the
+    images smaller.
+
+    Args:
+        stacks: as simulated, with masks.
+        rng: source of randomness.
+    """
+    kind = rng.random()
+    if kind < EVEN_SHARE:
+        return list(stacks)
+    cuts = rng.random() < CUT_SHARE
+    both = rng.random() < BOTH_SHARE
+    result = list(stacks)
+    if cuts or both:
+        result = _with_cuts(result, rng)
+    if not cuts or both:
+        result = [_with_missing_run(one, rng) if rng.random() < CONCERNED_SHARE else one for one in result]
+    return result
+
+
+def without_slices(one: SimulatedStack, first: int, last: int) -> SimulatedStack:
+    """A stack in which slices `first` to `last` - 1 were never acquired: zero, with empty masks."""
+    image, mask = one.stack.image.copy(), one.stack.mask.copy()
+    image[:, :, first:last], mask[:, :, first:last] = 0, False
+    return replace(one, stack=replace(one.stack, image=image, mask=mask)) if mask.any() else one
+
+
+def _with_missing_run(one: SimulatedStack, rng: np.random.Generator) -> SimulatedStack:
+    masked = np.flatnonzero(one.stack.mask.any((0, 1)))
+    longest = min(MISSING_SLICES[1], len(masked) - MIN_SLICES)
+    if longest < MISSING_SLICES[0]:
+        return one
+    n = int(rng.integers(MISSING_SLICES[0], longest + 1))
+    first = int(masked[rng.integers(len(masked) - n + 1)])
+    return without_slices(one, first, first + n)
+
+
+def _with_cuts(stacks: Sequence[SimulatedStack], rng: np.random.Generator) -> list[SimulatedStack]:
+    direction = rng.standard_normal(3)
+    share = rng.uniform(*CUT)
+    same = rng.random() < SAME_SIDE_SHARE
+    result = []
+    for one in stacks:
+        concerned = same or rng.random() < CONCERNED_SHARE
+        if concerned:
+            if not same:
+                direction, share = rng.standard_normal(3), rng.uniform(*CUT)
+            one = _cut(one, direction, share)
+        result.append(one)
+    return result
+
+
+def _cut(one: SimulatedStack, direction: NDArray[np.float64], share: float) -> SimulatedStack:
+    """A stack without the part of the head that lies furthest along a direction, cut square to its nearest axis."""
+    stack = one.stack
+    axes = stack.affine[:3, :3] / stack.spacing_mm
+    along = axes.T @ direction
+    axis = int(np.argmax(np.abs(along)))
+    marked = np.flatnonzero(stack.mask.any(tuple(other for other in range(3) if other != axis)))
+    n = min(round(share * len(marked)), len(marked) - MIN_SLICES)
+    if n < 1:
+        return one
+    at_end = along[axis] > 0
+    if axis == 2:
+        edge = int(marked[len(marked) - n] if at_end else marked[n])
+        return without_slices(one, edge, stack.image.shape[2]) if at_end else without_slices(one, 0, edge)
+    kept = slice(0, int(marked[len(marked) - n])) if at_end else slice(int(marked[n]), stack.image.shape[axis])
+    cropped = _cropped(stack, axis, kept)
+    return one if cropped is None else replace(one, stack=cropped)
+
+
+def _cropped(stack: Stack, axis: int, kept: slice) -> Stack | None:
+    """The stack with fewer rows or columns; None where no head would be left."""
+    box = tuple(kept if other == axis else slice(None) for other in range(3))
+    mask = stack.mask[box]
+    if not mask.any():
+        return None
+    affine = stack.affine.copy()
+    affine[:3, 3] = stack.affine[:3, :3] @ (np.eye(3)[axis] * kept.start) + stack.affine[:3, 3]
+    return replace(stack, image=np.ascontiguousarray(stack.image[box]), mask=mask, affine=affine)

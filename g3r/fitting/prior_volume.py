@@ -1,0 +1,74 @@
+"""V_prior and the brain mask of a subject, from its volumes, the prior network and the atlas template."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.coverage import UNSEEN_BELOW
+from g3r.acquisition.smooth_fill import smooth_fill
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.prior.inference import PriorMaps, Tiling
+from g3r.prior.model import Prior
+from g3r.prior.subject_template import PlacedTemplate
+from g3r.registration.atlas_frame import Orientation
+
+KNOWN_DENSITY = 2 * UNSEEN_BELOW
+"""Density from which on V_sharp is taken as it is where no template fills what is missing."""
+
+
+def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedTemplate | None:
+    """The prior's template in the frame of the slices; None without a prior, or where that is not the atlas frame."""
+    if prior is None or orientation is None or not prior.network.config.use_template:
+        return None
+    return PlacedTemplate.of(prior.template, orientation.weeks, orientation.scale)
+
+
+def prior_volume(
+    volumes: InitialVolumes,
+    gain: NDArray[np.float64],
+    prior: Prior | None,
+    placed: PlacedTemplate | None,
+    *,
+    n_views: int,
+    tiling: Tiling,
+) -> PriorVolume:
+    """V_prior (G3R Eq. 7) and the brain mask, in which the unseen part of the head is what its shape suggests.
+
+    Args:
+        volumes: what the slices give by themselves.
+        gain: [K] of the slices.
+        prior: None takes V_sharp, smoothly continued into what was not seen.
+        placed: its atlas template; None where there is none, and the smooth continuation takes its place.
+        n_views: see `estimate_prior`.
+        tiling: see `estimate_prior`.
+    """
+    share = volumes.share
+    if placed is not None:
+        fitted = placed.fitted(volumes.sharp, share, volumes.density, volumes.grid)
+        guess, outline = fitted.values, fitted.inside
+    else:
+        guess = smooth_fill(volumes.sharp, np.clip(volumes.density / KNOWN_DENSITY, 0, 1))
+        outline = volumes.foreground.completed().astype(np.float32)
+    values, brain = guess, None
+    if prior is not None:
+        maps = PriorMaps(
+            coarse=volumes.coarse,
+            density=volumes.density,
+            share=share,
+            sharp=volumes.sharp,
+            template=guess,
+            outline=outline,
+        )
+        found = prior.estimate(maps, n_views=n_views, tiling=tiling)
+        values, brain = found.volume, found.brain
+    mask = volumes.foreground.completed(brain)
+    return PriorVolume(
+        volumes=volumes,
+        values=values,
+        brain=brain,
+        mask=mask,
+        has_template=placed is not None,
+        gain=gain,
+        scale=volumes.scale,
+    )
