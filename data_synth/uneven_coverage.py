@@ -51,11 +51,28 @@ def with_uneven_coverage(stacks: Sequence[SimulatedStack], rng: np.random.Genera
     return result
 
 
-def without_slices(one: SimulatedStack, first: int, last: int) -> SimulatedStack:
-    """A stack in which slices `first` to `last` - 1 were never acquired: zero, with empty masks."""
-    image, mask = one.stack.image.copy(), one.stack.mask.copy()
+def emptied(stack: Stack, first: int, last: int) -> Stack:
+    """A stack whose slices `first` to `last` - 1 were never acquired: zero, with empty masks; as it is if none is left.
+
+    Args:
+        stack: to change.
+        first: number of a slice.
+        last: number of the slice after the run.
+    """
+    image, mask = stack.image.copy(), stack.mask.copy()
     image[:, :, first:last], mask[:, :, first:last] = 0, False
-    return replace(one, stack=replace(one.stack, image=image, mask=mask)) if mask.any() else one
+    return replace(stack, image=image, mask=mask) if mask.any() else stack
+
+
+def without_slices(one: SimulatedStack, first: int, last: int) -> SimulatedStack:
+    """A simulated stack with slices `first` to `last` - 1 emptied; see `emptied`.
+
+    Args:
+        one: to change.
+        first: number of a slice.
+        last: number of the slice after the run.
+    """
+    return replace(one, stack=emptied(one.stack, first, last))
 
 
 def _with_missing_run(one: SimulatedStack, rng: np.random.Generator) -> SimulatedStack:

@@ -1,0 +1,1 @@
+"""What docs/unseen.md shows: parts of a head that no slice saw."""
