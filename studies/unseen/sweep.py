@@ -80,8 +80,8 @@ def with_holes(stacks: tuple[Stack, ...], holes: tuple[Hole, ...]) -> tuple[Stac
     result = list(stacks)
     for hole in holes:
         masked = np.flatnonzero(stacks[hole.stack].mask.any((0, 1)))
-        first = int(round(hole.first * len(masked)))
-        n = int(-hole.last) if hole.last < 0 else int(round(hole.last * len(masked))) - first
+        first = round(hole.first * len(masked))
+        n = int(-hole.last) if hole.last < 0 else round(hole.last * len(masked)) - first
         if n > 0:
             last = min(first + n, len(masked)) - 1
             result[hole.stack] = emptied(stacks[hole.stack], int(masked[first]), int(masked[last]) + 1)
@@ -186,7 +186,8 @@ def calibration_ratio(case: SimulatedCase, result: Any, common: RigidPose) -> di
         common: motion of all slices to the truth.
     """
     alignment = aligned(case, result.volume, result.grid, common).alignment
-    assert alignment is not None and result.uncertainty is not None
+    assert alignment is not None
+    assert result.uncertainty is not None
     truth_from_result = alignment.volume_from_reference.inverse() @ common
     truth = resample(case.truth, result.grid, truth_from_result)
     inside = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
