@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Planes, Slices
-from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
+from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError

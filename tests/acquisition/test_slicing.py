@@ -9,7 +9,8 @@ import pytest
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, slices_from_stacks
+from g3r.acquisition.area_profile import head_volume_mm3
+from g3r.acquisition.slicing import normalised_slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, stacks_of_two, write
