@@ -15,7 +15,7 @@ from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
-from g3r.registration.global_search import GlobalSearch, search_single
+from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
 from g3r.registration.segment_search import aligned_to
@@ -105,7 +105,7 @@ def register(
     held_out = None
     if not single:
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
-        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found.motion, fitted, settings.finest_voxel_mm)
+        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings.finest_voxel_mm)
     orientation = None
     if found.placed is not None and settings.standard_orientation:
         start = found.placed.motion(len(slices), samples)
@@ -131,7 +131,7 @@ def _with_rigid_stacks(
     slices: Slices,
     samples: list[StackSamples],
     rigid: list[int],
-    motion: RigidPose,
+    found: SearchResult,
     fitted: FittedSlices,
     voxel_mm: float,
 ) -> tuple[FittedSlices, list[float]]:
@@ -140,11 +140,12 @@ def _with_rigid_stacks(
     Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
     are not asked: a few slices that went astray lower their correlation, while all others gain.
     """
-    before = held_out_score(slices, samples, motion)
+    motion, fill = found.motion, found.fill
+    before = held_out_score(slices, samples, motion, fill)
     refined = fitted.slices.world_from_header()
     equal = np.ones(len(slices))
     rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
-    after = held_out_score(slices, samples, refined)
+    after = held_out_score(slices, samples, refined, fill)
     reverted = [
         sample
         for sample, old, new in zip(samples, before.correlations, after.correlations, strict=True)
@@ -164,7 +165,7 @@ def _with_rigid_stacks(
         refined = refined.with_rows(sample.rows, motion.take(sample.rows))
         gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
     kept = replace(fitted, slices=slices.with_motion(refined), gain=gain, weight=weight)
-    return kept, held_out_score(slices, samples, refined).correlations
+    return kept, held_out_score(slices, samples, refined, fill).correlations
 
 
 def _segments_of(samples: list[StackSamples], motion: RigidPose) -> tuple[list[int], list[int | None]]:

@@ -1,0 +1,67 @@
+"""What no other stack saw: the atlas template in place of the zeros of a volume made of the other stacks.
+
+A volume of the other stacks is zero where they lack slices. That zero is no evidence: a slice that belongs there
+would fit better anywhere else, and hole goes to hole. The template, in the frame that the slices are in, predicts
+roughly what lies there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from g3r.geometry import VolumeGrid
+
+FULL_COVERAGE = 0.3
+"""Share of the typical coverage of a voxel by pixels from which on the template does not count."""
+
+
+@dataclass(frozen=True)
+class TemplateFill:
+    """A head in the frame of the slices.
+
+    Args:
+        volume: [I, J, K] blurred as thick slices are.
+        grid: its grid.
+        center_mm: [3] of the head.
+    """
+
+    volume: NDArray[np.float32]
+    grid: VolumeGrid
+    center_mm: NDArray[np.float64]
+
+    def filled(
+        self, volume: NDArray[np.float32], grid: VolumeGrid, coverage: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """A volume with the template where no pixel was seen.
+
+        Args:
+            volume: [I, J, K] of some slices.
+            grid: its grid.
+            coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
+        """
+        head = resampled(self.volume, self.grid, grid)
+        share = coverage_share(coverage)
+        known = (share >= 1) & (head > 0)
+        scale = 1.0
+        if known.any():
+            scale = float(np.clip((volume[known] @ head[known]) / (head[known] @ head[known]), 0.5, 2.0))
+        return (share * volume + (1 - share) * np.float32(scale) * head).astype(np.float32)
+
+
+def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How far each voxel [I, J, K] was seen, from 0 (not) to 1, from the pixels that were spread over it."""
+    some = coverage > 0.1 * coverage.max(initial=0)
+    typical = float(np.median(coverage[some])) if some.any() else 1.0
+    return np.minimum(coverage / np.float32(FULL_COVERAGE * typical), 1.0).astype(np.float32)
+
+
+def resampled(volume: NDArray[np.float32], grid: VolumeGrid, onto: VolumeGrid) -> NDArray[np.float32]:
+    """A volume on another grid (trilinear), 0 outside its own."""
+    matrix = np.linalg.inv(grid.affine) @ onto.affine
+    index = np.indices(onto.shape).reshape(3, -1)
+    place = matrix[:3, :3] @ index + matrix[:3, 3:]
+    return map_coordinates(volume, place, order=1, output=np.float32).reshape(onto.shape)
