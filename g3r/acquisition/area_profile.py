@@ -39,6 +39,12 @@ AREA_SPREAD = 0.08
 MIN_ANGLE_DEG = 45.0
 """Stacks whose normals are at least so far apart see each other's length."""
 
+WHOLE_VOLUME_SPREAD = 0.08
+"""Deviation of the logarithm of a cut stack's volume, continued, from that of stacks that show the whole head."""
+
+MAX_AREA_GAIN = 1.25
+"""The largest area of a head over the largest that a cut stack shows: 1.2 where it lacks 70 % of the length."""
+
 MAX_LENGTH_GAIN = 2.5
 """No head is longer than this times what was seen of it."""
 
@@ -98,8 +104,14 @@ class AreaProfile:
 
 def area_profiles(slices: Slices) -> list[AreaProfile]:
     """The profile of each stack that has slices, in the order of their numbers."""
-    stacks = np.unique(slices.stack_id)
-    return [_profile(slices, slices.stack_id == stack) for stack in stacks]
+    of_stack = [slices.stack_id == stack for stack in np.unique(slices.stack_id)]
+    seen = [_profile(slices, one) for one in of_stack]
+    whole = [one.volume_mm3 for one in seen if not one.is_cut]
+    volume_mm3 = float(np.median(whole)) if whole else None
+    return [
+        _continued(slices, one, profile, volume_mm3) if profile.is_cut else profile
+        for one, profile in zip(of_stack, seen, strict=True)
+    ]
 
 
 def head_volume_mm3(slices: Slices) -> float:
@@ -113,6 +125,7 @@ def head_volume_mm3(slices: Slices) -> float:
 
 
 def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
+    """From the first to the last slice of a stack."""
     stack = slices.take(of_stack)
     number, plane = stack.slice_index, stack.pixel_plane
     count = np.bincount(plane, minlength=len(stack))
@@ -130,20 +143,37 @@ def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
     cut = (False, False)
     if len(number) >= MIN_SLICES:
         cut = bool(area[0] > MIN_CUT_AREA * largest), bool(area[-1] > MIN_CUT_AREA * largest)
-    if any(cut):
-        before, after = _beyond(number, area, spacing, cut, _length_of_others_mm(slices, of_stack))
-        every = np.concatenate([number[0] - 1 - np.arange(len(before))[::-1], every, number[-1] + 1 + np.arange(len(after))])
-        expected = np.concatenate([before[::-1], expected, after])
-    # beyond the ends the middle of the area goes on along the normal, not in plane
-    step = _step_mm(stack)
-    middle = np.stack([np.interp(every, number, (center - number[:, None] * step)[:, axis]) for axis in range(3)], axis=1)
+    middle = np.stack([np.interp(every, number, center[:, axis]) for axis in range(3)], axis=1)
     return AreaProfile(
         index=every,
         area_mm2=expected,
-        center_mm=middle + every[:, None] * step,
+        center_mm=middle,
         seen=np.isin(every, number),
         spacing_mm=spacing,
         cut=cut,
+    )
+
+
+def _continued(
+    slices: Slices, of_stack: NDArray[np.bool_], profile: AreaProfile, volume_mm3: float | None
+) -> AreaProfile:
+    """A profile with the slices beyond its cut ends; the middle of the area goes on along the normal."""
+    before, after = _beyond(profile, _length_of_others_mm(slices, of_stack), volume_mm3)
+    first, last = -np.arange(len(before), 0, -1), np.arange(1, len(after) + 1)
+    step = _step_mm(slices.take(of_stack))
+    return AreaProfile(
+        index=np.concatenate([profile.index[0] + first, profile.index, profile.index[-1] + last]),
+        area_mm2=np.concatenate([before[::-1], profile.area_mm2, after]),
+        center_mm=np.concatenate(
+            [
+                profile.center_mm[0] + first[:, None] * step,
+                profile.center_mm,
+                profile.center_mm[-1] + last[:, None] * step,
+            ]
+        ),
+        seen=np.concatenate([first > 0, profile.seen, last < 0]),
+        spacing_mm=profile.spacing_mm,
+        cut=profile.cut,
     )
 
 
@@ -175,29 +205,30 @@ def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float |
 
 
 def _beyond(
-    number: NDArray[np.int64],
-    area_mm2: NDArray[np.float64],
-    spacing_mm: float,
-    cut: tuple[bool, bool],
-    length_mm: float | None,
+    profile: AreaProfile, length_mm: float | None, volume_mm3: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Areas of the slices before the first and after the last one, from the ends outwards.
 
     The ellipsoid with area A (1 - ((z - z0) / c)^2) that is most likely, given the areas that were seen, the usual
-    length of a head of that area, and the length that other stacks show.
+    length of a head of that area, the length that other stacks show, and the volume of those that show all.
     """
-    z = (number - number[0]) * spacing_mm
+    cut, spacing_mm = profile.cut, profile.spacing_mm
+    z = (profile.index - profile.index[0]) * spacing_mm
+    padded = np.pad(profile.area_mm2, 1, mode="edge")  # slices of an interleaved, moving stack alternate
+    area_mm2 = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
+    largest = float(area_mm2.max())
     seen_mm = float(z[-1]) + spacing_mm
     half = np.linspace(seen_mm / 2 if all(cut) else seen_mm / 2.2, seen_mm * MAX_LENGTH_GAIN / 2, 60)
     middle = np.linspace(-seen_mm, 2 * seen_mm, 121)
     shape = np.maximum(1 - ((z - middle[:, None, None]) / half[None, :, None]) ** 2, 0.0)
-    top = (shape @ area_mm2) / np.maximum((shape**2).sum(-1), 1e-9)
+    top = np.minimum((shape @ area_mm2) / np.maximum((shape**2).sum(-1), 1e-9), MAX_AREA_GAIN * largest)
     misfit = area_mm2 - top[..., None] * shape
-    largest = np.maximum(top, float(area_mm2.max()))
-    cost = 0.5 * ((misfit / (AREA_SPREAD * largest[..., None])) ** 2).sum(-1)
+    cost = 0.5 * ((misfit / (AREA_SPREAD * largest)) ** 2).sum(-1)
     if length_mm is not None:
         cost += 0.5 * (np.log(2 * half / length_mm) / SEEN_LENGTH_SPREAD) ** 2
-    usual_mm = LENGTH_RATIO * 2 * np.sqrt(largest / np.pi)
+    if volume_mm3 is not None:
+        cost += 0.5 * (np.log(4 / 3 * np.maximum(top, 1e-9) * half / volume_mm3) / WHOLE_VOLUME_SPREAD) ** 2
+    usual_mm = LENGTH_RATIO * 2 * np.sqrt(np.maximum(top, 1e-9) / np.pi)
     cost += 0.5 * (np.log(2 * half / usual_mm) / LENGTH_SPREAD) ** 2
     m, h = np.unravel_index(int(cost.argmin()), cost.shape)
 
