@@ -48,6 +48,8 @@ def volume_without(
     """
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
+    if fill is not None:
+        grid = fill.grid_with(grid)
     index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // PIXELS_OF_VOLUME))
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 3))
     value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)

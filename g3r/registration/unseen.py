@@ -33,6 +33,13 @@ class TemplateFill:
     grid: VolumeGrid
     center_mm: NDArray[np.float64]
 
+    def grid_with(self, grid: VolumeGrid) -> VolumeGrid:
+        """A grid that covers another one and the whole head, with its voxels."""
+        head = self.grid.world(np.argwhere(self.volume > 0))
+        corners = grid.world(np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(grid.shape) - 1))
+        both = np.concatenate([head, corners])
+        return VolumeGrid.isotropic(both.min(0), both.max(0), float(grid.spacing_mm[0]), 0.0)
+
     def filled(
         self, volume: NDArray[np.float32], grid: VolumeGrid, coverage: NDArray[np.float32]
     ) -> NDArray[np.float32]:
