@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.area_profile import head_volume_mm3
+from g3r.acquisition.area_profile import AreaProfile, head_volume_mm3
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
@@ -33,6 +33,7 @@ from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.atlas_search import template_fits
+from g3r.registration.overlap import Overlap
 from g3r.registration.prior_registration import register_to_prior
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
@@ -40,6 +41,8 @@ from g3r.run.deadline import Deadline
 
 STORED_RECORDS = (
     Registration,
+    AreaProfile,
+    Overlap,
     InitialVolumes,
     PriorVolume,
     PriorCloud,

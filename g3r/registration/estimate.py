@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.area_profile import AreaProfile
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
@@ -18,6 +19,7 @@ from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
@@ -49,6 +51,8 @@ class Registration:
         n_segments: motion segments of each stack; 1 for a rigid stack.
         orientation: the standard orientation; None where the result stays in the scanner frame.
         history: figures of each round.
+        profiles: of each stack, missing slices included.
+        overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
     """
 
     slices: Slices
@@ -62,6 +66,8 @@ class Registration:
     n_segments: list[int]
     orientation: Orientation | None
     history: list[dict[str, float]] = field(default_factory=list)
+    profiles: list[AreaProfile] = field(default_factory=list)
+    overlap: Overlap | None = None
 
     def __repr__(self) -> str:
         frame = "scanner frame" if self.orientation is None else "atlas frame"
@@ -101,11 +107,14 @@ def register(
     n_segments, interleave = _segments_of(samples, found.motion)
     rounds = replace(settings, n_rounds=0) if single else settings
     rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
-    fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline)
+    missing = not single and any(sample.profile.has_missing for sample in samples)
+    seen_share = overlap_of(slices, samples, found.motion).seen_share if missing else None
+    fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline, seen_share)
     held_out = None
     if not single:
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
         fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings.finest_voxel_mm)
+    overlap = overlap_of(slices, samples, fitted.slices.world_from_header()) if missing else None
     orientation = None
     if found.placed is not None and settings.standard_orientation:
         start = found.placed.motion(len(slices), samples)
@@ -124,6 +133,8 @@ def register(
         n_segments=n_segments,
         orientation=orientation,
         history=fitted.history,
+        profiles=[sample.profile for sample in samples],
+        overlap=overlap,
     )
 
 

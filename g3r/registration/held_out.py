@@ -23,7 +23,7 @@ from g3r.registration.similarity import (
     mean_square_residual,
     own_moments,
 )
-from g3r.registration.unseen import TemplateFill
+from g3r.registration.unseen import TemplateFill, coverage_share
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +46,30 @@ def volume_without(
         spacing_mm: voxel size.
         fill: what to take for voxels that no other stack saw; zero without it.
     """
+    operator, value, grid = _of_others(slices, stack, spacing_mm, fill)
+    weight = np.ones(len(value), np.float32)
+    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
+    if fill is not None:
+        volume = fill.filled(volume, grid, operator.adjoint(weight))
+    return gaussian_filter(volume, 0.5), grid
+
+
+def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
+    """How far voxels were seen by all slices except those of one stack, from 0 (not) to 1; and the grid.
+
+    Args:
+        slices: all slices at their present poses.
+        stack: the one to hold out.
+        spacing_mm: voxel size.
+    """
+    operator, value, grid = _of_others(slices, stack, spacing_mm, None)
+    return coverage_share(operator.adjoint(np.ones(len(value), np.float32))), grid
+
+
+def _of_others(
+    slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None
+) -> tuple[VoxelOperator, NDArray[np.float32], VolumeGrid]:
+    """Operator and values of some pixels, those outside the masks included, of all other stacks."""
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     if fill is not None:
@@ -53,11 +77,7 @@ def volume_without(
     index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // PIXELS_OF_VOLUME))
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 3))
     value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)
-    weight = np.ones(len(index), np.float32)
-    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
-    if fill is not None:
-        volume = fill.filled(volume, grid, operator.adjoint(weight))
-    return gaussian_filter(volume, 0.5), grid
+    return operator, value, grid
 
 
 @dataclass(frozen=True)

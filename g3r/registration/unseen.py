@@ -68,7 +68,11 @@ def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def resampled(volume: NDArray[np.float32], grid: VolumeGrid, onto: VolumeGrid) -> NDArray[np.float32]:
     """A volume on another grid (trilinear), 0 outside its own."""
-    matrix = np.linalg.inv(grid.affine) @ onto.affine
-    index = np.indices(onto.shape).reshape(3, -1)
-    place = matrix[:3, :3] @ index + matrix[:3, 3:]
-    return map_coordinates(volume, place, order=1, output=np.float32).reshape(onto.shape)
+    return sampled(volume, grid, onto.world(np.indices(onto.shape).reshape(3, -1).T)).reshape(onto.shape)
+
+
+def sampled(volume: NDArray[np.float32], grid: VolumeGrid, point_mm: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A volume at points [P, 3] of the world (trilinear), 0 outside its grid."""
+    matrix = np.linalg.inv(grid.affine)
+    place = matrix[:3, :3] @ point_mm.T + matrix[:3, 3:]
+    return map_coordinates(volume, place, order=1, output=np.float32)
