@@ -145,12 +145,7 @@ def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
         cut = bool(area[0] > MIN_CUT_AREA * largest), bool(area[-1] > MIN_CUT_AREA * largest)
     middle = np.stack([np.interp(every, number, center[:, axis]) for axis in range(3)], axis=1)
     return AreaProfile(
-        index=every,
-        area_mm2=expected,
-        center_mm=middle,
-        seen=np.isin(every, number),
-        spacing_mm=spacing,
-        cut=cut,
+        index=every, area_mm2=expected, center_mm=middle, seen=np.isin(every, number), spacing_mm=spacing, cut=cut
     )
 
 

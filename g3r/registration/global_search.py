@@ -18,7 +18,7 @@ from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
 from g3r.registration.thresholds import MIN_COST_GAIN, MIN_COST_GAIN_SINGLE, RETRY_BELOW_CORRELATION
-from g3r.registration.unseen import TemplateFill
+from g3r.registration.unseen import TemplateFill, with_header_spans
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -107,7 +107,9 @@ class GlobalSearch:
             interleave = [placement.segments.interleave for placement in placements]
             segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave, fill)
             after = held_out_score(slices, samples, segmented, fill)
-            if after.cost <= score.cost - MIN_COST_GAIN:
+            # in parts of a head, segments gain less; what the template alone placed has nothing to lose by the others
+            needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
+            if after.cost <= score.cost - needed:
                 motion, score = segmented, after
         correlations = {key: value.correlations for key, value in scores.items()}
         return score, SearchResult(motion, name, correlations, placed, fill)
@@ -131,7 +133,10 @@ def search_single(
     if not settings.segments:
         return SearchResult(motion, "headers", {}, placed)
     (placement,), head = placed.placement, placed.template
+    segments = placement.motion
+    if sample.profile.has_missing:
+        segments = with_header_spans(slices.take(sample.rows).header_pose, segments, sample.slice_index)
     motion, is_rigid = rigid_or_segments(
-        slices, sample, placement.motion, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
+        slices, sample, segments, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
     )
     return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

@@ -44,6 +44,15 @@ MIN_NCC = 0.75
 """So is one whose slices have a lower median correlation with the volume: at least 0.93 for stacks in place,
 0.8 with a bias field of 0.15, 0.4 to 0.73 for the worst stack of failures."""
 
+MIN_OVERLAP_CORRELATION = 0.5
+"""So is one that lacks slices, or whose partners do, with a lower correlation over the pixels that other stacks saw:
+0.61 to 0.79 in place (development cases of docs/motion.md, "Missing slices"), 0.2 to 0.4 where halves were joined
+wrongly."""
+
+MIN_OVERLAP_SHARE = 0.2
+"""So is one of which others saw a smaller share: too little to prove anything. Two crossing halves share about half
+of each, a stack whose partners lack their middles 0.5 to 0.9."""
+
 DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHARE = 0.5, 0.6
 """So is one of whose slices a larger share has a weight below the first number; up to 0.4 in good
 reconstructions of real stacks."""

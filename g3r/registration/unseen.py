@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from g3r.geometry import VolumeGrid
+from g3r.geometry import RigidPose, VolumeGrid
 
 FULL_COVERAGE = 0.3
 """Share of the typical coverage of a voxel by pixels from which on the template does not count."""
+
+SPAN_SLICES = 4
+"""Slices at either side of a missing span whose middles say how long it is; even, for interleaved stacks."""
 
 
 @dataclass(frozen=True)
@@ -76,3 +79,28 @@ def sampled(volume: NDArray[np.float32], grid: VolumeGrid, point_mm: NDArray[np.
     matrix = np.linalg.inv(grid.affine)
     place = matrix[:3, :3] @ point_mm.T + matrix[:3, 3:]
     return map_coordinates(volume, place, order=1, output=np.float32)
+
+
+def with_header_spans(header_pose: RigidPose, motion: RigidPose, slice_index: NDArray[np.int64]) -> RigidPose:
+    """Motions of a single stack whose missing spans are as long as the header says.
+
+    Slices behind a span may turn and shift in plane against those before it. A jump along the normal would only
+    close or widen the hole: the template that asks for it is another head, and no other stack was asked.
+
+    Args:
+        header_pose: [K] of the slices of one stack, in the order of their numbers.
+        motion: [K] world from header.
+        slice_index: [K] numbers of the slices in their stack.
+    """
+    translation = motion.translation_mm.copy()
+    for first in np.flatnonzero(np.diff(slice_index) > 1) + 1:
+        near = slice(max(0, first - SPAN_SLICES), first), slice(first, first + SPAN_SLICES)
+        place = motion.rotation @ header_pose.translation_mm[..., None]
+        place = place[..., 0] + translation
+        normal = (motion.rotation @ header_pose.rotation)[near[0].start : near[1].stop, :, 2].mean(0)
+        normal /= np.linalg.norm(normal)
+        middle = header_pose.translation_mm
+        given_mm = float(header_pose.rotation[first, :, 2] @ (middle[near[1]].mean(0) - middle[near[0]].mean(0)))
+        found_mm = float(normal @ (place[near[1]].mean(0) - place[near[0]].mean(0)))
+        translation[first:] += (given_mm - found_mm) * normal
+    return RigidPose(motion.rotation, translation)

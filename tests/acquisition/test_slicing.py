@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from data_synth.phantom import fetal_brain_phantom
+from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.slicing import normalised_slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
