@@ -40,17 +40,18 @@ def test_missing_slices_are_put_back(whole: Slices, span: tuple[float, float]) -
     assert found.n_inside == (~np.isin(given.index, found.index[found.seen])).sum()
     assert found.longest_gap_mm == pytest.approx(found.n_inside * found.spacing_mm)
     assert not found.is_cut
-    assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.05)
+    assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.07)
     assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 2
 
 
 @pytest.mark.parametrize(("span", "cut"), [((0.0, 0.4), (True, False)), ((0.6, 1.0), (False, True))])
 def test_a_cut_head_is_continued(whole: Slices, span: tuple[float, float], cut: tuple[bool, bool]) -> None:
-    given, (found,) = area_profiles(one_stack(whole))[0], area_profiles(without(one_stack(whole), 0, *span))
+    (given,), (found,) = area_profiles(one_stack(whole, 2)), area_profiles(without(one_stack(whole, 2), 2, *span))
     seen_mm3 = float(found.area_mm2[found.seen].sum() * found.spacing_mm)
     assert found.cut == cut
-    assert abs(np.log(found.volume_mm3 / given.volume_mm3)) < 0.2 < np.log(given.volume_mm3 / seen_mm3)
-    assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 8
+    assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.1)
+    assert seen_mm3 < 0.7 * given.volume_mm3
+    assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 3
 
 
 def test_whole_stacks_say_the_volume(whole: Slices) -> None:

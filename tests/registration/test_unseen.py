@@ -34,7 +34,7 @@ def test_the_template_stands_for_what_others_did_not_see(still_slices: tuple[Sli
     alone = held_out_score(halves, samples, still).correlations
     filled = held_out_score(halves, samples, still, the_head(slices)).correlations
     assert max(alone) < 0.7
-    assert min(filled) > 0.8
+    assert min(filled) > 0.75
 
 
 def test_the_fill_leaves_what_was_seen(still_slices: tuple[Slices, RigidPose]) -> None:
@@ -75,10 +75,8 @@ def test_overlap(still_slices: tuple[Slices, RigidPose]) -> None:
     assert min(whole.stack_share) > 0.95
     assert all(0.3 < share < 0.95 for share in found.stack_share)
     assert min(found.correlation) > 0.7
-    turned = RigidPose(
-        np.tile(rotation_matrix(np.array([0.0, 0.0, np.pi])), (len(samples[0].rows), 1, 1)),
-        np.zeros((len(samples[0].rows), 3)),
-    )
+    n = len(samples[0].rows)
+    turned = RigidPose(np.tile(rotation_matrix(np.array([0.0, 0.0, np.pi])), (n, 1, 1)), np.zeros((n, 3)))
     assert overlap_of(halves, samples, still.with_rows(samples[0].rows, turned)).correlation[0] < 0.5
     assert all(one.is_cut for one in area_profiles(halves))
 
