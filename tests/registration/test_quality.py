@@ -78,7 +78,12 @@ def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -
 
 def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[float], ids: list[int]) -> Any:
     return SimpleNamespace(
-        slices=SimpleNamespace(stack_id=np.array(ids)), held_out=held_out, ncc=np.array(ncc), weight=np.array(weight)
+        profiles=[],
+        overlap=None,
+        slices=SimpleNamespace(stack_id=np.array(ids)),
+        held_out=held_out,
+        ncc=np.array(ncc),
+        weight=np.array(weight),
     )
 
 
