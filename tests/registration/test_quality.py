@@ -106,6 +106,11 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "held_out_correlation": held_out,
         "median_slice_ncc": ncc,
         "downweighted_share": 0.75 if weight < 0.5 else 0.0,
+        "n_missing": 0,
+        "longest_gap_mm": 0.0,
+        "is_cut": False,
+        "overlap_share": None,
+        "overlap_correlation": None,
     }
 
 
