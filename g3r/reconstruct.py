@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.area_profile import AreaProfile, head_volume_mm3
 from g3r.acquisition.foreground import Foreground
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
-from g3r.acquisition.slicing import head_volume_mm3, normalised_slices, skipped_slice_notes
+from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
@@ -34,6 +35,7 @@ from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.atlas_search import template_fits
+from g3r.registration.overlap import Overlap
 from g3r.registration.prior_registration import register_to_prior
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
@@ -41,6 +43,8 @@ from g3r.run.deadline import Deadline
 
 STORED_RECORDS = (
     Registration,
+    AreaProfile,
+    Overlap,
     InitialVolumes,
     PriorVolume,
     PriorCloud,

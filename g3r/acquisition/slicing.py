@@ -1,4 +1,4 @@
-"""From stacks to slices: cut to the masks and normalised; slice spacing and head volume by the headers."""
+"""From stacks to slices: cut to the masks and normalised; slice spacing by the headers."""
 
 from __future__ import annotations
 
@@ -113,16 +113,6 @@ def slice_spacing_mm(stack: Slices) -> float:
     normal = stack.header_pose.rotation[0, :, 2]
     along = stack.header_pose.translation_mm @ normal
     return float(np.median(np.abs(np.diff(along) / np.diff(stack.slice_index))))
-
-
-def head_volume_mm3(slices: Slices) -> float:
-    """Median over stacks of masked area times slice spacing (mm^3)."""
-    volumes = []
-    for stack in np.unique(slices.stack_id):
-        one = slices.take(slices.stack_id == stack)
-        area = np.bincount(one.pixel_plane, minlength=len(one)) * one.planes.spacing_mm.prod(1)
-        volumes.append(area.sum() * slice_spacing_mm(one))
-    return float(np.median(volumes))
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:

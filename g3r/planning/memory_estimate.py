@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.slicing import head_volume_mm3
 from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
 from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
 from g3r.planning.memory_size import gigabytes

@@ -14,6 +14,9 @@
 5. `atlas_frame` moves the result into the standard orientation or keeps the frame of the scanner; `quality`
    says which stacks are registered.
 
+Where stacks lack slices (`acquisition.area_profile` says which), the template stands for what other stacks did not
+see (`unseen`), and `overlap` measures how far stacks prove each other's poses.
+
 `prior_registration` is used later, for single stacks alone: their slices move towards the prior volume.
 """
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.slicing import head_volume_mm3
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.held_out import predict
 from g3r.registration.placement import Placement, refine_placement

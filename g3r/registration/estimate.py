@@ -9,15 +9,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.area_profile import AreaProfile
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
-from g3r.registration.global_search import GlobalSearch, search_single
+from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
@@ -49,6 +51,8 @@ class Registration:
         n_segments: motion segments of each stack; 1 for a rigid stack.
         orientation: the standard orientation; None where the result stays in the scanner frame.
         history: figures of each round.
+        profiles: of each stack, missing slices included.
+        overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
     """
 
     slices: Slices
@@ -62,6 +66,8 @@ class Registration:
     n_segments: list[int]
     orientation: Orientation | None
     history: list[dict[str, float]] = field(default_factory=list)
+    profiles: list[AreaProfile] = field(default_factory=list)
+    overlap: Overlap | None = None
 
     def __repr__(self) -> str:
         frame = "scanner frame" if self.orientation is None else "atlas frame"
@@ -101,11 +107,14 @@ def register(
     n_segments, interleave = _segments_of(samples, found.motion)
     rounds = replace(settings, n_rounds=0) if single else settings
     rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
-    fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline)
+    missing = not single and any(sample.profile.has_missing for sample in samples)
+    seen_share = overlap_of(slices, samples, found.motion).seen_share if missing else None
+    fitted = refine_slices(slices.with_motion(found.motion), rounds, progress, rounds_deadline, seen_share)
     held_out = None
     if not single:
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
-        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found.motion, fitted, settings.finest_voxel_mm)
+        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings.finest_voxel_mm)
+    overlap = overlap_of(slices, samples, fitted.slices.world_from_header()) if missing else None
     orientation = None
     if found.placed is not None and settings.standard_orientation:
         start = found.placed.motion(len(slices), samples)
@@ -124,6 +133,8 @@ def register(
         n_segments=n_segments,
         orientation=orientation,
         history=fitted.history,
+        profiles=[sample.profile for sample in samples],
+        overlap=overlap,
     )
 
 
@@ -131,7 +142,7 @@ def _with_rigid_stacks(
     slices: Slices,
     samples: list[StackSamples],
     rigid: list[int],
-    motion: RigidPose,
+    found: SearchResult,
     fitted: FittedSlices,
     voxel_mm: float,
 ) -> tuple[FittedSlices, list[float]]:
@@ -140,11 +151,12 @@ def _with_rigid_stacks(
     Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
     are not asked: a few slices that went astray lower their correlation, while all others gain.
     """
-    before = held_out_score(slices, samples, motion)
+    motion, fill = found.motion, found.fill
+    before = held_out_score(slices, samples, motion, fill)
     refined = fitted.slices.world_from_header()
     equal = np.ones(len(slices))
     rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
-    after = held_out_score(slices, samples, refined)
+    after = held_out_score(slices, samples, refined, fill)
     reverted = [
         sample
         for sample, old, new in zip(samples, before.correlations, after.correlations, strict=True)
@@ -164,7 +176,7 @@ def _with_rigid_stacks(
         refined = refined.with_rows(sample.rows, motion.take(sample.rows))
         gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
     kept = replace(fitted, slices=slices.with_motion(refined), gain=gain, weight=weight)
-    return kept, held_out_score(slices, samples, refined).correlations
+    return kept, held_out_score(slices, samples, refined, fill).correlations
 
 
 def _segments_of(samples: list[StackSamples], motion: RigidPose) -> tuple[list[int], list[int | None]]:

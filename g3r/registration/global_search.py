@@ -18,6 +18,7 @@ from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
 from g3r.registration.thresholds import MIN_COST_GAIN, MIN_COST_GAIN_SINGLE, RETRY_BELOW_CORRELATION
+from g3r.registration.unseen import TemplateFill, with_header_spans
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -32,12 +33,14 @@ class SearchResult:
         initialisation: the name of the one it started from.
         initialisations: held-out correlation of every initialisation, stack by stack.
         placed: the slices in the atlas template; None without one.
+        fill: what stands for the parts of the head that stacks lack; None where nothing is missing.
     """
 
     motion: RigidPose
     initialisation: str
     initialisations: dict[str, list[float]]
     placed: AtlasPlacement | None
+    fill: TemplateFill | None = None
 
 
 @dataclass(frozen=True)
@@ -85,22 +88,31 @@ class GlobalSearch:
     def _attempt(
         self, initialisations: dict[str, RigidPose], rng: np.random.Generator, deadline: Deadline | None
     ) -> tuple[HeldOutScore, SearchResult]:
-        slices, samples, placed = self.slices, self.samples, None
+        slices, samples, placed, fill = self.slices, self.samples, None, None
         if self.template is not None:
             placed = place_in_atlas(slices, samples, self.template, rng)
-            initialisations = {**initialisations, "template": placed.motion(len(slices), samples)}
-        name, scores = best_initialisation(slices, samples, initialisations)
+            in_atlas = placed.motion(len(slices), samples)
+            if any(sample.profile.has_missing for sample in samples):
+                # the template stands for what is missing, so every start has to be in its frame
+                fill = TemplateFill(placed.template.volume, placed.template.grid, placed.template.center_mm)
+                initialisations = {
+                    name: aligned_to(slices, in_atlas, motion) for name, motion in initialisations.items()
+                }
+            initialisations = {**initialisations, "template": in_atlas}
+        name, scores = best_initialisation(slices, samples, initialisations, fill)
         motion, score = initialisations[name], scores[name]
         if self.settings.segments:
             others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
-            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline)
+            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill)
             interleave = [placement.segments.interleave for placement in placements]
-            segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave)
-            after = held_out_score(slices, samples, segmented)
-            if after.cost <= score.cost - MIN_COST_GAIN:
+            segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave, fill)
+            after = held_out_score(slices, samples, segmented, fill)
+            # in parts of a head, segments gain less; what the template alone placed has nothing to lose by the others
+            needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
+            if after.cost <= score.cost - needed:
                 motion, score = segmented, after
         correlations = {key: value.correlations for key, value in scores.items()}
-        return score, SearchResult(motion, name, correlations, placed)
+        return score, SearchResult(motion, name, correlations, placed, fill)
 
 
 def search_single(
@@ -121,7 +133,10 @@ def search_single(
     if not settings.segments:
         return SearchResult(motion, "headers", {}, placed)
     (placement,), head = placed.placement, placed.template
+    segments = placement.motion
+    if sample.profile.has_missing:
+        segments = with_header_spans(slices.take(sample.rows).header_pose, segments, sample.slice_index)
     motion, is_rigid = rigid_or_segments(
-        slices, sample, placement.motion, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
+        slices, sample, segments, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
     )
     return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

@@ -23,6 +23,7 @@ from g3r.registration.similarity import (
     mean_square_residual,
     own_moments,
 )
+from g3r.registration.unseen import TemplateFill, coverage_share
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +33,9 @@ PIXELS_OF_VOLUME = 100_000
 """At most about this many pixels make a volume of the search."""
 
 
-def volume_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
+def volume_without(
+    slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None = None
+) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume from all slices except those of one stack, zero outside the masks; and its grid.
 
     A slice would register to its own blur if it had helped to make the volume.
@@ -41,15 +44,40 @@ def volume_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArr
         slices: all slices at their present poses.
         stack: the one to hold out.
         spacing_mm: voxel size.
+        fill: what to take for voxels that no other stack saw; zero without it.
     """
+    operator, value, grid = _of_others(slices, stack, spacing_mm, fill)
+    weight = np.ones(len(value), np.float32)
+    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
+    if fill is not None:
+        volume = fill.filled(volume, grid, operator.adjoint(weight))
+    return gaussian_filter(volume, 0.5), grid
+
+
+def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
+    """How far voxels were seen by all slices except those of one stack, from 0 (not) to 1; and the grid.
+
+    Args:
+        slices: all slices at their present poses.
+        stack: the one to hold out.
+        spacing_mm: voxel size.
+    """
+    operator, value, grid = _of_others(slices, stack, spacing_mm, None)
+    return coverage_share(operator.adjoint(np.ones(len(value), np.float32))), grid
+
+
+def _of_others(
+    slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None
+) -> tuple[VoxelOperator, NDArray[np.float32], VolumeGrid]:
+    """Operator and values of some pixels, those outside the masks included, of all other stacks."""
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
+    if fill is not None:
+        grid = fill.grid_with(grid)
     index = np.arange(0, others.planes.n_pixels, max(1, others.planes.n_pixels // PIXELS_OF_VOLUME))
     operator = VoxelOperator(others.planes, grid, index, (1, 1, 3))
     value = np.where(others.mask[index], others.value[index], 0).astype(np.float32)
-    weight = np.ones(len(index), np.float32)
-    volume = solve_volume(operator, value, weight, n_iterations=6, smoothness=0.1)
-    return gaussian_filter(volume, 0.5), grid
+    return operator, value, grid
 
 
 @dataclass(frozen=True)
@@ -105,18 +133,21 @@ class HeldOutScore:
         return [p.correlation for p in self.prediction]
 
 
-def held_out_score(slices: Slices, samples: list[StackSamples], motion: RigidPose) -> HeldOutScore:
+def held_out_score(
+    slices: Slices, samples: list[StackSamples], motion: RigidPose, fill: TemplateFill | None = None
+) -> HeldOutScore:
     """Hold out each stack in turn and compare it with the volume of the others.
 
     Args:
         slices: of two or more stacks.
         samples: the thinned pixels of each stack.
         motion: [K] world from header of all slices.
+        fill: see `volume_without`.
     """
     posed = slices.with_motion(motion)
     predictions = []
     for sample in samples:
-        volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM)
+        volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM, fill)
         own = motion.take(sample.rows)
         predictions.append(predict(sample, own, volume, grid, estimate_interleave(sample, own)))
     return HeldOutScore(predictions)
@@ -132,7 +163,10 @@ def estimate_interleave(sample: StackSamples, motion: RigidPose) -> int:
 
 
 def best_initialisation(
-    slices: Slices, samples: list[StackSamples], initialisations: Mapping[str, RigidPose]
+    slices: Slices,
+    samples: list[StackSamples],
+    initialisations: Mapping[str, RigidPose],
+    fill: TemplateFill | None = None,
 ) -> tuple[str, dict[str, HeldOutScore]]:
     """The name of the initialisation with the lowest held-out cost, and the scores of all.
 
@@ -140,8 +174,9 @@ def best_initialisation(
         slices: of two or more stacks.
         samples: the thinned pixels of each stack.
         initialisations: motions [K] (world from header) by name.
+        fill: see `volume_without`.
     """
-    scores = {name: held_out_score(slices, samples, motion) for name, motion in initialisations.items()}
+    scores = {name: held_out_score(slices, samples, motion, fill) for name, motion in initialisations.items()}
     for name, score in scores.items():
         correlations = " ".join(f"{one:.2f}" for one in score.correlations)
         logger.info("%s: held-out cost %.0f, correlation %s", name, score.cost, correlations)

@@ -10,7 +10,14 @@ import numpy as np
 
 from g3r.acquisition.stacks import Stack
 from g3r.registration.estimate import Registration
-from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHARE, MIN_HELD_OUT, MIN_NCC
+from g3r.registration.thresholds import (
+    DOWNWEIGHTED_BELOW,
+    MAX_DOWNWEIGHTED_SHARE,
+    MIN_HELD_OUT,
+    MIN_NCC,
+    MIN_OVERLAP_CORRELATION,
+    MIN_OVERLAP_SHARE,
+)
 
 
 @dataclass(frozen=True)
@@ -23,12 +30,23 @@ class StackQuality:
         held_out_correlation: with a volume of the other stacks; None for a single stack.
         median_slice_ncc: of its slices with the volume of all; None without slices.
         downweighted_share: share of slices with a weight below one half.
+        n_missing: slices that are missing between others.
+        longest_gap_mm: the longest span without a slice between others.
+        is_cut: whether the field of view cut the head.
+        overlap_share: share of its pixels that other stacks saw; None for a single stack, and where no stack
+            lacks slices.
+        overlap_correlation: with the other stacks over those pixels.
     """
 
     reliable: bool | None
     held_out_correlation: float | None
     median_slice_ncc: float | None
     downweighted_share: float
+    n_missing: int = 0
+    longest_gap_mm: float = 0.0
+    is_cut: bool = False
+    overlap_share: float | None = None
+    overlap_correlation: float | None = None
 
     def record(self) -> dict[str, Any]:
         """For run.json."""
@@ -50,7 +68,32 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
         reliable = None
         if held_out is not None:
             reliable = held_out >= MIN_HELD_OUT and ncc >= MIN_NCC and downweighted <= MAX_DOWNWEIGHTED_SHARE
-        found.append(StackQuality(reliable, held_out, ncc, downweighted))
+        share = correlation = None
+        if registration.overlap is not None:
+            place = present.index(n)
+            share = registration.overlap.stack_share[place]
+            correlation = registration.overlap.correlation[place]
+            # the template that stood for what others did not see agrees with any head
+            reliable = bool(reliable) and share >= MIN_OVERLAP_SHARE and correlation >= MIN_OVERLAP_CORRELATION
+        missing = {}
+        if registration.profiles:
+            profile = registration.profiles[present.index(n)]
+            missing = {
+                "n_missing": profile.n_inside,
+                "longest_gap_mm": profile.longest_gap_mm,
+                "is_cut": profile.is_cut,
+            }
+        found.append(
+            StackQuality(
+                reliable=reliable,
+                held_out_correlation=held_out,
+                median_slice_ncc=ncc,
+                downweighted_share=downweighted,
+                overlap_share=share,
+                overlap_correlation=correlation,
+                **missing,
+            )
+        )
     return found
 
 
@@ -70,9 +113,22 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
             lines.append(
                 f"{stack.name}: registration probably failed (correlation with the other stacks "
                 f"{one.held_out_correlation:.2f}, of its slices with the volume {one.median_slice_ncc:.2f}, "
-                f"{one.downweighted_share:.0%} of its slices fit badly); do not rely on the volume"
+                f"{one.downweighted_share:.0%} of its slices fit badly{_overlap_text(one)}); do not rely on the volume"
             )
+        elif one.reliable is None and one.n_missing:
+            lines.append(
+                f"{stack.name}: {one.n_missing} slices are missing, up to {one.longest_gap_mm:.0f} mm in a row; that "
+                "this part of the head is so long is what the header says, no other stack checks it"
+            )
+        if one.reliable is None and one.is_cut:
+            lines.append(f"{stack.name}: the field of view cuts the head; what lies beyond was seen by no stack")
     return lines
+
+
+def _overlap_text(one: StackQuality) -> str:
+    if one.overlap_share is None or one.overlap_correlation is None:
+        return ""
+    return f"; others saw {one.overlap_share:.0%} of it and correlate {one.overlap_correlation:.2f} there"
 
 
 def registration_reliable(qualities: Sequence[StackQuality]) -> bool | None:

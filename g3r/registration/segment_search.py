@@ -17,6 +17,7 @@ from g3r.registration.similarity import StackSamples
 from g3r.registration.so3_search import place_around, stack_orientations
 from g3r.registration.stack_registration import refine_stack
 from g3r.registration.thresholds import IN_PLACE_CORRELATION, MIN_COST_GAIN
+from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
@@ -64,6 +65,7 @@ def refine_segments(
     others: list[RigidPose],
     rng: np.random.Generator,
     deadline: Deadline | None = None,
+    fill: TemplateFill | None = None,
 ) -> tuple[RigidPose, list[Placement]]:
     """Place the motion segments of every stack in the volume of the other stacks, round after round.
 
@@ -74,18 +76,19 @@ def refine_segments(
         others: motions [K] of other initialisations in the same frame, candidates in the first round.
         rng: source of randomness.
         deadline: fewer rounds if they would end after it.
+        fill: see `volume_without`.
 
     Returns:
         Motions [K], and the last placement of each stack.
     """
     placements: list[Placement] = []
     for sample in samples:
-        motion = motion.with_rows(sample.rows, _search_orientations(slices, sample, motion, rng))
+        motion = motion.with_rows(sample.rows, _search_orientations(slices, sample, motion, rng, fill))
     for number, done in timed_steps(len(ROUNDS), deadline, least=MIN_ROUNDS):
         rotation_deg, translation_mm, voxel_mm = ROUNDS[int(round(done * len(ROUNDS), 9))]
         placements = []
         for sample in samples:
-            volume, grid = volume_without(slices.with_motion(motion), sample.stack, voxel_mm)
+            volume, grid = volume_without(slices.with_motion(motion), sample.stack, voxel_mm, fill)
             proposals = None
             if number == 0 and others:
                 proposals = RigidPose.concatenated([other.take(sample.rows) for other in others])
@@ -105,16 +108,18 @@ def refine_segments(
 
 
 def _search_orientations(
-    slices: Slices, sample: StackSamples, motion: RigidPose, rng: np.random.Generator
+    slices: Slices, sample: StackSamples, motion: RigidPose, rng: np.random.Generator, fill: TemplateFill | None
 ) -> RigidPose:
     """Motions [K] of one stack: the present ones, or better ones from an exhaustive search.
 
     A stack that starts upside down cannot come back by small steps.
     """
     posed = slices.with_motion(motion)
-    volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM)
+    volume, grid = volume_without(posed, sample.stack, HELD_OUT_VOXEL_MM, fill)
     others = posed.take(posed.stack_id != sample.stack)
     target = others.planes.pixel_world_mm(others.pixel_index).mean(0)
+    if fill is not None:  # the others' pixels may lie at one side of the head
+        target = fill.center_mm
     best = motion.take(sample.rows)
     present = predict(sample, best, volume, grid, estimate_interleave(sample, best))
     if present.correlation > IN_PLACE_CORRELATION:
@@ -134,7 +139,11 @@ def _search_orientations(
 
 
 def collapse_to_rigid(
-    slices: Slices, samples: list[StackSamples], motion: RigidPose, interleave: list[int]
+    slices: Slices,
+    samples: list[StackSamples],
+    motion: RigidPose,
+    interleave: list[int],
+    fill: TemplateFill | None = None,
 ) -> tuple[RigidPose, list[bool]]:
     """Give each stack one motion for all its slices where that predicts them as well.
 
@@ -143,13 +152,14 @@ def collapse_to_rigid(
         samples: the thinned pixels of each stack.
         motion: [K] world from header, in segments.
         interleave: acquisition order of each stack.
+        fill: see `volume_without`.
 
     Returns:
         Motions [K], and for each stack whether it is rigid now.
     """
     rigid = []
     for sample, order in zip(samples, interleave, strict=True):
-        volume, grid = volume_without(slices.with_motion(motion), sample.stack, RIGID_VOXEL_MM)
+        volume, grid = volume_without(slices.with_motion(motion), sample.stack, RIGID_VOXEL_MM, fill)
         own, is_rigid = rigid_or_segments(slices, sample, motion.take(sample.rows), order, volume, grid)
         motion = motion.with_rows(sample.rows, own)
         rigid.append(is_rigid)

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.area_profile import AreaProfile, area_profiles
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 
@@ -33,7 +34,7 @@ class SearchPixels:
         value: [P].
         start: [K + 1] first pixel of each slice.
         area_mm2: [K] area of the bounding box of each slice.
-        center_mm: [3] mean of the masked pixels.
+        center_mm: [3] mean of the masked pixels; of a stack that lacks slices, the middle of the head.
     """
 
     point_mm: NDArray[np.float64]
@@ -96,6 +97,7 @@ class StackSamples:
         pixels: at the header poses.
         slice_index: [K] number of each slice in its stack.
         n_candidates: random motions that are tried at once.
+        profile: of the head along the stack, missing slices included.
     """
 
     stack: int
@@ -103,21 +105,26 @@ class StackSamples:
     pixels: SearchPixels
     slice_index: NDArray[np.int64]
     n_candidates: int
+    profile: AreaProfile
 
     @classmethod
     def of_all(cls, slices: Slices, n_candidates: int = 4000) -> list[StackSamples]:
         """One entry for each stack."""
         by_header = slices.with_pose(slices.header_pose)
         samples = []
-        for stack in np.unique(slices.stack_id):
+        for stack, profile in zip(np.unique(slices.stack_id), area_profiles(slices), strict=True):
             rows = np.flatnonzero(slices.stack_id == stack)
+            pixels = SearchPixels.of(by_header.take(rows))
+            if profile.has_missing:
+                pixels = replace(pixels, center_mm=profile.head_center_mm)
             samples.append(
                 cls(
                     stack=int(stack),
                     rows=rows,
-                    pixels=SearchPixels.of(by_header.take(rows)),
+                    pixels=pixels,
                     slice_index=slices.slice_index[rows],
                     n_candidates=n_candidates,
+                    profile=profile,
                 )
             )
         return samples

@@ -26,13 +26,23 @@ TIE_SHARE = 0.01
 """Stiffness of the tie between neighbours, as a share of the median stiffness of a slice: a slice through the
 middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
 
+UNSEEN_NORMAL_TIE = 0.3
+"""The same along the normal of a slice that no other stack sees: the volume there was made of the slice and its
+neighbours, and nothing else says how far they are apart."""
+
 TIE_REACH_MM = 3.0
 """Neighbours whose motion would move a slice further than this count less: after a jerk, and between the
 passes of an interleaved stack, neighbours are elsewhere for good reason."""
 
 
 def register_slices(
-    model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, n_steps: int, width: float
+    model: SliceModel,
+    slices: Slices,
+    gain: NDArray[np.float64],
+    *,
+    n_steps: int,
+    width: float,
+    normal_tie: NDArray[np.float64] | None = None,
 ) -> tuple[Slices, NDArray[np.float64], NormalEquations]:
     """Levenberg-Marquardt steps for every slice at once, each with its own damping.
 
@@ -42,6 +52,7 @@ def register_slices(
         gain: [K] present intensity factors.
         n_steps: number of evaluations.
         width: residual at which the Cauchy loss bends.
+        normal_tie: [K] further stiffness of the tie along the normal, see `UNSEEN_NORMAL_TIE`.
 
     Returns:
         Slices in new poses, new gains, and the statistics at them.
@@ -50,7 +61,7 @@ def register_slices(
     log_gain = np.log(gain)
     damping = np.full(len(slices), 1e-2)
     current = model.evaluate(slices.planes, gain, width)
-    tie = NeighbourTie.of(slices, current)
+    tie = NeighbourTie.of(slices, current, normal_tie)
     for _ in range(n_steps):
         step = _solve(current, log_gain, damping, width, tie, pose)
         trial_pose = RigidPose(
@@ -114,8 +125,16 @@ class NeighbourTie:
     precision: NDArray[np.float64]
 
     @classmethod
-    def of(cls, slices: Slices, equations: NormalEquations) -> NeighbourTie:
-        """Ties for the present poses."""
+    def of(
+        cls, slices: Slices, equations: NormalEquations, normal_tie: NDArray[np.float64] | None = None
+    ) -> NeighbourTie:
+        """Ties for the present poses.
+
+        Args:
+            slices: K slices.
+            equations: of their fit.
+            normal_tie: [K] see `UNSEEN_NORMAL_TIE`.
+        """
         n = len(slices)
         motion = slices.world_from_header()
         pose = slices.planes.pose
@@ -145,8 +164,10 @@ class NeighbourTie:
             np.where(alone[:, None], pose.translation_mm, translation / safe[:, None]),
         )
         stiffness = np.where(alone, 0.0, TIE_SHARE * float(np.median(information)))
-        precision = np.stack([stiffness * radius_mm**2, stiffness], axis=1)
-        return cls(target, np.repeat(precision, 3, axis=1))
+        precision = np.repeat(np.stack([stiffness * radius_mm**2, stiffness], axis=1), 3, axis=1)
+        if normal_tie is not None:
+            precision[:, 5] += np.where(alone, 0.0, normal_tie * float(np.median(information)))
+        return cls(target, precision)
 
     def twist(self, pose: RigidPose) -> NDArray[np.float64]:
         """Body-frame rotation and translation [K, 6] from poses to the target."""

@@ -17,7 +17,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.settings import RegistrationSettings
-from g3r.registration.slice_registration import register_slices, try_neighbours
+from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
@@ -43,6 +43,7 @@ def refine_slices(
     settings: RegistrationSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
     deadline: Deadline | None = None,
+    seen_share: NDArray[np.float64] | None = None,
 ) -> FittedSlices:
     """Register every slice to the volume of all, which each round makes anew.
 
@@ -51,7 +52,9 @@ def refine_slices(
         settings: number of rounds and steps, finest voxel, number of pixels.
         progress: called with the rounds done and their total.
         deadline: fewer rounds if they would end after it.
+        seen_share: [K] share of each slice that other stacks see; None where nothing is missing.
     """
+    normal_tie = None if seen_share is None else UNSEEN_NORMAL_TIE * (1 - seen_share) ** 2
     gain = np.ones(len(slices))
     weight = np.ones(len(slices))
     volume: NDArray[np.float32] | None = None
@@ -75,7 +78,9 @@ def refine_slices(
         moved = 0
         if 0.1 < fraction < 0.8:
             slices, moved = try_neighbours(model, slices, gain, width=width)
-        slices, gain, fit = register_slices(model, slices, gain, n_steps=settings.steps_per_round, width=width)
+        slices, gain, fit = register_slices(
+            model, slices, gain, n_steps=settings.steps_per_round, width=width, normal_tie=normal_tie
+        )
         weight = slice_weights(fit.loss)
         history.append(
             {

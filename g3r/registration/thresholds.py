@@ -44,6 +44,15 @@ MIN_NCC = 0.75
 """So is one whose slices have a lower median correlation with the volume: at least 0.93 for stacks in place,
 0.8 with a bias field of 0.15, 0.4 to 0.73 for the worst stack of failures."""
 
+MIN_OVERLAP_CORRELATION = 0.6
+"""So is one with a lower correlation over the pixels that other stacks saw, where any stack lacks slices: 0.70 to 0.82
+for nine stacks that ended within 1.1 mm (median), 0.07 to 0.48 for stacks 5 to 13 mm off (one of a wrong pair 0.61).
+It does not tell 3 or 4 mm from 1 mm (0.70 to 0.77). Cases of docs/motion.md, "Missing slices"."""
+
+MIN_OVERLAP_SHARE = 0.2
+"""So is one of which others saw a smaller share: too little to prove anything. Two crossing halves share about half
+of each, a stack whose partners lack their middles 0.5 to 0.9."""
+
 DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHARE = 0.5, 0.6
 """So is one of whose slices a larger share has a weight below the first number; up to 0.4 in good
 reconstructions of real stacks."""

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack
+from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.slicing import head_volume_mm3
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import standard_orientation

@@ -11,6 +11,7 @@ from data_synth.phantom import Phantom, fetal_brain_phantom
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE
 from g3r.registration import Registration, RegistrationSettings, register
+from g3r.registration.overlap import Overlap
 from g3r.registration.quality import StackQuality, pose_warnings, registration_summary, stack_qualities
 from g3r.registration.thresholds import MIN_HELD_OUT, MIN_NCC
 from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
@@ -77,7 +78,12 @@ def test_stacks_left_far_apart_are_not_reliable(head: Phantom, moving: Moving) -
 
 def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[float], ids: list[int]) -> Any:
     return SimpleNamespace(
-        slices=SimpleNamespace(stack_id=np.array(ids)), held_out=held_out, ncc=np.array(ncc), weight=np.array(weight)
+        profiles=[],
+        overlap=None,
+        slices=SimpleNamespace(stack_id=np.array(ids)),
+        held_out=held_out,
+        ncc=np.array(ncc),
+        weight=np.array(weight),
     )
 
 
@@ -100,6 +106,11 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "held_out_correlation": held_out,
         "median_slice_ncc": ncc,
         "downweighted_share": 0.75 if weight < 0.5 else 0.0,
+        "n_missing": 0,
+        "longest_gap_mm": 0.0,
+        "is_cut": False,
+        "overlap_share": None,
+        "overlap_correlation": None,
     }
 
 
@@ -122,3 +133,34 @@ def test_the_estimates_own_weights_keep_to_it(moving: Moving) -> None:
     assert isinstance(moving.estimate, Registration)
     assert (weight < DROPPED_WEIGHT).mean() <= MAX_DROPPED_SHARE
     assert weight.max() == 1.0
+
+
+def test_a_single_stack_with_a_hole_is_warned_about(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(still[:1])
+    middle = len(slices) // 2
+    holed = slices.take(np.setdiff1d(np.arange(len(slices)), np.arange(middle - 1, middle + 2)))
+    estimate = register(holed, QUICK)
+    found = stack_qualities(estimate, 1)
+    (line,) = pose_warnings(estimate, found, [still[0].stack])
+    assert found[0].n_missing == 3
+    assert found[0].reliable is None
+    assert "3 slices are missing" in line
+    assert "what the header says" in line
+    whole = register(slices, QUICK)
+    assert pose_warnings(whole, stack_qualities(whole, 1), [still[0].stack]) == []
+
+
+@pytest.mark.parametrize(
+    ("share", "correlation", "reliable"), [(0.5, 0.75, True), (0.1, 0.75, False), (0.5, 0.4, False)]
+)
+def test_stacks_that_share_little_are_not_reliable(
+    moving: Moving, share: float, correlation: float, reliable: bool
+) -> None:
+    n = len(moving.estimate.slices)
+    overlap = Overlap(seen_share=np.ones(n), stack_share=[1.0, share, 1.0], correlation=[0.9, correlation, 0.9])
+    estimate = replace(moving.estimate, overlap=overlap)
+    found = stack_qualities(estimate, 3)
+    assert [one.reliable for one in found] == [True, reliable, True]
+    lines = pose_warnings(estimate, found, [one.stack for one in moving.stacks])
+    assert len(lines) == (not reliable)
+    assert all(f"others saw {share:.0%} of it" in line for line in lines)

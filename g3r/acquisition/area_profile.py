@@ -1,0 +1,241 @@
+"""How much of the head each stack saw: area along the normal, with the slices that are missing put back.
+
+A mask counts only what was acquired. Slices that are missing inside a stack are interpolated between their
+neighbours. Where a stack ends in a large slice, its field of view cut the head: the rest is continued as an
+ellipsoid, whose length other stacks show in their planes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slice_spacing_mm
+
+MIN_MISSING_AREA = 0.2
+"""Slices that are missing between others count from this share of the largest area; smaller ones are tips of the
+head, of which masks often lack a slice."""
+
+MIN_CUT_AREA = 0.3
+"""A stack whose first or last slice is larger than this share of its largest one was cut there. Whole heads end at
+0 to 0.19 of it, with 4 mm between slices at the most; a field of view that lacks a tenth of the head at 0.36."""
+
+MIN_SLICES = 6
+"""Stacks of fewer slices are too coarse to say where they were cut."""
+
+LENGTH_RATIO, LENGTH_SPREAD = 1.0, 0.2
+"""Length of a head along the normal over the diameter of a disc of its largest area, and the deviation of its
+logarithm: 0.85 to 1.3 for axial to coronal stacks of an ellipsoid with the proportions of a fetal brain."""
+
+SEEN_LENGTH_SPREAD = 0.08
+"""The same deviation where another stack shows the length in its planes."""
+
+AREA_SPREAD = 0.08
+"""Deviation of areas from an ellipsoid's, as a share of the largest."""
+
+MIN_ANGLE_DEG = 45.0
+"""Stacks whose normals are at least so far apart see each other's length."""
+
+WHOLE_VOLUME_SPREAD = 0.08
+"""Deviation of the logarithm of a cut stack's volume, continued, from that of stacks that show the whole head."""
+
+MAX_AREA_GAIN = 1.25
+"""The largest area of a head over the largest that a cut stack shows: 1.2 where it lacks 70 % of the length."""
+
+MAX_LENGTH_GAIN = 2.5
+"""No head is longer than this times what was seen of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AreaProfile:
+    """Slices of one stack by the header, those that are missing included.
+
+    Args:
+        index: [N] numbers of the slices in their stack, ascending; may begin below zero.
+        area_mm2: [N] masked area, or what is expected of a missing slice.
+        center_mm: [N, 3] middle of that area by the header.
+        seen: [N] whether the slice was acquired.
+        spacing_mm: distance of slices.
+        cut: whether the field of view cut the head before the first and after the last slice that was seen.
+    """
+
+    index: NDArray[np.int64]
+    area_mm2: NDArray[np.float64]
+    center_mm: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    spacing_mm: float
+    cut: tuple[bool, bool]
+
+    @property
+    def volume_mm3(self) -> float:
+        """Of the head, missing slices included."""
+        return float(self.area_mm2.sum() * self.spacing_mm)
+
+    @property
+    def head_center_mm(self) -> NDArray[np.float64]:
+        """Middle of the head [3] by the header, missing slices included."""
+        return np.average(self.center_mm, axis=0, weights=self.area_mm2)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the field of view cut the head."""
+        return any(self.cut)
+
+    @property
+    def n_inside(self) -> int:
+        """Slices that are missing between others."""
+        first, last = np.flatnonzero(self.seen)[[0, -1]]
+        return int((~self.seen[first : last + 1]).sum())
+
+    @property
+    def longest_gap_mm(self) -> float:
+        """Length along the normal of the longest span without a slice between others; 0 without one."""
+        steps = np.diff(self.index[self.seen])
+        return float((steps.max(initial=1) - 1) * self.spacing_mm) if self.n_inside else 0.0
+
+    @property
+    def has_missing(self) -> bool:
+        """Whether a part of the head is missing."""
+        return self.is_cut or self.n_inside > 0
+
+
+def area_profiles(slices: Slices) -> list[AreaProfile]:
+    """The profile of each stack that has slices, in the order of their numbers."""
+    of_stack = [slices.stack_id == stack for stack in np.unique(slices.stack_id)]
+    seen = [_profile(slices, one) for one in of_stack]
+    whole = [one.volume_mm3 for one in seen if not one.is_cut]
+    volume_mm3 = float(np.median(whole)) if whole else None
+    return [
+        _continued(slices, one, profile, volume_mm3) if profile.is_cut else profile
+        for one, profile in zip(of_stack, seen, strict=True)
+    ]
+
+
+def head_volume_mm3(slices: Slices) -> float:
+    """Median over stacks of masked area times slice spacing (mm^3), missing slices included.
+
+    Stacks that show the whole head decide, if there are any.
+    """
+    profiles = area_profiles(slices)
+    whole = [one for one in profiles if not one.is_cut]
+    return float(np.median([one.volume_mm3 for one in whole or profiles]))
+
+
+def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
+    """From the first to the last slice of a stack."""
+    stack = slices.take(of_stack)
+    number, plane = stack.slice_index, stack.pixel_plane
+    count = np.bincount(plane, minlength=len(stack))
+    area = count * stack.planes.spacing_mm.prod(1)
+    header = stack.planes.with_pose(stack.header_pose)
+    point = header.pixel_world_mm(stack.pixel_index)
+    sums = np.stack([np.bincount(plane, point[:, axis], minlength=len(stack)) for axis in range(3)], axis=1)
+    center = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], stack.header_pose.translation_mm)
+    spacing = slice_spacing_mm(stack)
+    largest = area.max()
+    every = np.arange(number[0], number[-1] + 1)
+    expected = np.interp(every, number, area)
+    kept = np.isin(every, number) | (expected >= MIN_MISSING_AREA * largest)
+    every, expected = every[kept], expected[kept]
+    cut = (False, False)
+    if len(number) >= MIN_SLICES:
+        cut = bool(area[0] > MIN_CUT_AREA * largest), bool(area[-1] > MIN_CUT_AREA * largest)
+    middle = np.stack([np.interp(every, number, center[:, axis]) for axis in range(3)], axis=1)
+    return AreaProfile(
+        index=every, area_mm2=expected, center_mm=middle, seen=np.isin(every, number), spacing_mm=spacing, cut=cut
+    )
+
+
+def _continued(
+    slices: Slices, of_stack: NDArray[np.bool_], profile: AreaProfile, volume_mm3: float | None
+) -> AreaProfile:
+    """A profile with the slices beyond its cut ends; the middle of the area goes on along the normal."""
+    before, after = _beyond(profile, _length_of_others_mm(slices, of_stack), volume_mm3)
+    first, last = -np.arange(len(before), 0, -1), np.arange(1, len(after) + 1)
+    step = _step_mm(slices.take(of_stack))
+    return AreaProfile(
+        index=np.concatenate([profile.index[0] + first, profile.index, profile.index[-1] + last]),
+        area_mm2=np.concatenate([before[::-1], profile.area_mm2, after]),
+        center_mm=np.concatenate(
+            [
+                profile.center_mm[0] + first[:, None] * step,
+                profile.center_mm,
+                profile.center_mm[-1] + last[:, None] * step,
+            ]
+        ),
+        seen=np.concatenate([first > 0, profile.seen, last < 0]),
+        spacing_mm=profile.spacing_mm,
+        cut=profile.cut,
+    )
+
+
+def _step_mm(stack: Slices) -> NDArray[np.float64]:
+    """From one slice to the next [3] by the header, along the normal."""
+    normal = stack.header_pose.rotation[0, :, 2]
+    along = stack.header_pose.translation_mm @ normal
+    if len(stack) < 2:
+        return normal * float(stack.thickness_mm[0])
+    return normal * float(np.median(np.diff(along) / np.diff(stack.slice_index)))
+
+
+def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float | None:
+    """Extent of the other stacks' masks along the normal of a stack, by the headers; None where none shows it."""
+    normal = slices.header_pose.rotation[np.flatnonzero(of_stack)[0], :, 2]
+    found = []
+    for other in np.unique(slices.stack_id[~of_stack]):
+        stack = slices.take(slices.stack_id == other)
+        if abs(float(stack.header_pose.rotation[0, :, 2] @ normal)) > np.cos(np.deg2rad(MIN_ANGLE_DEG)):
+            continue
+        plane = stack.pixel_plane
+        along = stack.planes.with_pose(stack.header_pose).pixel_world_mm(stack.pixel_index) @ normal
+        # slice by slice: slices that moved must not add up to a longer head
+        low, high = np.full(len(stack), np.inf), np.full(len(stack), -np.inf)
+        np.minimum.at(low, plane, along)
+        np.maximum.at(high, plane, along)
+        found.append(float(np.max(high - low)))
+    return max(found) if found else None
+
+
+def _beyond(
+    profile: AreaProfile, length_mm: float | None, volume_mm3: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Areas of the slices before the first and after the last one, from the ends outwards.
+
+    The ellipsoid with area A (1 - ((z - z0) / c)^2) that is most likely, given the areas that were seen, the usual
+    length of a head of that area, the length that other stacks show, and the volume of those that show all.
+    """
+    cut, spacing_mm = profile.cut, profile.spacing_mm
+    z = (profile.index - profile.index[0]) * spacing_mm
+    padded = np.pad(profile.area_mm2, 1, mode="edge")  # slices of an interleaved, moving stack alternate
+    area_mm2 = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
+    largest = float(area_mm2.max())
+    seen_mm = float(z[-1]) + spacing_mm
+    half = np.linspace(seen_mm / 2 if all(cut) else seen_mm / 2.2, seen_mm * MAX_LENGTH_GAIN / 2, 60)
+    middle = np.linspace(-seen_mm, 2 * seen_mm, 121)
+    shape = np.maximum(1 - ((z - middle[:, None, None]) / half[None, :, None]) ** 2, 0.0)
+    top = np.minimum((shape @ area_mm2) / np.maximum((shape**2).sum(-1), 1e-9), MAX_AREA_GAIN * largest)
+    misfit = area_mm2 - top[..., None] * shape
+    cost = 0.5 * ((misfit / (AREA_SPREAD * largest)) ** 2).sum(-1)
+    if length_mm is not None:
+        cost += 0.5 * (np.log(2 * half / length_mm) / SEEN_LENGTH_SPREAD) ** 2
+    if volume_mm3 is not None:
+        cost += 0.5 * (np.log(4 / 3 * np.maximum(top, 1e-9) * half / volume_mm3) / WHOLE_VOLUME_SPREAD) ** 2
+    usual_mm = LENGTH_RATIO * 2 * np.sqrt(np.maximum(top, 1e-9) / np.pi)
+    cost += 0.5 * (np.log(2 * half / usual_mm) / LENGTH_SPREAD) ** 2
+    m, h = np.unravel_index(int(cost.argmin()), cost.shape)
+
+    def outwards(start_mm: float, direction: float, end_area: float) -> NDArray[np.float64]:
+        steps = np.arange(1, int(np.ceil(2 * half[h] / spacing_mm)) + 1)
+        model = top[m, h] * (1 - ((start_mm + direction * steps * spacing_mm - middle[m]) / half[h]) ** 2)
+        model = model[: int(np.argmax(model <= 0))] if (model <= 0).any() else model
+        # from the area that was seen at the end to the model's
+        at_end = top[m, h] * (1 - ((start_mm - middle[m]) / half[h]) ** 2)
+        return np.maximum(model + (end_area - at_end) * 0.5 ** np.arange(1, len(model) + 1), 0.0)
+
+    none = np.zeros(0)
+    before = outwards(0.0, -1.0, float(area_mm2[0])) if cut[0] else none
+    after = outwards(float(z[-1]), 1.0, float(area_mm2[-1])) if cut[1] else none
+    return before, after

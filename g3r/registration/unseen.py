@@ -1,0 +1,106 @@
+"""What no other stack saw: the atlas template in place of the zeros of a volume made of the other stacks.
+
+A volume of the other stacks is zero where they lack slices. That zero is no evidence: a slice that belongs there
+would fit better anywhere else, and hole goes to hole. The template, in the frame that the slices are in, predicts
+roughly what lies there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from g3r.geometry import RigidPose, VolumeGrid
+
+FULL_COVERAGE = 0.3
+"""Share of the typical coverage of a voxel by pixels from which on the template does not count."""
+
+SPAN_SLICES = 4
+"""Slices at either side of a missing span whose middles say how long it is; even, for interleaved stacks."""
+
+
+@dataclass(frozen=True)
+class TemplateFill:
+    """A head in the frame of the slices.
+
+    Args:
+        volume: [I, J, K] blurred as thick slices are.
+        grid: its grid.
+        center_mm: [3] of the head.
+    """
+
+    volume: NDArray[np.float32]
+    grid: VolumeGrid
+    center_mm: NDArray[np.float64]
+
+    def grid_with(self, grid: VolumeGrid) -> VolumeGrid:
+        """A grid that covers another one and the whole head, with its voxels."""
+        head = self.grid.world(np.argwhere(self.volume > 0))
+        corners = grid.world(np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(grid.shape) - 1))
+        both = np.concatenate([head, corners])
+        return VolumeGrid.isotropic(both.min(0), both.max(0), float(grid.spacing_mm[0]), 0.0)
+
+    def filled(
+        self, volume: NDArray[np.float32], grid: VolumeGrid, coverage: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """A volume with the template where no pixel was seen.
+
+        Args:
+            volume: [I, J, K] of some slices.
+            grid: its grid.
+            coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
+        """
+        head = resampled(self.volume, self.grid, grid)
+        share = coverage_share(coverage)
+        known = (share >= 1) & (head > 0)
+        scale = 1.0
+        if known.any():
+            scale = float(np.clip((volume[known] @ head[known]) / (head[known] @ head[known]), 0.5, 2.0))
+        return (share * volume + (1 - share) * np.float32(scale) * head).astype(np.float32)
+
+
+def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How far each voxel [I, J, K] was seen, from 0 (not) to 1, from the pixels that were spread over it."""
+    some = coverage > 0.1 * coverage.max(initial=0)
+    typical = float(np.median(coverage[some])) if some.any() else 1.0
+    return np.minimum(coverage / np.float32(FULL_COVERAGE * typical), 1.0).astype(np.float32)
+
+
+def resampled(volume: NDArray[np.float32], grid: VolumeGrid, onto: VolumeGrid) -> NDArray[np.float32]:
+    """A volume on another grid (trilinear), 0 outside its own."""
+    return sampled(volume, grid, onto.world(np.indices(onto.shape).reshape(3, -1).T)).reshape(onto.shape)
+
+
+def sampled(volume: NDArray[np.float32], grid: VolumeGrid, point_mm: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A volume at points [P, 3] of the world (trilinear), 0 outside its grid."""
+    matrix = np.linalg.inv(grid.affine)
+    place = matrix[:3, :3] @ point_mm.T + matrix[:3, 3:]
+    return map_coordinates(volume, place, order=1, output=np.float32)
+
+
+def with_header_spans(header_pose: RigidPose, motion: RigidPose, slice_index: NDArray[np.int64]) -> RigidPose:
+    """Motions of a single stack whose missing spans are as long as the header says.
+
+    Slices behind a span may turn and shift in plane against those before it. A jump along the normal would only
+    close or widen the hole: the template that asks for it is another head, and no other stack was asked.
+
+    Args:
+        header_pose: [K] of the slices of one stack, in the order of their numbers.
+        motion: [K] world from header.
+        slice_index: [K] numbers of the slices in their stack.
+    """
+    translation = motion.translation_mm.copy()
+    for first in np.flatnonzero(np.diff(slice_index) > 1) + 1:
+        near = slice(max(0, first - SPAN_SLICES), first), slice(first, first + SPAN_SLICES)
+        place = motion.rotation @ header_pose.translation_mm[..., None]
+        place = place[..., 0] + translation
+        normal = (motion.rotation @ header_pose.rotation)[near[0].start : near[1].stop, :, 2].mean(0)
+        normal /= np.linalg.norm(normal)
+        middle = header_pose.translation_mm
+        given_mm = float(header_pose.rotation[first, :, 2] @ (middle[near[1]].mean(0) - middle[near[0]].mean(0)))
+        found_mm = float(normal @ (place[near[1]].mean(0) - place[near[0]].mean(0)))
+        translation[first:] += (given_mm - found_mm) * normal
+    return RigidPose(motion.rotation, translation)

@@ -1,0 +1,74 @@
+"""The size and the middle of a head are right although slices of it are missing."""
+
+import numpy as np
+import pytest
+
+from data_synth.phantom import fetal_brain_phantom
+from g3r.acquisition.area_profile import area_profiles, head_volume_mm3
+from g3r.acquisition.planes import Slices
+from tests.registration.moving_heads import as_slices, simulated
+
+
+@pytest.fixture(scope="module")
+def whole() -> Slices:
+    return as_slices(simulated(fetal_brain_phantom(28, 1.5)))[0]
+
+
+def without(slices: Slices, stack: int, first: float, last: float) -> Slices:
+    """Without the slices of a stack between two fractions of its own."""
+    rows = np.flatnonzero(slices.stack_id == stack)
+    lost = rows[round(first * len(rows)) : round(last * len(rows))]
+    return slices.take(np.setdiff1d(np.arange(len(slices)), lost))
+
+
+def one_stack(slices: Slices, stack: int = 0) -> Slices:
+    return slices.take(slices.stack_id == stack)
+
+
+def test_a_whole_head_counts_as_masked(whole: Slices) -> None:
+    for stack, profile in enumerate(area_profiles(whole)):
+        one = one_stack(whole, stack)
+        area_mm2 = np.bincount(one.pixel_plane, minlength=len(one)) * one.planes.spacing_mm.prod(1)
+        assert profile.volume_mm3 == pytest.approx(area_mm2.sum() * profile.spacing_mm, rel=1e-12)
+        assert not profile.has_missing
+        assert profile.longest_gap_mm == 0
+
+
+@pytest.mark.parametrize("span", [(0.45, 0.55), (0.35, 0.65)])
+def test_missing_slices_are_put_back(whole: Slices, span: tuple[float, float]) -> None:
+    (given,), (found,) = area_profiles(one_stack(whole)), area_profiles(without(one_stack(whole), 0, *span))
+    assert found.n_inside == (~np.isin(given.index, found.index[found.seen])).sum()
+    assert found.longest_gap_mm == pytest.approx(found.n_inside * found.spacing_mm)
+    assert not found.is_cut
+    assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.07)
+    assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 2
+
+
+@pytest.mark.parametrize(("span", "cut"), [((0.0, 0.4), (True, False)), ((0.6, 1.0), (False, True))])
+def test_a_cut_head_is_continued(whole: Slices, span: tuple[float, float], cut: tuple[bool, bool]) -> None:
+    (given,), (found,) = area_profiles(one_stack(whole, 2)), area_profiles(without(one_stack(whole, 2), 2, *span))
+    seen_mm3 = float(found.area_mm2[found.seen].sum() * found.spacing_mm)
+    assert found.cut == cut
+    assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.1)
+    assert seen_mm3 < 0.7 * given.volume_mm3
+    assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 3
+
+
+def test_whole_stacks_say_the_volume(whole: Slices) -> None:
+    cut = without(whole, 0, 0.5, 1.0)
+    assert head_volume_mm3(cut) == pytest.approx(head_volume_mm3(whole), rel=0.05)
+    assert area_profiles(cut)[0].volume_mm3 == pytest.approx(head_volume_mm3(whole), rel=0.15)
+
+
+def test_all_stacks_cut(whole: Slices) -> None:
+    halves = whole
+    for stack in range(3):
+        halves = without(halves, stack, 0.0, 0.5)
+    assert head_volume_mm3(halves) == pytest.approx(head_volume_mm3(whole), rel=0.25)
+
+
+def test_few_slices_are_taken_as_they_are(whole: Slices) -> None:
+    few = one_stack(whole).take(np.arange(8, 11))
+    (found,) = area_profiles(few)
+    assert not found.has_missing
+    assert found.seen.all()
