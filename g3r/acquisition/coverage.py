@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.geometry import VolumeGrid
 
+UNSEEN_POWER = 4
+"""What no slice saw has the weight (1 - c)^4 = exp(-4 M): 1 without coverage, 0.45 where M = 0.2, 0.02 under one
+gapless stack."""
+
 REACH_SIGMA = 5.0
 """Where the profile of a slice ends: beyond it lies a millionth of its integral."""
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from g3r.acquisition.coverage import UNSEEN_BELOW
+from g3r.acquisition.coverage import UNSEEN_BELOW, UNSEEN_POWER
 from g3r.acquisition.foreground import foreground
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.stacks import Stack
@@ -37,6 +37,9 @@ from g3r.uncertainty.prior_share import estimate_prior_share
 from g3r.uncertainty.unseen import UnseenPart
 
 logger = logging.getLogger(__name__)
+
+LEAST_WEIGHT = 0.01
+"""Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 
@@ -85,8 +88,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.clock(Stage.VOLUME):
         mask = found.prior.mask if grid is volumes.grid else _mask_on(grid, found.prior, fit)
-        volume = _volume(found, mask, grid, settings)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
+        volume = _volume(found, mask, density, grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
         unseen_part = UnseenPart.of(unseen, mask, grid.voxel_volume_mm3, shown=_shown_unseen(found.prior, settings))
     line = unseen_part.line()
@@ -108,7 +111,9 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                     cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
-                prior_share[unseen] = 1.0
+                left_to_prior = _left_to_prior(density)
+                prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share)
+                prior_share = prior_share.astype(np.float32)
                 release_memory()
         with run.clock(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
@@ -175,14 +180,29 @@ def _no_fit(found: StageResults) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 
 
+def _left_to_prior(density: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weight [I, J, K] of the prior in the written volume: 1 where no slice looked, next to nothing where one did.
+
+    Nothing holds Gaussians there but what they have to explain elsewhere.
+    """
+    weight = np.exp(-UNSEEN_POWER * density)
+    return np.where(weight < LEAST_WEIGHT, 0, weight).astype(np.float32)
+
+
 def _volume(
-    found: StageResults, mask: NDArray[np.bool_], grid: VolumeGrid, settings: ReconstructionSettings
+    found: StageResults,
+    mask: NDArray[np.bool_],
+    density: NDArray[np.float32],
+    grid: VolumeGrid,
+    settings: ReconstructionSettings,
 ) -> NDArray[np.float32]:
-    """The Gaussians on the output grid; the prior volume before there are any."""
+    """The Gaussians on the output grid, and the prior where no slice looked; the prior alone before there are any."""
+    prior = on_grid(found.prior.values, found.prior.volumes.grid, grid, outside=0.0)
     if found.fit is None:
-        return on_grid(found.prior.values, found.prior.volumes.grid, grid, outside=0.0) * mask
+        return prior * mask
     pixels = render(found.fit.cloud, volume_planes(grid), cutoff_sigma=settings.slice_stage.cutoff_sigma).numpy()
-    volume = volume_from_pixels(pixels, grid) * mask
+    fitted = volume_from_pixels(pixels, grid)
+    volume = (fitted + _left_to_prior(density) * (prior - fitted)) * mask
     if not np.isfinite(volume).all():
         raise NumericalError("the volume holds values that are not finite; lower the step sizes")
     return volume

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,9 @@ MARGIN_MM = 6.0
 SCALE_BAR_MM = 20.0
 ROW_HEIGHT_INCHES = 2.5
 DOTS_PER_INCH = 130
+TITLE_LINE_INCHES = 0.19
+TITLE_LETTER_INCHES = 0.092
+"""Height of a line and mean width of a letter at the size of the title."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,8 +164,10 @@ def _draw(
     height_mm = max(size_mm[view.up] for view in VIEWS)
     inches_per_mm = ROW_HEIGHT_INCHES / height_mm
     captioned = any(one.caption for one in volumes)
-    left, right, top, bottom = 0.58 if captioned else 0.38, 0.55, 0.34 + (0.26 if title else 0.0), 0.30
+    left, right, bottom = 0.58 if captioned else 0.38, 0.55, 0.30
     width = sum(widths_mm) * inches_per_mm + left + right + 0.08
+    title_lines = textwrap.wrap(title, max(20, int(width / TITLE_LETTER_INCHES)))
+    top = 0.34 + (0.08 + TITLE_LINE_INCHES * len(title_lines) if title_lines else 0.0)
     height = len(volumes) * ROW_HEIGHT_INCHES + 0.04 * (len(volumes) - 1) + top + bottom
     figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor=BACKGROUND)
     panels = figure.subplots(
@@ -211,8 +217,8 @@ def _draw(
             bar.tick_params(colors=FAINT_INK, labelsize=7, length=2, pad=2)
             bar.spines[:].set_visible(False)
     _scale_bar(panels[-1][0])
-    if title:
-        figure.text(0.5, 1 - 0.16 / height, title, color=INK, fontsize=11, ha="center", va="center")
+    if title_lines:
+        figure.text(0.5, 1 - 0.06 / height, "\n".join(title_lines), color=INK, fontsize=11, ha="center", va="top")
     voxel = " x ".join(f"{value:.2f}" for value in spacing_mm)
     note = f"voxels {voxel} mm; radiological: the patient's right is on the left"
     figure.text(1 - 0.1 / width, 0.13 / height, note, color=FAINT_INK, fontsize=7.5, ha="right", va="center")

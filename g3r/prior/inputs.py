@@ -7,14 +7,12 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from g3r.acquisition.coverage import UNSEEN_POWER
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.gate import confidence_from_density
 
 CERTAIN_LOGIT = 3.0
 """Logit of a voxel inside the masks or the template before the network has its say: a probability of 0.95."""
-
-SEEN_POWER = 4
-"""The base is the measured volume with weight 1 - (1 - c)^4: 0.98 under one gapless stack, 0.55 where M = 0.2."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +73,7 @@ class PriorInputs:
         return CERTAIN_LOGIT * (2 * share - 1)
 
     def _unseen(self) -> Tensor:
-        return torch.exp(-SEEN_POWER * self.density)
+        return torch.exp(-UNSEEN_POWER * self.density)
 
     def flip(self, dims: list[int]) -> PriorInputs:
         """All volumes mirrored along some axes."""

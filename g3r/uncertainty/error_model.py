@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from g3r.acquisition.coverage import UNSEEN_POWER
+
 DEPTH_MM = 3.0
 """Depth below the rim of the mask at which its influence has fallen to 1/e."""
 
@@ -20,9 +22,6 @@ FLOORS = {"residual": 0.005, "edge": 0.01, "texture": 0.005, "from_prior": 0.003
 
 MIN_ERROR, MAX_ERROR = 1e-4, 1.0
 """Bounds of the expected error, in normalised intensities: a ten-thousandth of the brightest tissue, and all of it."""
-
-UNSEEN_POWER = 4
-"""Sets what no slice saw apart from what slices saw thinly: (1 - c)^4 is 0.45 where M = 0.2, 0.02 under one stack."""
 
 RIDGE = 1e-4
 """Keeps coefficients finite that a small sample does not determine."""
