@@ -51,7 +51,7 @@ TINY_TRAINING = [
 
 def volumes(n: int, seed: int = 0, size: int = 12) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    names = ("coarse", "density", "sharp", "truth")
+    names = ("coarse", "density", "share", "sharp", "template", "outline", "truth")
     batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
     return {**batch, "mask": torch.ones_like(batch["truth"])}
 
@@ -108,13 +108,13 @@ def test_images_show_gate_and_confidence_for_each_number_of_stacks(log: Any) -> 
     assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
     assert "confidence, gate" in validation.PANEL_TAG
     image = log.Images(tags[0])[-1]
-    assert (image.height, image.width) == (12, 7 * 12)
+    assert (image.height, image.width) == (12, 8 * 12)
 
 
 def test_panel_of_a_network_without_a_gate() -> None:
     batch = volumes(1)
     shown = validation.panel(batch, batch["coarse"], None)
-    coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
+    coarse, _, _, confidence, gate, prior, _, _ = shown.split(12, 1)
     assert bool((gate == 1).all())
     assert 0 < float(confidence.max()) < 1
     assert torch.equal(prior, coarse)  # which stands for the prior here
@@ -129,7 +129,7 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
     run.save_checkpoint(tmp_path / "run.ckpt")
     path = tmp_path / "prior.safetensors"
     assert first.voxel_mm is not None
-    Prior(network=first.network, voxel_mm=first.voxel_mm, training_data="noise").save(path)
+    Prior(network=first.network, voxel_mm=first.voxel_mm, weeks=(30.0,), training_data="noise").save(path)
     data = ValidatedByStacks()
     data.spacing_mm = 1.0
     again = training.PriorModule(NETWORK, start_from=str(path))

@@ -13,12 +13,14 @@ import pytest
 import torch
 import yaml
 
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export
 from g3r.errors import InputError
 from g3r.evaluation.metrics import score
 from g3r.prior.config import PriorNetworkConfig
-from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
+from g3r.prior.inputs import PriorInputs
 from g3r.prior.model import Prior
 
 pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
@@ -29,10 +31,19 @@ from torch.utils.data import DataLoader
 from g3r.training import prior_batches as batches
 from g3r.training import prior_module as training
 from g3r.training.annealed_module import cosine_factor
-from g3r.training.prior_validation import sample_scores
+from g3r.training.prior_validation import (
+    ASSUMED_VOXEL_MM,
+    PLACES,
+    RIM_MM,
+    ValidationScores,
+    confidence_bins,
+    l1_by_confidence,
+    psnr_by_place,
+    sample_scores,
+)
 from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
-NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
+NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4, template_spacing_mm=4.0)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 Trained = tuple[Path, Path, training.PriorModule]
@@ -51,15 +62,37 @@ def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
     mask = torch.ones_like(truth)
     mask[:, :3] = 0
     coarse, sharp = mask * (truth + error), mask * (truth + 0.8 * error)
-    return {"coarse": coarse, "density": density, "sharp": sharp, "truth": mask * truth, "mask": mask}
+    return {
+        "coarse": coarse,
+        "density": density,
+        "share": mask,
+        "sharp": sharp,
+        "template": mask * truth.mean(),
+        "outline": mask,
+        "truth": mask * truth,
+        "mask": mask,
+    }
+
+
+def given_at_random(*shape: int) -> PriorInputs:
+    """Inputs of a network that mean nothing."""
+    names = ("coarse", "density", "share", "sharp", "template", "outline")
+    return PriorInputs(**{name: torch.rand(1, 1, *shape) for name in names})
 
 
 class TinyData(lightning.LightningDataModule):
-    """Four samples in memory."""
+    """Four samples in memory, and a template of two ages."""
 
-    def __init__(self, spacing_mm: float = 0.8, source: str = "/some/where/atlas") -> None:
+    def __init__(
+        self, spacing_mm: float = 0.8, template_mm: float = 4.0, source: str = "/some/where/atlas"
+    ) -> None:
         super().__init__()
         self.save_hyperparameters()
+
+    def template(self) -> AtlasTemplate:
+        config = replace(NETWORK, template_shape=(2, 5, 6, 4), template_spacing_mm=self.hparams["template_mm"])
+        heads = np.random.default_rng(0).random(config.template_shape).astype(np.float32)
+        return AtlasTemplate(heads, config.template_grid.affine, np.array([25.0, 31.0]))
 
     def train_dataloader(self) -> DataLoader:
         return in_memory([sample(seed) for seed in range(4)], 2)
@@ -82,12 +115,15 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 def test_tensorboard_has_scalars_and_the_panel(trained: Trained) -> None:
     log = logged(trained[0] / "run" / "version_0")
-    scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
+    scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "sharp", "coarse", "template")}
+    by_confidence = {f"train/l1_prior_{name}" for name in ("hardly_seen", "thinly_seen", "seen")}
+    by_place = {f"val/psnr_prior_seen_{place}" for place in PLACES}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
-    assert scores | speed | {"train/l1_prior", "train/l1_coarse"} <= set(log.Tags()["scalars"])
+    losses = {"train/loss", "train/l1_prior", "train/l1_coarse"}
+    assert scores | speed | losses | by_confidence | by_place <= set(log.Tags()["scalars"])
     (tag,) = log.Tags()["images"]
     image = log.Images(tag)[0]
-    assert (image.height, image.width) == (16, 7 * 16)
+    assert (image.height, image.width) == (16, 8 * 16)
 
 
 def test_training_moves_the_weights(trained: Trained) -> None:
@@ -106,11 +142,15 @@ def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys:
     path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
     prior = Prior.load(path)
-    inputs = torch.rand(3, 1, 1, 12, 16, 9)
+    given = given_at_random(12, 16, 9)
     with torch.no_grad():
-        torch.testing.assert_close(prior.network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
+        for one, other in zip(prior.network(given), module.eval()(given), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
     assert (prior.network.config.alpha, prior.voxel_mm) == (0.1, 0.8)
-    assert "TinyData(spacing_mm=0.8, source=atlas)" in prior.training_data
+    assert prior.template.weeks.tolist() == [25, 31]
+    np.testing.assert_allclose(prior.template.volume, TinyData().template().volume, atol=1e-3)  # float16
+    np.testing.assert_allclose(prior.template.affine, TinyData().template().affine)
+    assert "TinyData(spacing_mm=0.8, template_mm=4.0, source=atlas)" in prior.training_data
     assert "/some/where" not in prior.training_data
     assert prior.validation["val/psnr_prior"] > 0
     assert "val/psnr_prior" in capsys.readouterr().out
@@ -143,6 +183,7 @@ def spoil(content: dict[str, Any]) -> None:
         (without("state_dict"), "not written by this version of g3r-pretrain"),
         (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be exported"),
         (lambda content: content["g3r_export"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
+        (lambda content: content["g3r_export"].update(weeks=[25.0]), "1 ages for a template of 2"),
         (lambda content: content["state_dict"].popitem(), "cannot be exported"),
         (spoil, "NaN or infinity"),
     ],
@@ -181,20 +222,26 @@ def test_voxel_size_must_agree_with_the_data(tmp_path: Path) -> None:
         trainer(tmp_path, max_steps=2).fit(module, TinyData())
 
 
+def test_the_template_s_voxels_must_agree_with_the_data(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"not on a grid of 4 mm.*template_spacing_mm"):
+        trainer(tmp_path, max_steps=2).fit(training.PriorModule(**SMALL), TinyData(template_mm=3.0))
+
+
 def test_a_patch_can_be_learnt() -> None:
     """Sixty steps on one patch bring the prior's error to half the coarse volume's."""
     torch.manual_seed(0)
     module = training.PriorModule(**SMALL, learning_rate=3e-3)
     batch = {name: value[None] for name, value in sample(0, size=24).items()}
-    weight = batches.loss_weight(batch["mask"], 0.1)
+    weight = batches.loss_weight(batch, 0.1)
     optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
     for _ in range(60):
-        prior = module(batch["coarse"], batch["density"], batch["sharp"])
-        loss = batches.weighted_l1(prior, batch["truth"], weight)
+        found = module(batches.prior_inputs(batch))
         optimizer.zero_grad()
-        loss.backward()
+        batches.prior_loss(found, batch, weight).backward()
         optimizer.step()
-    coarse_loss = batches.weighted_l1(batch["coarse"], batch["truth"], weight)
+    loss, coarse_loss = (
+        batches.weighted_l1(volume, batch["truth"], weight) for volume in (found.volume, batch["coarse"])
+    )
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
 
 
@@ -205,22 +252,109 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_sharp: 
     old = DensityGatedPriorNetwork(replace(NETWORK, use_sharp=use_sharp))
     torch.nn.init.normal_(old.refiner.head.weight)
     path = tmp_path / "old.safetensors"
-    Prior(network=old, voxel_mm=0.8, training_data="noise").save(path)
-    volumes = [torch.rand(1, 1, 8, 8, 8) for _ in range(3)]
+    old.set_template(torch.rand(3, 2, 2, 2))  # of another shape, and not taken
+    Prior(network=old, voxel_mm=0.8, weeks=(25.0, 28.0, 31.0), training_data="noise").save(path)
+    given = given_at_random(8, 8, 8)
     new = training.PriorModule(NETWORK, start_from=str(path)).network
-    torch.testing.assert_close(new(*volumes), old(*volumes))
-    moved = training.PriorModule(replace(NETWORK, sharp_base=True), start_from=str(path)).network
-    torch.testing.assert_close(moved(*volumes), volumes[2])
+    assert new.config.template_shape == NETWORK.template_shape
+    for one, other in zip(new(given), old(given), strict=True):
+        torch.testing.assert_close(one, other)
+    for changes in ({"sharp_base": True}, {"use_template": False}):
+        config = replace(NETWORK, **changes)
+        moved = training.PriorModule(config, start_from=str(path)).network
+        torch.testing.assert_close(moved(given).volume, given.base(config))
     with pytest.raises(InputError, match="give it the same channels and units"):
         training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
 
 
-def test_loss_weight_is_one_in_the_mask_and_small_outside() -> None:
-    mask = torch.zeros(1, 1, 5, 5, 5)
-    mask[0, 0, 2, 2, 2] = 1
-    weight = batches.loss_weight(mask, 0.1)
-    assert float(weight[0, 0, 2, 2, 2]) == 1
-    assert float(weight.sum()) == pytest.approx(1 + 0.1 * 124)
+def test_loss_weight_is_that_of_brain_band_and_background() -> None:
+    """1 in the brain and more where nothing was seen; outside little, and more next to the brain."""
+    mask = torch.zeros(1, 1, 21, 21, 21)
+    mask[0, 0, 10, 10, 9:11] = 1
+    density = torch.full_like(mask, 50.0)
+    density[0, 0, 10, 10, 9] = 0
+    weight = batches.loss_weight({"mask": mask, "density": density}, 0.02)
+    assert float(weight[0, 0, 10, 10, 10]) == pytest.approx(1)
+    assert float(weight[0, 0, 10, 10, 9]) == pytest.approx(1 + batches.UNSEEN_EMPHASIS)
+    band = 0.02 * batches.BAND_FACTOR
+    assert float(weight[0, 0, 10, 10, 10 + batches.BAND_VOXELS]) == pytest.approx(band)
+    assert float(weight[0, 0, 10, 10, 11 + batches.BAND_VOXELS]) == pytest.approx(0.02)
+    wide = 2 * batches.BAND_VOXELS + 1
+    n_band = wide * wide * (wide + 1) - 2
+    expected = 2 + batches.UNSEEN_EMPHASIS + band * n_band + 0.02 * (21**3 - n_band - 2)
+    assert float(weight.sum()) == pytest.approx(expected, rel=1e-5)
+    # never more than the brain's
+    assert float(batches.loss_weight({"mask": mask, "density": density}, 1.0).min()) == 1
+
+
+def test_the_loss_wants_the_median_where_slices_looked_and_the_mean_where_none_did() -> None:
+    """Of a voxel that is 0 in three heads and 1 in one, the least loss is at 0 if seen, at 1/4 if unseen."""
+    truth = torch.tensor([0.0, 0, 0, 1]).reshape(4, 1, 1, 1, 1)
+    mask = torch.ones_like(truth)
+    guesses = torch.linspace(0, 1, 101)
+    for density, best in ((30.0, 0.0), (0.0, 0.25)):
+        batch = {"truth": truth, "mask": mask, "density": torch.full_like(truth, density)}
+        losses = [
+            float(batches.prior_loss(PriorOutput(torch.full_like(truth, float(x)), 9 * mask), batch, mask))
+            for x in guesses
+        ]
+        assert float(guesses[int(np.argmin(losses))]) == pytest.approx(best, abs=0.011)
+
+
+def test_the_loss_asks_for_the_brain_above_all_where_no_slice_looked() -> None:
+    truth = torch.zeros(1, 1, 1, 1, 2)
+    mask = torch.tensor([1.0, 0.0]).reshape(truth.shape)
+
+    def loss(logit: torch.Tensor, density: float) -> float:
+        batch = {"truth": truth, "mask": mask, "density": torch.full_like(truth, density)}
+        return float(batches.prior_loss(PriorOutput(truth, logit), batch, torch.ones_like(truth)))
+
+    right, undecided = 12 * (mask - 0.5), 0 * mask
+    assert loss(right, 0.0) < 0.01 * loss(undecided, 0.0)
+    assert loss(undecided, 0.0) == pytest.approx(batches.BRAIN_FACTOR * np.log(2), rel=1e-5)
+    # one seen voxel, one unseen: the unseen one's answer counts more
+    batch = {"truth": truth, "mask": 0 * mask, "density": torch.tensor([30.0, 0.0]).reshape(truth.shape)}
+    seen_wrong, unseen_wrong = (
+        float(batches.prior_loss(PriorOutput(truth, 12 * (wrong - 0.5)), batch, torch.ones_like(truth)))
+        for wrong in (mask, 1 - mask)
+    )
+    assert unseen_wrong > 5 * seen_wrong
+
+
+def test_errors_by_confidence_are_of_the_brain_alone() -> None:
+    density = torch.tensor([0.0, 0.2, 0.5, 3.0, 3.0]).reshape(1, 1, 1, 1, 5)
+    mask = torch.tensor([1.0, 1, 1, 1, 0]).reshape(density.shape)
+    error = torch.tensor([0.1, 0.2, 0.3, 0.4, 9.0]).reshape(density.shape)
+    batch = {"density": density, "mask": mask, "truth": 0 * mask}
+    found = {name: float(value) for name, value in l1_by_confidence(error, batch).items()}
+    assert found == pytest.approx({"unseen": 0.1, "hardly_seen": 0.2, "thinly_seen": 0.3, "seen": 0.4})
+    assert sum(one.int() for one in confidence_bins(density)).tolist() == torch.ones_like(density).tolist()
+    seen = {**batch, "density": density + 3}
+    assert l1_by_confidence(error, seen).keys() == {"seen"}
+
+
+def test_validation_tells_rim_from_depth_and_seen_from_unseen() -> None:
+    """An error of 0.1 in the rim and of 0.01 within; the upper half is unseen."""
+    mask = torch.zeros(1, 1, 24, 24, 24)
+    mask[:, :, 2:22, 2:22, 2:22] = 1
+    deep = torch.zeros_like(mask)
+    n_rim = int(RIM_MM / ASSUMED_VOXEL_MM)
+    deep[:, :, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim] = 1
+    density = torch.full_like(mask, 3.0)
+    density[..., 12:] = 0
+    truth = torch.rand(mask.shape)
+    made = truth + 0.1 + deep * (0.01 - 0.1)
+    volumes = dict.fromkeys(("prior", "sharp", "coarse", "template"), made)
+    scores = ValidationScores()
+    scores.add(volumes, {"truth": truth, "mask": mask, "density": density}, mask)
+    found = psnr_by_place(scores.squares)
+    assert found["psnr_prior_unseen_rim"] == pytest.approx(20, abs=0.01)
+    assert found["psnr_template_seen_rim"] == pytest.approx(20, abs=0.01)
+    assert found["psnr_prior_unseen_deep"] == pytest.approx(40, abs=0.01)
+    assert not any("thinly" in name for name in found)
+    n = scores.squares[..., 0, 1]
+    assert float(n.sum()) == float(mask.sum())
+    assert float(n[0].sum()) == float(mask[..., 12:].sum())
 
 
 def test_weighted_l1_of_an_empty_mask_without_background_is_zero() -> None:
