@@ -31,11 +31,7 @@ def small_prior() -> Prior:
     torch.nn.init.normal_(network.refiner.head.weight)
     network.set_template(torch.rand(2, 4, 5, 3))
     return Prior(
-        network=network,
-        voxel_mm=0.8,
-        weeks=(25.0, 31.0),
-        training_data="two phantoms",
-        validation={"val/psnr": 30.0},
+        network=network, voxel_mm=0.8, weeks=(25.0, 31.0), training_data="two phantoms", validation={"val/psnr": 30.0}
     )
 
 

@@ -13,8 +13,8 @@ from g3r.gaussians import GaussianCloud, render, solve_amplitudes
 from g3r.gaussians.amplitudes import AmplitudeSystem
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inputs import PriorInputs
 from g3r.prior.gate import DensityGate, confidence_from_density
+from g3r.prior.inputs import PriorInputs
 from tests.gradients import gradient_of
 from tests.numerics.oracles import naive_amplitudes, naive_render
 from tests.numerics.scenes import head_scene, single, slender_scenes

@@ -25,6 +25,7 @@ from g3r.planning.memory_size import gigabytes, parsed_size
 from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
+from g3r.prior.inference import Tiling
 
 DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
 PROCESS = 500_000_000

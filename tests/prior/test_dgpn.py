@@ -153,8 +153,7 @@ def test_a_base_that_is_not_shown_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"template_shape": (2, 2, 2)}, {"template_shape": (1, 2, 600, 2)}, {"template_spacing_mm": 0.0}],
+    "wrong", [{"template_shape": (2, 2, 2)}, {"template_shape": (1, 2, 600, 2)}, {"template_spacing_mm": 0.0}]
 )
 def test_templates_without_meaning_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="template of"):
@@ -168,6 +167,14 @@ def test_a_template_of_any_shape_is_taken_as_it_will_be_stored() -> None:
     assert network.template.dtype == torch.float32
     assert torch.equal(network.template, torch.full((2, 3, 4, 5), 1 / 3).half().float())
     np.testing.assert_allclose(network.config.template_grid.center_mm, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [4, 13, 25, 30, 49, 60])
+def test_the_template_s_grid_has_its_shape(n: int) -> None:
+    """Whatever way (n - 1) times 1.6 is rounded."""
+    grid = replace(SMALL, template_shape=(1, n, 5, 4), template_spacing_mm=1.6).template_grid
+    assert grid.shape == (n, 5, 4)
+    np.testing.assert_allclose(grid.world([0, 0, 0]), -0.8 * np.array([n - 1, 4, 3]), atol=1e-9)
 
 
 def test_importing_the_package_stays_light() -> None:

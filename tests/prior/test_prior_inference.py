@@ -17,7 +17,9 @@ from tests.prior.receptive_field import receptive_radius_voxels
 def small(n_levels: int = 1, **changes: Any) -> DensityGatedPriorNetwork:
     """A network of 8 channels that sees V_coarse and M."""
     levels: dict[str, Any] = {"channels": (8,) * n_levels, "units": (1,) * n_levels, "tail_channels": 4}
-    return DensityGatedPriorNetwork(PriorNetworkConfig(**levels, **{"use_sharp": False, "use_template": False, **changes})).eval()
+    return DensityGatedPriorNetwork(
+        PriorNetworkConfig(**levels, **{"use_sharp": False, "use_template": False, **changes})
+    ).eval()
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +63,7 @@ def test_whole_volume_is_the_network_s_output(
     assert 0.03 < np.std(whole.volume - maps.coarse) < 0.3
 
 
-def test_tiles_agree_with_the_whole(
-    network: DensityGatedPriorNetwork, maps: PriorMaps, whole: EstimatedPrior
-) -> None:
+def test_tiles_agree_with_the_whole(network: DensityGatedPriorNetwork, maps: PriorMaps, whole: EstimatedPrior) -> None:
     tiled = estimate_prior(network, maps, tiling=Tiling(max_whole_voxels=0, tile_voxels=48))
     # The default halo, on white noise and random weights, which look further than an image and trained ones.
     assert largest_difference(tiled, whole) < 1e-3

@@ -26,6 +26,7 @@ from g3r.prior.model import Prior
 from g3r.reconstruct import GaussianReconstructor
 from g3r.training import prior_module as training
 from g3r.training import prior_validation as validation
+from g3r.training.prior_batches import loss_weight
 from tests.training.small_runs import in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
@@ -99,7 +100,8 @@ def test_scores_are_means_over_volumes(log: Any) -> None:
     assert last("val/psnr_coarse") == pytest.approx(expected, abs=1e-4)
     assert last("val/psnr_gain") == pytest.approx(last("val/psnr_prior") - last("val/psnr_coarse"), abs=1e-4)
     one = next(iter(ValidatedByStacks().val_dataloader()))
-    l1 = float((one["coarse"] - one["truth"]).abs().mean())
+    weight = loss_weight(one, 1.0)
+    l1 = float((weight * (one["coarse"] - one["truth"]).abs()).sum() / weight.sum())
     assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
 
 

@@ -17,10 +17,8 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export
 from g3r.errors import InputError
-from g3r.evaluation.metrics import score
 from g3r.prior.config import PriorNetworkConfig
-from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
-from g3r.prior.inputs import PriorInputs
+from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
 
 pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
@@ -31,17 +29,9 @@ from torch.utils.data import DataLoader
 from g3r.training import prior_batches as batches
 from g3r.training import prior_module as training
 from g3r.training.annealed_module import cosine_factor
-from g3r.training.prior_validation import (
-    ASSUMED_VOXEL_MM,
-    PLACES,
-    RIM_MM,
-    ValidationScores,
-    confidence_bins,
-    l1_by_confidence,
-    psnr_by_place,
-    sample_scores,
-)
+from g3r.training.prior_validation import PLACES
 from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
+from tests.training.small_volumes import given_at_random, sample
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4, template_spacing_mm=4.0)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
@@ -49,43 +39,10 @@ CONFIG = "lightning_configs/prior.yaml"
 Trained = tuple[Path, Path, training.PriorModule]
 
 
-def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
-    coarse_noise = torch.rand(1, 1, size // 4, size // 4, size // 4, generator=generator)
-    return torch.nn.functional.interpolate(coarse_noise, scale_factor=4, mode="trilinear")[0]
-
-
-def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
-    """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
-    generator = torch.Generator().manual_seed(seed)
-    truth, density = smooth_noise(generator, size), 3 * smooth_noise(generator, size)
-    error = -0.5 * torch.exp(-density) * truth + 0.02 * torch.randn(truth.shape, generator=generator)
-    mask = torch.ones_like(truth)
-    mask[:, :3] = 0
-    coarse, sharp = mask * (truth + error), mask * (truth + 0.8 * error)
-    return {
-        "coarse": coarse,
-        "density": density,
-        "share": mask,
-        "sharp": sharp,
-        "template": mask * truth.mean(),
-        "outline": mask,
-        "truth": mask * truth,
-        "mask": mask,
-    }
-
-
-def given_at_random(*shape: int) -> PriorInputs:
-    """Inputs of a network that mean nothing."""
-    names = ("coarse", "density", "share", "sharp", "template", "outline")
-    return PriorInputs(**{name: torch.rand(1, 1, *shape) for name in names})
-
-
 class TinyData(lightning.LightningDataModule):
     """Four samples in memory, and a template of two ages."""
 
-    def __init__(
-        self, spacing_mm: float = 0.8, template_mm: float = 4.0, source: str = "/some/where/atlas"
-    ) -> None:
+    def __init__(self, spacing_mm: float = 0.8, template_mm: float = 4.0, source: str = "/some/where/atlas") -> None:
         super().__init__()
         self.save_hyperparameters()
 
@@ -115,7 +72,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 def test_tensorboard_has_scalars_and_the_panel(trained: Trained) -> None:
     log = logged(trained[0] / "run" / "version_0")
-    scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "sharp", "coarse", "template")}
+    scores = {
+        f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "sharp", "coarse", "template")
+    }
     by_confidence = {f"train/l1_prior_{name}" for name in ("hardly_seen", "thinly_seen", "seen")}
     by_place = {f"val/psnr_prior_seen_{place}" for place in PLACES}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
@@ -245,11 +204,11 @@ def test_a_patch_can_be_learnt() -> None:
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
 
 
-@pytest.mark.parametrize("use_sharp", [False, True])
-def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_sharp: bool) -> None:
-    """Channels that the file lacks have no effect at first; on another base the residual begins at zero."""
+@pytest.mark.parametrize("use_template", [False, True])
+def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_template: bool) -> None:
+    """On another base the residual begins at zero; the template is the data's, not the file's."""
     torch.manual_seed(0)
-    old = DensityGatedPriorNetwork(replace(NETWORK, use_sharp=use_sharp))
+    old = DensityGatedPriorNetwork(replace(NETWORK, use_template=use_template))
     torch.nn.init.normal_(old.refiner.head.weight)
     path = tmp_path / "old.safetensors"
     old.set_template(torch.rand(3, 2, 2, 2))  # of another shape, and not taken
@@ -257,146 +216,23 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_sharp: 
     given = given_at_random(8, 8, 8)
     new = training.PriorModule(NETWORK, start_from=str(path)).network
     assert new.config.template_shape == NETWORK.template_shape
-    for one, other in zip(new(given), old(given), strict=True):
-        torch.testing.assert_close(one, other)
-    for changes in ({"sharp_base": True}, {"use_template": False}):
-        config = replace(NETWORK, **changes)
-        moved = training.PriorModule(config, start_from=str(path)).network
-        torch.testing.assert_close(moved(given).volume, given.base(config))
+    if use_template:
+        for one, other in zip(new(given), old(given), strict=True):
+            torch.testing.assert_close(one, other)
+    else:
+        torch.testing.assert_close(new(given).volume, given.base(NETWORK))
+        # channels that the file lacks have no effect at first
+        shown = replace(given, template=torch.rand(1, 1, 8, 8, 8))
+        new.refiner.head.load_state_dict(old.refiner.head.state_dict())
+        torch.testing.assert_close(new.refiner(shown)[0], old.refiner(given)[0])
+    moved_base = replace(NETWORK, sharp_base=True)
+    moved = training.PriorModule(moved_base, start_from=str(path)).network
+    torch.testing.assert_close(moved(given).volume, given.base(moved_base))
+    for other_inputs in ({"use_sharp": False}, {"use_density": False}):
+        with pytest.raises(InputError, match="V_sharp and densities"):
+            training.PriorModule(replace(NETWORK, **other_inputs), start_from=str(path))
     with pytest.raises(InputError, match="give it the same channels and units"):
         training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
-
-
-def test_loss_weight_is_that_of_brain_band_and_background() -> None:
-    """1 in the brain and more where nothing was seen; outside little, and more next to the brain."""
-    mask = torch.zeros(1, 1, 21, 21, 21)
-    mask[0, 0, 10, 10, 9:11] = 1
-    density = torch.full_like(mask, 50.0)
-    density[0, 0, 10, 10, 9] = 0
-    weight = batches.loss_weight({"mask": mask, "density": density}, 0.02)
-    assert float(weight[0, 0, 10, 10, 10]) == pytest.approx(1)
-    assert float(weight[0, 0, 10, 10, 9]) == pytest.approx(1 + batches.UNSEEN_EMPHASIS)
-    band = 0.02 * batches.BAND_FACTOR
-    assert float(weight[0, 0, 10, 10, 10 + batches.BAND_VOXELS]) == pytest.approx(band)
-    assert float(weight[0, 0, 10, 10, 11 + batches.BAND_VOXELS]) == pytest.approx(0.02)
-    wide = 2 * batches.BAND_VOXELS + 1
-    n_band = wide * wide * (wide + 1) - 2
-    expected = 2 + batches.UNSEEN_EMPHASIS + band * n_band + 0.02 * (21**3 - n_band - 2)
-    assert float(weight.sum()) == pytest.approx(expected, rel=1e-5)
-    # never more than the brain's
-    assert float(batches.loss_weight({"mask": mask, "density": density}, 1.0).min()) == 1
-
-
-def test_the_loss_wants_the_median_where_slices_looked_and_the_mean_where_none_did() -> None:
-    """Of a voxel that is 0 in three heads and 1 in one, the least loss is at 0 if seen, at 1/4 if unseen."""
-    truth = torch.tensor([0.0, 0, 0, 1]).reshape(4, 1, 1, 1, 1)
-    mask = torch.ones_like(truth)
-    guesses = torch.linspace(0, 1, 101)
-    for density, best in ((30.0, 0.0), (0.0, 0.25)):
-        batch = {"truth": truth, "mask": mask, "density": torch.full_like(truth, density)}
-        losses = [
-            float(batches.prior_loss(PriorOutput(torch.full_like(truth, float(x)), 9 * mask), batch, mask))
-            for x in guesses
-        ]
-        assert float(guesses[int(np.argmin(losses))]) == pytest.approx(best, abs=0.011)
-
-
-def test_the_loss_asks_for_the_brain_above_all_where_no_slice_looked() -> None:
-    truth = torch.zeros(1, 1, 1, 1, 2)
-    mask = torch.tensor([1.0, 0.0]).reshape(truth.shape)
-
-    def loss(logit: torch.Tensor, density: float) -> float:
-        batch = {"truth": truth, "mask": mask, "density": torch.full_like(truth, density)}
-        return float(batches.prior_loss(PriorOutput(truth, logit), batch, torch.ones_like(truth)))
-
-    right, undecided = 12 * (mask - 0.5), 0 * mask
-    assert loss(right, 0.0) < 0.01 * loss(undecided, 0.0)
-    assert loss(undecided, 0.0) == pytest.approx(batches.BRAIN_FACTOR * np.log(2), rel=1e-5)
-    # one seen voxel, one unseen: the unseen one's answer counts more
-    batch = {"truth": truth, "mask": 0 * mask, "density": torch.tensor([30.0, 0.0]).reshape(truth.shape)}
-    seen_wrong, unseen_wrong = (
-        float(batches.prior_loss(PriorOutput(truth, 12 * (wrong - 0.5)), batch, torch.ones_like(truth)))
-        for wrong in (mask, 1 - mask)
-    )
-    assert unseen_wrong > 5 * seen_wrong
-
-
-def test_errors_by_confidence_are_of_the_brain_alone() -> None:
-    density = torch.tensor([0.0, 0.2, 0.5, 3.0, 3.0]).reshape(1, 1, 1, 1, 5)
-    mask = torch.tensor([1.0, 1, 1, 1, 0]).reshape(density.shape)
-    error = torch.tensor([0.1, 0.2, 0.3, 0.4, 9.0]).reshape(density.shape)
-    batch = {"density": density, "mask": mask, "truth": 0 * mask}
-    found = {name: float(value) for name, value in l1_by_confidence(error, batch).items()}
-    assert found == pytest.approx({"unseen": 0.1, "hardly_seen": 0.2, "thinly_seen": 0.3, "seen": 0.4})
-    assert sum(one.int() for one in confidence_bins(density)).tolist() == torch.ones_like(density).tolist()
-    seen = {**batch, "density": density + 3}
-    assert l1_by_confidence(error, seen).keys() == {"seen"}
-
-
-def test_validation_tells_rim_from_depth_and_seen_from_unseen() -> None:
-    """An error of 0.1 in the rim and of 0.01 within; the upper half is unseen."""
-    mask = torch.zeros(1, 1, 24, 24, 24)
-    mask[:, :, 2:22, 2:22, 2:22] = 1
-    deep = torch.zeros_like(mask)
-    n_rim = int(RIM_MM / ASSUMED_VOXEL_MM)
-    deep[:, :, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim] = 1
-    density = torch.full_like(mask, 3.0)
-    density[..., 12:] = 0
-    truth = torch.rand(mask.shape)
-    made = truth + 0.1 + deep * (0.01 - 0.1)
-    volumes = dict.fromkeys(("prior", "sharp", "coarse", "template"), made)
-    scores = ValidationScores()
-    scores.add(volumes, {"truth": truth, "mask": mask, "density": density}, mask)
-    found = psnr_by_place(scores.squares)
-    assert found["psnr_prior_unseen_rim"] == pytest.approx(20, abs=0.01)
-    assert found["psnr_template_seen_rim"] == pytest.approx(20, abs=0.01)
-    assert found["psnr_prior_unseen_deep"] == pytest.approx(40, abs=0.01)
-    assert not any("thinly" in name for name in found)
-    n = scores.squares[..., 0, 1]
-    assert float(n.sum()) == float(mask.sum())
-    assert float(n[0].sum()) == float(mask[..., 12:].sum())
-
-
-def test_weighted_l1_of_an_empty_mask_without_background_is_zero() -> None:
-    ones = torch.ones(1, 1, 4, 4, 4)
-    assert float(batches.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
-
-
-def test_symmetries_turn_all_volumes_alike() -> None:
-    batch = {name: value[None] for name, value in sample(0, size=8).items()}
-    batch["density"] = batch["truth"].clone()
-    seen = set()
-    for seed in range(200):
-        torch.manual_seed(seed)
-        turned = batches.random_cube_symmetry(batch)
-        assert torch.equal(turned["density"], turned["truth"])
-        seen.add(turned["truth"].numpy().tobytes())
-    assert 40 < len(seen) <= 48
-
-
-def test_symmetries_keep_the_shape() -> None:
-    batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
-    assert {tuple(batches.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
-
-
-def test_validation_scores_are_those_of_an_evaluation() -> None:
-    truth = sample(3, size=24)["truth"]
-    mask = torch.zeros_like(truth)
-    mask[:, 4:20, 5:21, 6:18] = 1
-    torch.manual_seed(0)
-    made = 0.8 * truth + 0.05 * torch.randn(truth.shape)
-    found = sample_scores(made, truth, mask, weight=mask)
-    expected = score(made[0].numpy(), truth[0].numpy(), mask[0].numpy() > 0)
-    assert (found["psnr"], found["ssim"]) == (expected.psnr_db, expected.ssim)
-    assert found["l1"] == pytest.approx(float((made - truth).abs()[mask > 0].mean()), rel=1e-5)
-
-
-def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan() -> None:
-    truth = sample(3)["truth"]
-    assert sample_scores(truth, truth, torch.zeros_like(truth), torch.ones_like(truth)).keys() == {"l1"}
-    found = sample_scores(torch.full_like(truth, torch.nan), truth, torch.ones_like(truth), torch.ones_like(truth))
-    assert all(np.isnan(value) for value in found.values())
-    assert found.keys() == {"l1", "psnr", "ssim"}
 
 
 def test_learning_rate_follows_the_budget_that_ends_first(tmp_path: Path) -> None:
