@@ -51,7 +51,7 @@ def shaken(slices: Slices) -> Slices:
 
 
 def integrated(slices: Slices, points: np.ndarray) -> np.ndarray:
-    """Eq. 6 at points [N, 3]: thickness times the PSF, summed over pixels of a tenth of a sigma."""
+    """Eq. 6 at points [N, 3]: thickness times the PSF, summed over pixels of a fiftieth of a sigma."""
     planes, extent = slices.planes, slices.fields_of_view.extent_mm
     density = np.zeros(len(points))
     for k in range(len(slices)):
@@ -61,7 +61,7 @@ def integrated(slices: Slices, points: np.ndarray) -> np.ndarray:
         value = slices.thickness_mm[k] * through
         for axis in range(2):
             low, high = extent[k, axis]
-            n = int(np.ceil((high - low) / (0.1 * np.sqrt(var[axis]))))
+            n = int(np.ceil((high - low) / (0.02 * np.sqrt(var[axis]))))
             pixel = low + (high - low) * (np.arange(n) + 0.5) / n
             gauss = np.exp(-0.5 * (local[:, axis, None] - pixel) ** 2 / var[axis]) / np.sqrt(2 * np.pi * var[axis])
             value = value * gauss.sum(1) * (high - low) / n

@@ -126,7 +126,7 @@ def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> N
     assert not mask[depth(WORLD) < -0.2].any()
     assert label(mask)[1] == 1
     assert volume_of(mask) == pytest.approx(
-        volume_of(foreground_mask(slices_from_stacks([ellipsoid_stack()]))), rel=0.03
+        volume_of(foreground_mask(slices_from_stacks([ellipsoid_stack()]))), rel=0.05
     )
     # without any filling one of the two ends would be lost
     nothing = found.completed(np.zeros(GRID.shape))
@@ -154,7 +154,7 @@ def test_a_flat_or_lone_brain_has_no_hull() -> None:
 def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
     slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0)])
     found = foreground(slices, GRID)
-    right = WORLD[..., 0] > 0
+    right = (WORLD[..., 0] > 0) & (WORLD[..., 2] < 0)  # one piece with what was seen
     contrary = np.where(found.unseen, right, ~found.brain).astype(np.float32)
     mask = found.completed(contrary)
     np.testing.assert_array_equal(mask, found.brain | (found.unseen & right))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.template_fit import TemplateFit, fit_template
@@ -49,10 +50,11 @@ HEAD = (1.3 * TRUTH - 0.35 * TRUTH**2).astype(np.float32)  # another contrast
 
 
 def case(hidden: np.ndarray) -> dict[str, Any]:
-    """What slices saw of the head: all but the hidden part, and noise."""
-    seen = (~hidden).astype(np.float32)
+    """What slices saw of the head: all but the hidden part, into which the coverage fades, and noise."""
+    seen = gaussian_filter((~hidden).astype(np.float32), 0.75)
+    known = seen > 1e-3
     noise = 0.05 * np.random.default_rng(0).standard_normal(GRID.shape).astype(np.float32)
-    return {"head": (HEAD + noise) * seen, "share": INSIDE * seen, "seen": seen, "grid": GRID}
+    return {"head": (HEAD + noise) * known, "share": (INSIDE & known).astype(np.float32), "seen": seen, "grid": GRID}
 
 
 SLABS = {
@@ -86,17 +88,17 @@ def test_the_hidden_part_is_found(hidden: np.ndarray, fitted: TemplateFit) -> No
     placed = brain(world(GRID))[0]  # the template where it was
     before = float(np.sqrt(((coloured(placed, part) - HEAD[part]) ** 2).mean()))
     after = float(np.sqrt(((fitted.values[part] - HEAD[part]) ** 2).mean()))
-    assert after < 0.6 * before
+    assert after < 0.65 * before
     hidden_brain = dice((fitted.inside > 0.5) & hidden, part)
-    assert hidden_brain > 0.95
+    assert hidden_brain > 0.94
     assert 1 - hidden_brain < 0.6 * (1 - dice((placed > 0) & hidden, part))
 
 
 def test_the_seen_part_fits_better_still(hidden: np.ndarray, fitted: TemplateFit) -> None:
     part = ~hidden & INSIDE
     assert np.corrcoef(fitted.values[part], HEAD[part])[0, 1] > 0.9
-    assert fitted.values[part].mean() == pytest.approx(HEAD[part].mean(), rel=0.05)
-    assert fitted.loss < 0.02
+    assert fitted.values[part].mean() == pytest.approx(HEAD[part].mean(), rel=0.08)
+    assert fitted.loss < 0.003
 
 
 def test_the_background_stays_zero(fitted: TemplateFit) -> None:
@@ -148,4 +150,4 @@ def test_nothing_seen_is_no_failure() -> None:
     found = fit_template(TEMPLATE, TEMPLATE_GRID, **given, n_steps=QUICK)
     assert np.isfinite(found.values).all()
     # the outline is that of the template, in its place
-    assert dice(found.inside > 0.5, brain(world(GRID))[1]) > 0.97
+    assert dice(found.inside > 0.5, brain(world(GRID))[1]) > 0.96
