@@ -35,6 +35,8 @@ TINY_TRAINING = [
     "lightning_configs/prior.yaml",
     "--model.network.channels=[8,8]",
     "--model.network.units=[1,1]",
+    "--model.network.template_spacing_mm=4.0",
+    "--data.template_spacing_mm=4.0",
     "--data.spacing_mm=3.0",
     "--data.patch_size=16",
     "--data.patches_per_subject=4",
