@@ -22,7 +22,7 @@ TINY: dict[str, Any] = {
     "subjects_per_epoch": 2,
     "val_subjects": 2,
     "val_crop": 40,
-    "template_spacing_mm": 4.0,
+    "template_spacing_mm": 3.0,
 }
 
 
@@ -87,7 +87,7 @@ def test_the_template_is_made_of_the_training_subjects_once(atlas: Path) -> None
     template = data.template()
     assert data.template() is template
     assert template.weeks.tolist() == [22, 25, 28, 31]  # of weeks 24 and 30, within two weeks
-    np.testing.assert_allclose(template.grid.spacing_mm, 4.0)
+    np.testing.assert_allclose(template.grid.spacing_mm, 3.0)
     np.testing.assert_allclose(template.grid.center_mm, 0, atol=1e-6)
 
 

@@ -56,7 +56,7 @@ def test_density_is_of_whole_slices_and_the_fit_s_of_masked_pixels(missing: Init
     np.testing.assert_allclose(missing.masked_density, coarse_and_density(slices, grid)[1], atol=1e-6)
     radius = np.linalg.norm(world_of(missing), axis=-1)
     seen = missing.density > 0.9
-    assert missing.share[seen & (radius < 0.8 * RADIUS_MM)].min() > 0.9
+    assert missing.share[seen & (radius < 0.8 * RADIUS_MM)].min() > 0.85
     assert missing.share[seen & (radius > 1.2 * RADIUS_MM)].max() < 0.02
     assert np.percentile(missing.coarse[missing.masked_density > 0.1], 99) == pytest.approx(1, abs=1e-3)
     assert missing.foreground.unseen.any()
@@ -92,7 +92,7 @@ def test_without_a_network_the_prior_volume_is_v_sharp_smoothly_continued(missin
     unseen = made.mask & missing.foreground.unseen
     assert unseen.sum() > 200
     brain = made.mask & ~missing.foreground.unseen
-    assert made.values[unseen].mean() == pytest.approx(made.values[brain].mean(), rel=0.1)
+    assert made.values[unseen].mean() == pytest.approx(made.values[brain].mean(), rel=0.15)
     assert missing.sharp[unseen & (missing.density < 0.01)].mean() < 0.5 * made.values[unseen].mean()
     # the hull closes the gap
     radius = np.linalg.norm(world_of(missing), axis=-1)
