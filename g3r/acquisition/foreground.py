@@ -57,7 +57,7 @@ class Foreground:
         if not self.unseen.any():
             likely = self.unseen
         elif brain_probability is None:
-            likely = _hull(self.brain)
+            likely = _hull(self.brain, self.unseen)
         else:
             likely = brain_probability > BRAIN_PROBABILITY
         brain = self.brain | (self.unseen & likely)
@@ -100,13 +100,15 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     return Foreground(brain, ~seen)
 
 
-def _hull(brain: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The voxels [I, J, K] inside the convex hull of a mask; none where it is flat."""
-    surface = np.argwhere(brain & ~(np.roll(brain, 1, 2) & np.roll(brain, -1, 2)))
+def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the voxels asked for [I, J, K] lie inside the convex hull of a mask; none where it is flat."""
+    within = np.zeros_like(brain)
+    within[:, :, 1:-1] = brain[:, :, :-2] & brain[:, :, 2:]
+    surface = np.argwhere(brain & ~within)
     result = np.zeros(brain.shape, bool)
     low, high = surface.min(0), surface.max(0) + 1
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    index = np.argwhere(~brain[box]) + low
+    index = np.argwhere(asked[box]) + low
     try:
         inside = Delaunay(surface[:: max(1, len(surface) // 4000)]).find_simplex(index) >= 0
     except QhullError:

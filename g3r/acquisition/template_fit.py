@@ -99,28 +99,45 @@ def _fitted(
     pair = torch.from_numpy(np.stack([template, (template > 0).astype(np.float32)]))[None]
     deformation = _Deformation(working, template_grid)
     affine_steps, total = n_steps[0], sum(n_steps)
-    optimiser = torch.optim.Adam([deformation.affine], lr=STEP_MM)
-    rate = 1.0
+    adams = [_Adam(deformation.affine)]
     loss = torch.zeros(())
     colour = torch.zeros(2)
     for step in range(total):
         if step == affine_steps:
-            optimiser.add_param_group({"params": [deformation.control], "lr": STEP_MM})
-        rate = 0.1 ** (step / max(total - 1, 1))
-        for group in optimiser.param_groups:
-            group["lr"] = STEP_MM * rate
+            adams.append(_Adam(deformation.control))
         warped, inside = deformation.sample(pair)
         colour = _colour(warped.detach(), observed, weight * outline)
         difference = _coloured(warped, colour) - observed
         mismatch = (weight * (difference**2 + OUTLINE * (inside - outline) ** 2)).sum() / weight.sum().clamp_min(1e-6)
         loss = mismatch + BENDING * deformation.bending()
-        optimiser.zero_grad()
         loss.backward()
-        optimiser.step()
+        for adam in adams:
+            adam.step(STEP_MM * 0.1 ** (step / max(total - 1, 1)))
+        deformation.control.grad = None
     with torch.no_grad():
         warped, inside = deformation.on(grid).sample(pair)
         values = _coloured(warped, colour).clamp_min(0)
     return TemplateFit(values=values.numpy(), inside=inside.numpy(), loss=float(mismatch.detach()))
+
+
+class _Adam:
+    """Adam (Kingma & Ba, ICLR 2015) for one tensor; that of `torch.optim` loads 70 MB of compilers first."""
+
+    def __init__(self, leaf: Tensor) -> None:
+        self.leaf, self.n_steps = leaf, 0
+        self.mean, self.square = torch.zeros_like(leaf), torch.zeros_like(leaf)
+
+    def step(self, size: float) -> None:
+        """Move against the gradient, which is taken away."""
+        gradient = self.leaf.grad
+        assert gradient is not None
+        self.leaf.grad = None
+        self.n_steps += 1
+        self.mean.lerp_(gradient, 0.1)
+        self.square.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
+        scale = (self.square / (1 - 0.999**self.n_steps)).sqrt_().add_(1e-8)
+        with torch.no_grad():
+            self.leaf.addcdiv_(self.mean, scale, value=-size / (1 - 0.9**self.n_steps))
 
 
 class _Deformation:

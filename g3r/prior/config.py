@@ -76,8 +76,10 @@ class PriorNetworkConfig:
     @property
     def template_grid(self) -> VolumeGrid:
         """The template's grid, centred on the origin of the atlas frame."""
-        far = (np.array(self.template_shape[1:]) - 1) / 2 * self.template_spacing_mm
-        return VolumeGrid.isotropic(-far, far, self.template_spacing_mm)
+        shape, spacing = self.template_shape[1:], self.template_spacing_mm
+        affine = np.diag([spacing, spacing, spacing, 1.0])
+        affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing
+        return VolumeGrid((shape[0], shape[1], shape[2]), affine)
 
     @property
     def stride(self) -> int:

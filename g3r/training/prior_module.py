@@ -197,32 +197,35 @@ class PriorModule(AnnealedModule):
 
 
 def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
-    """Begin with the weights of an exported prior, of a network that may have had fewer inputs.
+    """Begin with the weights of an exported prior, of a network that may have had no template.
 
     Returns:
         The voxel size (mm) that they were trained on.
 
     Raises:
-        InputError: the file cannot be read, or its network has other channels or units.
+        InputError: the file cannot be read, or its network has other channels, units or inputs.
     """
     other = Prior.load(path)
     own = network.state_dict()
+    mine, theirs = network.config, other.network.config
+    # the template comes last in the first layer; without another input those after it would take its place
+    same_inputs = (mine.use_sharp, mine.use_density) == (theirs.use_sharp, theirs.use_density)
     for name, given in other.network.state_dict().items():
         if name == "template":  # the data module's is taken
             continue
         into = own.get(name)
         fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]
+        fits = fits and same_inputs
         if into is None or not fits or into.shape[2:] != given.shape[2:] or into.numel() < given.numel():
             raise InputError(
-                f"model.start_from: {path} has {other.network.config}, this network differs; "
-                "give it the same channels and units"
+                f"model.start_from: {path} has {theirs}, this network differs; "
+                "give it the same channels and units, V_sharp and densities"
             )
         if into.shape != given.shape:
             into.zero_()
             into[:, : given.shape[1]] = given
         else:
             into.copy_(given)
-    mine, theirs = network.config, other.network.config
     if (mine.sharp_base, mine.use_template) != (theirs.sharp_base, theirs.use_template):
         torch.nn.init.zeros_(network.refiner.head.weight)
         torch.nn.init.zeros_(network.refiner.head.bias)  # type: ignore[arg-type]

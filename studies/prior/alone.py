@@ -14,7 +14,7 @@ from g3r.evaluation.compare import compare
 from g3r.planning.presets import PRESETS
 from g3r.prior.model import Prior
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.prior.volumes import prior_volumes, slices_at_true_poses, tiling_difference
+from studies.prior.volumes import prior_volumes, slices_at_true_poses, template_at_truth, tiling_difference
 from studies.runs import figures
 from studies.subjects import SubjectSpec, case_folders, read_case, simulated_case
 from studies.tables import Cell, marked, stacks, table
@@ -60,7 +60,8 @@ def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
     prior = Prior.load(options.ckpt)
     case = read_case(folder)
     n_views = PRESETS[options.preset].prior_views
-    made = prior_volumes(prior.network, slices_at_true_poses(case, n_stacks), prior.voxel_mm, n_views)
+    placed = template_at_truth(prior.template, case.truth, case.truth_mask)
+    made = prior_volumes(prior, slices_at_true_poses(case, n_stacks), placed, n_views)
     scores = {
         name: figures(compare(Volume(data, made.grid.affine, name), case.truth, case.truth_mask).scores)
         for name, data in made.by_name.items()
@@ -74,15 +75,16 @@ def measure_speed(options: argparse.Namespace) -> Row:
     spec = SubjectSpec(name="speed-sta36", volume=SPEED_VOLUME, motion="mild", seed=SPEED_SEED, stretch=0.0)
     case = simulated_case(spec, options.cache)
     slices = slices_at_true_poses(case, len(case.stacks))
-    runs = [prior_volumes(prior.network, slices, prior.voxel_mm) for _ in range(REPEATS)]
-    views = prior_volumes(prior.network, slices, prior.voxel_mm, PRESETS[options.preset].prior_views)
+    placed = template_at_truth(prior.template, case.truth, case.truth_mask)
+    runs = [prior_volumes(prior, slices, placed) for _ in range(REPEATS)]
+    views = prior_volumes(prior, slices, placed, PRESETS[options.preset].prior_views)
     return {
         "shape": list(runs[0].grid.shape),
         "voxel_mm": prior.voxel_mm,
         "seconds": {name: min(run.seconds[name] for run in runs) for name in VOLUMES},
         "all_views_seconds": views.seconds["V_prior"],
         "tile_voxels": TILE_VOXELS,
-        "tiling_difference": tiling_difference(prior.network, runs[-1], TILE_VOXELS),
+        "tiling_difference": tiling_difference(prior, runs[-1], TILE_VOXELS),
     }
 
 

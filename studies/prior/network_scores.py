@@ -68,6 +68,7 @@ def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]
 
     from g3r.cli import export
     from g3r.prior.model import Prior
+    from g3r.training.prior_batches import prior_inputs
 
     exported = run / EXPORTED
     with contextlib.redirect_stdout(io.StringIO()):
@@ -76,7 +77,7 @@ def evaluate(checkpoint: Path, run: Path, volumes: Sequence[Mapping[str, Tensor]
         raise InputError(f"{checkpoint}: cannot be exported; remove {run} and train again")
     network = Prior.load(exported).network
     with torch.inference_mode():
-        priors = [network(one["coarse"], one["density"], one["sharp"]) for one in volumes]
+        priors = [network(prior_inputs(one)).volume for one in volumes]
     content = torch.load(checkpoint, map_location="cpu", weights_only=True)
     return {
         "steps": int(content["global_step"]),
@@ -90,15 +91,17 @@ def inference_seconds(exported: Path) -> float:
     """Wall seconds of one view of a whole brain, the least of a few runs."""
     import numpy as np
 
+    from g3r.prior.inference import PriorMaps
     from g3r.prior.model import Prior
 
     prior = Prior.load(exported)
     rng = np.random.default_rng(0)
-    inputs = [rng.random(SPEED_SHAPE, dtype=np.float32) for _ in range(3)]
+    names = ("coarse", "density", "share", "sharp", "template", "outline")
+    maps = PriorMaps(**{name: rng.random(SPEED_SHAPE, dtype=np.float32) for name in names})
     seconds = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        prior.estimate(*inputs)
+        prior.estimate(maps)
         seconds.append(time.perf_counter() - start)
     return round(min(seconds), 2)
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import yaml
 
 from g3r.bench.record import machine
 from g3r.errors import InputError
+from g3r.prior.config import PriorNetworkConfig
 from g3r.run.machine import available_cores
 from studies.harness import Record, Row, Study, Task, positive
 from studies.prior.figures import draw_networks
@@ -59,9 +60,14 @@ VARIANTS = (
     Variant("no-density", "F does not see M_rho; gated", {"use_density": False}),
     Variant("no-density-no-gate", "neither", {"use_density": False, "use_gate": False}),
     Variant("alpha-0.05", "the paper's gate", {"alpha": 0.05}),
-    Variant("no-sharp", "F does not see V_sharp: Eq. 7 as printed", {"use_sharp": False}),
+    Variant("no-sharp", "F does not see V_sharp", {"use_sharp": False}),
+    Variant("no-template", "no template under the residual", {"use_template": False}),
     Variant("sharp-base", "the residual is added to V_sharp", {"sharp_base": True}),
-    Variant("as-printed", "Eq. 7 as printed, alpha 0.05", {"use_sharp": False, "alpha": 0.05}),
+    Variant(
+        "as-printed",
+        "Eq. 7 as printed, alpha 0.05",
+        {"use_sharp": False, "sharp_base": False, "use_template": False, "alpha": 0.05},
+    ),
     Variant("size-16-32-64", "channels 16, 32, 64", {"channels": [16, 32, 64]}, is_size=True),
     Variant("size-32-64-96", "channels 32, 64, 96", {"channels": [32, 64, 96]}, is_size=True),
     Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
@@ -141,7 +147,7 @@ def finish(record: Record, options: argparse.Namespace) -> None:
 def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
     """The variants, without a size that is the configuration's own."""
     network = config["model"]["init_args"]["network"]
-    model = {"use_gate": True, "use_density": True, "use_sharp": True, "sharp_base": False, **network}
+    model = {**asdict(PriorNetworkConfig()), **network}
     return [
         variant
         for variant in VARIANTS

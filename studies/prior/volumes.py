@@ -5,21 +5,27 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
+from g3r.acquisition.coverage import brain_share, coverage
+from g3r.acquisition.foreground import foreground
+from g3r.acquisition.images import Volume
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
+from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.evaluation.case import SimulatedCase
+from g3r.fitting.prior_volume import KNOWN_DENSITY
 from g3r.geometry import VolumeGrid
-
-if TYPE_CHECKING:
-    from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.inference import PriorMaps, Tiling
+from g3r.prior.model import Prior
+from g3r.prior.subject_template import PlacedTemplate
 
 MARGIN_MM = 5.0
 """Around the slices, as the reconstruction has it."""
@@ -31,13 +37,13 @@ class PriorVolumes:
 
     Attributes:
         by_name: `V_coarse` (Eq. 6), `V_sharp` and `V_prior` (Eq. 7).
-        density: M_rho.
+        maps: what the network was given.
         grid: of all of them.
         seconds: wall time of each step.
     """
 
     by_name: dict[str, NDArray[np.float32]]
-    density: NDArray[np.float32]
+    maps: PriorMaps
     grid: VolumeGrid
     seconds: dict[str, float]
 
@@ -53,40 +59,62 @@ def slices_at_true_poses(case: SimulatedCase, n_stacks: int) -> Slices:
     return slices.with_pose(case.true.pose.take(rows) @ slices.header_pose)
 
 
-def prior_volumes(network: DensityGatedPriorNetwork, slices: Slices, voxel_mm: float, n_views: int = 1) -> PriorVolumes:
+def template_at_truth(template: AtlasTemplate, truth: Volume, mask: NDArray[np.bool_]) -> PlacedTemplate:
+    """The atlas head that is nearest in size, enlarged to the true one's volume and put at its centre.
+
+    Slices at their true poses lie in the frame of the truth, whose axes are those of the atlas.
+
+    Args:
+        template: of a `Prior`.
+        truth: the volume that was sliced.
+        mask: [I, J, K] of it.
+    """
+    here_mm3 = mask.sum() * truth.grid.voxel_volume_mm3
+    there_mm3 = (template.volume > 0).sum((1, 2, 3)) * template.grid.voxel_volume_mm3
+    nearest = int(np.abs(np.log(there_mm3 / here_mm3)).argmin())
+    placed = PlacedTemplate.of(template, float(template.weeks[nearest]), float(np.cbrt(here_mm3 / there_mm3[nearest])))
+    affine = placed.grid.affine.copy()
+    center_mm = placed.grid.world(np.argwhere(placed.volume > 0)).mean(0)
+    affine[:3, 3] += truth.grid.world(np.argwhere(mask)).mean(0) - center_mm
+    return PlacedTemplate(placed.volume, VolumeGrid(placed.grid.shape, affine))
+
+
+def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n_views: int = 1) -> PriorVolumes:
     """V_coarse, M_rho, V_sharp and V_prior of slices in the poses that they have.
 
     Args:
-        network: of a `Prior`.
+        prior: network and voxel size.
         slices: posed.
-        voxel_mm: that the network was trained on.
+        placed: the prior's template at the head; None takes the smooth continuation in its place.
         n_views: see `estimate_prior`.
     """
-    from g3r.prior.inference import estimate_prior
-
     seconds: dict[str, float] = {}
-    grid = grid_around(slices, voxel_mm, margin_mm=MARGIN_MM)
-    coarse, density = _timed(seconds, "V_coarse", lambda: coarse_and_density(slices, grid))
+    grid = grid_around(slices, prior.voxel_mm, margin_mm=MARGIN_MM)
+    coarse, masked = _timed(seconds, "V_coarse", lambda: coarse_and_density(slices, grid))
     sharp = _timed(seconds, "V_sharp", lambda: sharpened_volume(slices, grid, coarse))
-    scale = np.float32(normalisation_scale(coarse, density))
-    given = coarse / scale, density, sharp / scale
-    prior = _timed(seconds, "V_prior", lambda: estimate_prior(network, *given, n_views=n_views))
-    by_name = {"V_coarse": coarse / scale, "V_sharp": sharp / scale, "V_prior": prior}
-    return PriorVolumes(by_name, density, grid, seconds)
+    scale = np.float32(normalisation_scale(coarse, masked))
+    coarse, sharp, density = coarse / scale, sharp / scale, coverage(slices, grid)
+    share = brain_share(masked, density)
+    if placed is None:
+        known = np.clip(density / KNOWN_DENSITY, 0, 1)
+        template, outline = smooth_fill(sharp, known), foreground(slices, grid).completed().astype(np.float32)
+    else:
+        fitted = _timed(seconds, "template", lambda: placed.fitted(sharp, share, density, grid))
+        template, outline = fitted.values, fitted.inside
+    maps = PriorMaps(coarse=coarse, density=density, share=share, sharp=sharp, template=template, outline=outline)
+    values = _timed(seconds, "V_prior", lambda: prior.estimate(maps, n_views=n_views)).volume
+    return PriorVolumes({"V_coarse": coarse, "V_sharp": sharp, "V_prior": values}, maps, grid, seconds)
 
 
-def tiling_difference(network: DensityGatedPriorNetwork, volumes: PriorVolumes, tile_voxels: int) -> float:
+def tiling_difference(prior: Prior, volumes: PriorVolumes, tile_voxels: int) -> float:
     """Largest difference, in the normalised scale, between a prior of one view made whole and in tiles.
 
     Args:
-        network: of a `Prior`.
+        prior: the network.
         volumes: made whole.
         tile_voxels: edge of a tile.
     """
-    from g3r.prior.inference import Tiling, estimate_prior
-
-    given = volumes.by_name["V_coarse"], volumes.density, volumes.by_name["V_sharp"]
-    tiled = estimate_prior(network, *given, tiling=Tiling(0, tile_voxels))
+    tiled = prior.estimate(volumes.maps, tiling=Tiling(0, tile_voxels)).volume
     return float(np.abs(tiled - volumes.by_name["V_prior"]).max())
 
 

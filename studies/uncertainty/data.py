@@ -197,7 +197,7 @@ def _cached_registration(
     case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
     """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
-    path = cache / f"{case.name}-{n_stacks}.motion.pkl"
+    path = cache / f"{case.name}-{n_stacks}.whole-slices.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:
             return pickle.load(stream)

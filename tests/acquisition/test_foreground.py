@@ -1,4 +1,4 @@
-"""The mask of the result: the slices vote, each where it lies."""
+"""The mask of the result: the slices vote, each where it lies; what none has seen is decided by shape."""
 
 from dataclasses import replace
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from g3r.acquisition.foreground import foreground_mask
+from g3r.acquisition.foreground import Foreground, foreground
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
@@ -50,6 +51,25 @@ def ellipsoid_stack(
     return Stack(image=image, mask=mask, affine=affine, thickness_mm=thickness_mm)
 
 
+def without(stack: Stack, low_mm: float, high_mm: float) -> Stack:
+    """The stack with blank slices between two heights along its third axis."""
+    height = (
+        stack.affine[:3, 2]
+        / stack.spacing_mm[2]
+        @ (stack.affine[:3, 3, None] + stack.affine[:3, 2, None] * np.arange(stack.image.shape[2]))
+    )
+    image, mask = stack.image.copy(), stack.mask.copy()
+    missing = (height > low_mm) & (height < high_mm)
+    assert missing.any()
+    image[:, :, missing], mask[:, :, missing] = 0, False
+    return replace(stack, image=image, mask=mask)
+
+
+def foreground_mask(slices: Slices, weight: np.ndarray | None = None) -> np.ndarray:
+    """The brain mask where no network tells of unseen voxels."""
+    return foreground(slices, GRID, weight).completed()
+
+
 def volume_of(mask: np.ndarray) -> float:
     return float(mask.sum() * GRID.voxel_volume_mm3)
 
@@ -58,7 +78,9 @@ def volume_of(mask: np.ndarray) -> float:
 @pytest.mark.parametrize(("thickness_mm", "gap_mm"), [(2.2, 0.0), (4.0, 0.0), (3.0, 2.0)])
 def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: float) -> None:
     stacks = [ellipsoid_stack(t, thickness_mm=thickness_mm, gap_mm=gap_mm) for t in TURNS[:n_stacks]]
-    mask = foreground_mask(slices_from_stacks(stacks), GRID)
+    found = foreground(slices_from_stacks(stacks), GRID)
+    assert not found.unseen[depth(WORLD) > -0.2].any()
+    mask = found.completed()
     # generous (INSIDE_SHARE below one half) by a share of the slice distance, with one stack as with three
     excess_mm = np.cbrt(RADII_MM.prod()) * (np.cbrt(volume_of(mask) / TRUE_MM3) - 1)
     assert 0 < excess_mm < 0.27 * (thickness_mm + gap_mm)
@@ -70,25 +92,99 @@ def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: flo
 
 
 def test_a_left_handed_header_ends_where_a_right_handed_one_does() -> None:
-    right, left = (
-        foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)]), GRID) for flag in (False, True)
-    )
+    right, left = (foreground_mask(slices_from_stacks([ellipsoid_stack(left_handed=flag)])) for flag in (False, True))
     assert volume_of(left) == pytest.approx(volume_of(right), rel=0.02)
     assert (left != right).sum() < 0.05 * right.sum()
 
 
-def test_beyond_the_ends_of_a_stack_there_is_no_brain() -> None:
-    """The slices end inside of the head: the mask ends with them, not half a slice distance later."""
+def test_a_cut_off_end_is_unseen_and_not_background() -> None:
+    """The slices end inside of the head. What lies beyond is not known, and is as it is said to be by its shape."""
     slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)])
-    mask = foreground_mask(slices, GRID)
-    assert mask[(WORLD[..., 2] > 2) & (depth(WORLD) > 0.15)].all()
-    assert not mask[WORLD[..., 2] < -3.5].any()
+    found = foreground(slices, GRID)
+    z = WORLD[..., 2]
+    # it ends three quarters of the slice distance beyond the centre of the last slice
+    assert found.unseen[z < -3.8].all()
+    assert not found.unseen[(z > -2.2) & (np.abs(WORLD).max(-1) < 38)].any()
+    assert found.brain[(z > 2) & (depth(WORLD) > 0.15)].all()
+    assert not (found.brain & found.unseen).any()
+    # nobody says more: the mask ends with the slices
+    assert not found.completed()[z < -3.8].any()
+    # a network does: the whole head
+    likely = (depth(WORLD) > 0).astype(np.float32)
+    mask = found.completed(likely)
+    assert mask[depth(WORLD) > 0.05].all()
+    assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.12)
+
+
+def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> None:
+    missing = slices_from_stacks([without(ellipsoid_stack(), -6.5, 6.5)])
+    found = foreground(missing, GRID)
+    slab = np.abs(WORLD[..., 2]) < 4
+    assert found.unseen[slab].all()
+    mask = found.completed()
+    assert mask[slab & (depth(WORLD) > 0.06)].all()
+    assert not mask[depth(WORLD) < -0.2].any()
+    assert label(mask)[1] == 1
+    assert volume_of(mask) == pytest.approx(
+        volume_of(foreground_mask(slices_from_stacks([ellipsoid_stack()]))), rel=0.05
+    )
+    # without any filling one of the two ends would be lost
+    nothing = found.completed(np.zeros(GRID.shape))
+    assert volume_of(nothing) < 0.55 * volume_of(mask)
+
+
+def test_the_hull_reaches_the_borders_of_the_grid() -> None:
+    brain = np.zeros((12, 5, 6), bool)
+    brain[1:3], brain[8:11] = True, True
+    unseen = np.zeros_like(brain)
+    unseen[4:7], unseen[11] = True, True
+    mask = Foreground(
+        brain | (np.arange(12) == 3)[:, None, None] | (np.arange(12) == 7)[:, None, None], unseen
+    ).completed()
+    assert mask[1:11].all()
+    assert not mask[[0, 11]].any()
+
+
+def test_a_flat_or_lone_brain_has_no_hull() -> None:
+    brain, unseen = np.zeros((6, 6, 6), bool), np.ones((6, 6, 6), bool)
+    brain[3, 1:5, 1:5], unseen[3] = True, False
+    np.testing.assert_array_equal(Foreground(brain, unseen).completed(), brain)
+
+
+def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
+    slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0)])
+    found = foreground(slices, GRID)
+    right = (WORLD[..., 0] > 0) & (WORLD[..., 2] < 0)  # one piece with what was seen
+    contrary = np.where(found.unseen, right, ~found.brain).astype(np.float32)
+    mask = found.completed(contrary)
+    np.testing.assert_array_equal(mask, found.brain | (found.unseen & right))
+    # undecided is not brain
+    np.testing.assert_array_equal(found.completed(np.full(GRID.shape, 0.5)), found.completed(0 * contrary))
+
+
+def test_a_factor_common_to_all_weights_says_nothing() -> None:
+    slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0), ellipsoid_stack(TURNS[1], low_mm=-10.0)])
+    one = foreground(slices, GRID)
+    for factor in (0.5, 1e-3):
+        other = foreground(slices, GRID, np.full(len(slices), factor))
+        assert (one.brain != other.brain).mean() < 1e-4
+        assert (one.unseen != other.unseen).mean() < 1e-4
+
+
+def test_slices_without_weight_have_seen_nothing() -> None:
+    slices = slices_from_stacks([ellipsoid_stack()])
+    weight = np.where(np.abs(slices.planes.center_mm[:, 2]) < 6.5, 0.0, 1.0)
+    assert (weight == 0).sum() >= 4
+    blank = foreground(slices_from_stacks([without(ellipsoid_stack(), -6.5, 6.5)]), GRID)
+    found = foreground(slices, GRID, weight)
+    np.testing.assert_array_equal(found.unseen, blank.unseen)
+    np.testing.assert_array_equal(found.brain, blank.brain)
 
 
 def test_a_slice_without_weight_has_no_vote() -> None:
     """A slice that lies wrongly would put brain beside the head and a hole into it."""
     slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
-    good = foreground_mask(slices, GRID)
+    good = foreground_mask(slices)
     away = np.abs(slices.planes.center_mm @ TURNS[0][:, 2]) < 8
     away &= slices.stack_id == 0
     assert 3 <= away.sum() <= 6
@@ -96,13 +192,11 @@ def test_a_slice_without_weight_has_no_vote() -> None:
     center[away] += [0, 0, 24.0]
     astray = slices.with_pose(RigidPose(slices.planes.rotation, center))
     weight = np.where(away, 0.0, 1.0)
-    trusting, careful = foreground_mask(astray, GRID), foreground_mask(astray, GRID, weight)
+    trusting, careful = foreground_mask(astray), foreground_mask(astray, weight)
     assert (careful != good).sum() < 0.5 * (trusting != good).sum()
     # where they lie or what they show makes no difference
     elsewhere = slices.with_pose(RigidPose(slices.planes.rotation, center + away[:, None] * 5.0))
-    np.testing.assert_array_equal(foreground_mask(elsewhere, GRID, weight), careful)
-    half = foreground_mask(slices, GRID, np.full(len(slices), 0.5))
-    assert (half != good).mean() < 0.002  # a common factor says nothing
+    np.testing.assert_array_equal(foreground_mask(elsewhere, weight), careful)
 
 
 def test_what_one_stack_alone_has_seen_stays_inside() -> None:
@@ -110,7 +204,9 @@ def test_what_one_stack_alone_has_seen_stays_inside() -> None:
     whole = ellipsoid_stack(TURNS[0])
     partly = [ellipsoid_stack(t, low_mm=0.0) for t in TURNS[1:]]
     slices = slices_from_stacks([whole, *partly])
-    mask = foreground_mask(slices, GRID)
+    found = foreground(slices, GRID)
+    assert not found.unseen[depth(WORLD) > -0.2].any()
+    mask = found.completed()
     uncovered = (WORLD @ TURNS[1][:, 2] < -8) & (WORLD @ TURNS[2][:, 2] < -8) & (depth(WORLD) > 0.1)
     assert uncovered.sum() > 500
     assert mask[uncovered].all()
@@ -122,27 +218,26 @@ def test_what_most_stacks_call_outside_is_outside() -> None:
     spilt = stacks[0].mask | (np.arange(stacks[0].mask.shape[0]) < 22)[:, None, None]
     wrong = replace(stacks[0], mask=spilt)
     many = [wrong, *stacks[1:], *stacks[1:]]
-    mask = foreground_mask(slices_from_stacks(many), GRID)
-    # the others' surroundings reach a few mm beyond their masks; there they outvote the one
-    near = (depth(WORLD) < -0.12) & (depth(WORLD) > -0.2)
-    assert mask[near].mean() < 0.1
+    mask = foreground_mask(slices_from_stacks(many))
+    # the others have looked at all of it, however far it is from their masks
+    assert mask[depth(WORLD) < -0.12].mean() < 0.02
 
 
 def test_holes_are_filled_and_only_the_largest_piece_stays() -> None:
     whole, stack = slices_from_stacks([ellipsoid_stack()]), ellipsoid_stack(hole=True)
     crumb = stack.mask.copy()
     crumb[2:8, 2:8, 4:7] = True
-    mask = foreground_mask(slices_from_stacks([replace(stack, mask=crumb)]), GRID)
+    mask = foreground_mask(slices_from_stacks([replace(stack, mask=crumb)]))
     assert mask[np.linalg.norm(WORLD, axis=-1) < 5].all()
     assert label(mask)[1] == 1
-    assert volume_of(mask) == pytest.approx(volume_of(foreground_mask(whole, GRID)), rel=0.01)
+    assert volume_of(mask) == pytest.approx(volume_of(foreground_mask(whole)), rel=0.01)
 
 
 def test_the_mask_moves_with_the_slices() -> None:
     slices = slices_from_stacks([ellipsoid_stack(t) for t in TURNS])
     shift = np.array([3.0, -4.5, 1.5])  # whole voxels
     moved = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + shift))
-    here, there = foreground_mask(slices, GRID), foreground_mask(moved, GRID)
+    here, there = foreground_mask(slices), foreground_mask(moved)
     np.testing.assert_array_equal(np.roll(here, (2, -3, 1), (0, 1, 2)), there)
 
 
@@ -151,15 +246,15 @@ def test_one_or_two_slices_are_enough(n_slices: int) -> None:
     slices = slices_from_stacks([ellipsoid_stack()])
     middle = int(np.argmin(np.abs(slices.planes.center_mm[:, 2])))
     few = slices.take(np.arange(middle, middle + n_slices))
-    mask = foreground_mask(few, GRID)
+    mask = foreground_mask(few)
     thickness_mm = volume_of(mask) / (np.pi * RADII_MM[0] * RADII_MM[1])
-    assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 6  # beyond a lone slice nobody is asked
+    assert 0.8 * 3 * n_slices < thickness_mm < 3 * n_slices + 3  # beyond a lone slice nobody is asked
 
 
 def test_the_foreground_of_nothing_is_refused() -> None:
     slices = slices_from_stacks([ellipsoid_stack()])
     far = VolumeGrid.isotropic([500] * 3, [520] * 3, 2.0)
     with pytest.raises(InputError, match="no voxel is covered"):
-        foreground_mask(slices, far)
+        foreground(slices, far)
     with pytest.raises(InputError, match="no voxel is covered"):
-        foreground_mask(slices, GRID, np.zeros(len(slices)))
+        foreground(slices, GRID, np.zeros(len(slices)))

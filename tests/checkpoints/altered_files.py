@@ -29,7 +29,10 @@ def small_prior() -> Prior:
     config = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, alpha=0.1, beta=0.9, use_sharp=False)
     network = DensityGatedPriorNetwork(config).eval()
     torch.nn.init.normal_(network.refiner.head.weight)
-    return Prior(network=network, voxel_mm=0.8, training_data="two phantoms", validation={"val/psnr": 30.0})
+    network.set_template(torch.rand(2, 4, 5, 3))
+    return Prior(
+        network=network, voxel_mm=0.8, weeks=(25.0, 31.0), training_data="two phantoms", validation={"val/psnr": 30.0}
+    )
 
 
 def small_pose() -> PoseModel:

@@ -17,6 +17,7 @@ from g3r.checkpoints.weights_file import SHIPPED_POSE, SHIPPED_PRIOR, read_weigh
 from g3r.errors import InputError
 from g3r.pose_network.model import PoseModel
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.inputs import PriorInputs
 from g3r.prior.model import Prior
 from tests.checkpoints.altered_files import Content, content_of, small_pose, small_prior, write_content
 
@@ -61,11 +62,24 @@ def test_the_prior_s_file_says_all_that_has_to_be_known(saved: dict[str, Path]) 
     assert (prior.network.config.alpha, prior.network.config.beta) == (0.1, 0.9)
     assert (said["network_arguments"]["alpha"], said["network_arguments"]["beta"]) == (0.1, 0.9)
     assert prior.voxel_mm == said["voxel_mm"] == 0.8
-    assert said["density_convention"] == "dimensionless-thickness-v1"
+    assert said["density_convention"] == "dimensionless-whole-slice-v2"
     assert said["intensity_convention"] == "p99-coarse-v1"
     assert said["sharp_convention"] == "cg6-smoothness0.1-v1"
-    inputs = torch.rand(2, 1, 1, 12, 10, 9)
-    torch.testing.assert_close(prior.network(*inputs), small_prior().network(*inputs), rtol=0, atol=0)
+    names = ("coarse", "density", "template", "outline")
+    given = PriorInputs(**dict(zip(names, torch.rand(4, 1, 1, 12, 10, 9), strict=True)))
+    for one, other in zip(prior.network(given), small_prior().network(given), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_the_prior_s_file_holds_its_template(saved: dict[str, Path]) -> None:
+    prior, before = Prior.load(saved["prior"]), small_prior()
+    assert prior.weeks == (25.0, 31.0)
+    assert prior.template.weeks.tolist() == [25, 31]
+    np.testing.assert_array_equal(prior.template.volume, before.template.volume)
+    np.testing.assert_allclose(prior.template.affine @ [1.5, 2, 1, 1], [0, 0, 0, 1], atol=1e-9)
+    stored = content_of(saved["prior"])["weights"]["template"]
+    assert stored.dtype == torch.float16
+    assert prior.network.template.dtype == torch.float32
 
 
 def test_the_pose_network_s_file_holds_its_template(saved: dict[str, Path]) -> None:
@@ -117,6 +131,11 @@ REFUSALS: dict[str, tuple[str, Callable[[Content], object], str]] = {
     "no kind": ("prior", without("format"), "not a prior checkpoint"),
     "an earlier format version": ("prior", change(format_version=1), "format version is 1, this g3r reads 2"),
     "a later format version": ("pose", change(format_version=7), "format version is 7"),
+    "density of the masked pixels": (
+        "prior",
+        change(density_convention="dimensionless-thickness-v1"),
+        "density convention is 'dimensionless-thickness-v1'",
+    ),
     "density per millimetre": ("prior", change(density_convention="per-mm"), "density convention is 'per-mm'"),
     "no density convention": ("prior", without("density_convention"), "density convention is None"),
     "another intensity": ("prior", change(intensity_convention="max"), "intensity convention is 'max'"),
@@ -132,6 +151,9 @@ REFUSALS: dict[str, tuple[str, Callable[[Content], object], str]] = {
     "no number": ("prior", change(voxel_mm="thick"), "could not convert"),
     "no ages": ("pose", without("weeks"), "'weeks' is missing"),
     "too few ages": ("pose", change(weeks=[25.0]), "1 ages for a template of 2"),
+    "no ages of the prior's template": ("prior", without("weeks"), "'weeks' is missing"),
+    "too few ages of it": ("prior", change(weeks=[25.0]), "1 ages for a template of 2"),
+    "another template of the prior": ("prior", arguments(template_shape=[2, 4, 5, 4]), UNFIT),
     "ages that are a text": ("pose", change(weeks="25"), "weeks is '25', expected a list"),
     "an unknown argument": ("prior", arguments(depth=3), "network argument depth is unknown"),
     "a missing argument": (
@@ -194,8 +216,11 @@ def test_a_file_of_torch_save_is_refused_with_the_way_on(model: TrainedModel, tm
 
 
 def test_a_prior_of_absurd_voxels_is_not_made() -> None:
+    network = small_prior().network
     with pytest.raises(ValueError, match=r"voxel size is 1000\.0 mm"):
-        Prior(network=small_prior().network, voxel_mm=1e3, training_data="")
+        Prior(network=network, voxel_mm=1e3, weeks=(25.0, 31.0), training_data="")
+    with pytest.raises(ValueError, match="3 ages for a template of 2"):
+        Prior(network=network, voxel_mm=0.8, weeks=(25.0, 28.0, 31.0), training_data="")
 
 
 def test_a_network_is_built_only_if_the_file_can_fill_it(

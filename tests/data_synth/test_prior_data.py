@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -21,6 +22,7 @@ TINY: dict[str, Any] = {
     "subjects_per_epoch": 2,
     "val_subjects": 2,
     "val_crop": 40,
+    "template_spacing_mm": 3.0,
 }
 
 
@@ -78,6 +80,15 @@ def test_training_on_a_folder(atlas: Path) -> None:
     mixed.setup()
     assert mixed.train_set is not None
     assert len(mixed.train_set.subjects) == 4
+
+
+def test_the_template_is_made_of_the_training_subjects_once(atlas: Path) -> None:
+    data = StackSynthesisDataModule(source=str(atlas), include=["a/*"], val_include=["b/*"], **TINY)
+    template = data.template()
+    assert data.template() is template
+    assert template.weeks.tolist() == [22, 25, 28, 31]  # of weeks 24 and 30, within two weeks
+    np.testing.assert_allclose(template.grid.spacing_mm, 3.0)
+    np.testing.assert_allclose(template.grid.center_mm, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Training subjects of the prior network: values, and that every one can be made again."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,30 @@ pytest.importorskip("torchio")
 
 from data_synth.atlas import cropped, find_subjects, load_subject
 from data_synth.heads import PhantomSubject
-from data_synth.prior_samples import IMAGE_KEYS, SyntheticSubjects, patch_corners, synthesise
+from data_synth.prior_samples import (
+    IMAGE_KEYS,
+    OTHER_AGE_WEEKS,
+    SyntheticSubjects,
+    TemplateHead,
+    patch_corners,
+    synthesise,
+)
+from data_synth.template import atlas_templates
+from g3r.acquisition.atlas_template import AtlasTemplate
 
 SPACING_MM = 2.0
+SUBJECTS = [PhantomSubject("young", 23.0, 1), PhantomSubject("old", 33.0, 2)]
+
+
+@functools.cache
+def template() -> AtlasTemplate:
+    """Heads of 22, 25, 31 and 34 weeks."""
+    return atlas_templates(
+        [PhantomSubject(f"{week}w", week, 10 + k) for k, week in enumerate((22.0, 25.0, 31.0, 34.0))], 2.5
+    )
 
 
 def make_dataset(**options: Any) -> SyntheticSubjects:
-    subjects = [PhantomSubject("young", 23.0, 1), PhantomSubject("old", 33.0, 2)]
     defaults: dict[str, Any] = {
         "spacing_mm": SPACING_MM,
         "length": 4,
@@ -25,7 +43,7 @@ def make_dataset(**options: Any) -> SyntheticSubjects:
         "patch_size": 30,
         "artefact_share": 0.1,
     }
-    return SyntheticSubjects(subjects, **{**defaults, **options})
+    return SyntheticSubjects(SUBJECTS, template(), **{**defaults, **options})
 
 
 def test_a_sample_is_a_function_of_seed_epoch_and_index() -> None:
@@ -69,7 +87,48 @@ def test_coarse_and_truth_share_grid_and_scale() -> None:
         assert seen.sum() > 0.3 * one.mask.sum()
         assert 0.85 < one.coarse[seen].mean() / one.truth[seen].mean() < 1.1
         assert np.corrcoef(one.coarse[seen], one.truth[seen])[0, 1] > 0.3
-        assert abs(np.percentile(one.coarse[one.density > 0.1], 99) - 1) < 1e-3
+        assert abs(np.percentile(one.coarse[one.density * one.share > 0.1], 99) - 1) < 0.01
+
+
+def test_share_and_outline_are_shares_and_the_template_is_in_the_head_s_intensities() -> None:
+    dataset = make_dataset(in_order=True)
+    for index in range(2):
+        one = dataset.sample(0, index)
+        for share in (one.share, one.outline):
+            assert share.dtype == np.float32
+            assert 0 <= share.min() <= share.max() <= 1 + 1e-6
+        seen = one.density > 0.8
+        # slices look at background too, and say so
+        assert (seen & ~one.mask).sum() > 0.2 * one.mask.sum()
+        assert one.share[seen & one.mask].mean() > 0.85
+        assert one.share[seen & ~one.mask].mean() < 0.3
+        assert 2 * (one.mask & (one.outline > 0.5)).sum() / (one.mask.sum() + (one.outline > 0.5).sum()) > 0.85
+        inside = one.mask & (one.outline > 0.9)
+        assert one.template[inside].mean() == pytest.approx(one.truth[inside].mean(), rel=0.15)
+        assert (one.template[one.outline == 0] == 0).all()
+
+
+def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -> None:
+    """A template of the same age was made of the subject itself, or of its neighbours."""
+    rng, near, far = np.random.default_rng(0), *OTHER_AGE_WEEKS
+
+    def ages(weeks: float, in_order: bool) -> set[float]:
+        dataset, given = make_dataset(in_order=in_order), template()
+        heads = [dataset._template_head(weeks, rng) for _ in range(20)]
+        return {
+            float(week)
+            for week, volume in zip(given.weeks, given.volume, strict=True)
+            if any(np.array_equal(head.volume, volume) for head in heads)
+        }
+
+    for weeks in (23.0, 28.5, 33.0):
+        found = ages(weeks, in_order=False)
+        assert found
+        assert all(near <= abs(one - weeks) <= far for one in found)
+    assert ages(23.0, in_order=True) <= {22.0, 25.0}
+    assert ages(33.0, in_order=True) == {34.0}
+    # where no other age is near enough, the nearest has to do
+    assert ages(50.0, in_order=False) == {float(template().weeks[-1])}
 
 
 def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
@@ -89,7 +148,7 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
     again._synthesise = None  # type: ignore[method-assign,assignment]  # would fail if anything had to be made
     for epoch in (0, 3):  # every epoch is the first one again
         kept = again.sample(epoch, 1)
-        for key in ("coarse", "density", "sharp", "truth"):
+        for key in ("coarse", "density", "share", "sharp", "template", "outline", "truth"):
             np.testing.assert_allclose(getattr(kept, key), getattr(fresh, key), rtol=1e-3, atol=1e-6)
         np.testing.assert_array_equal(kept.mask, fresh.mask)
         assert (kept.name, kept.n_stacks, kept.residual) == (fresh.name, fresh.n_stacks, fresh.residual)
@@ -107,7 +166,8 @@ def test_kept_subjects_are_the_same(tmp_path: Path) -> None:
 def test_a_real_atlas(shared_data: Path) -> None:
     subject = find_subjects(shared_data / "atlas", include=["crl-sta/sta2?"])[0]
     volume = cropped(load_subject(subject, SPACING_MM), 4)
-    one = synthesise(volume, np.random.default_rng(0))
+    head = TemplateHead(template().volume[0], template().grid)
+    one = synthesise(volume, head, np.random.default_rng(0))
     assert one.truth.shape == volume.data.shape
     assert np.isfinite(one.coarse).all()
     assert 20 < volume.mask.sum() * SPACING_MM**3 / 1000 < 600

@@ -27,6 +27,7 @@ WHOLE = {
     "coarse.nii.gz",
     "density.nii.gz",
     "uncertainty.nii.gz",
+    "unseen.nii.gz",
     "gaussians.npz",
     "slices.tsv",
     "run.json",

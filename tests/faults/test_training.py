@@ -27,7 +27,7 @@ from g3r.prior.config import PriorNetworkConfig
 from g3r.training.annealed_module import WholeCheckpoints
 from g3r.training.prior_module import PriorModule
 
-NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2)
+NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, template_spacing_mm=3.0)
 # ten patches an epoch in batches of three: one is left over each time
 DATA: dict[str, Any] = {
     "spacing_mm": 2.0,
@@ -37,6 +37,7 @@ DATA: dict[str, Any] = {
     "subjects_per_epoch": 5,
     "val_subjects": 1,
     "val_crop": 24,
+    "template_spacing_mm": 3.0,
     "seed": 3,
 }
 N_EPOCHS = 4
@@ -133,12 +134,13 @@ CONFIG = """
 seed_everything: 5
 model:
   class_path: g3r.training.prior_module.PriorModule
-  init_args: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
+  init_args:
+    {network: {channels: [4, 4], units: [1, 1], tail_channels: 2, template_spacing_mm: 3.0}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
     {spacing_mm: 3.0, patch_size: 24, patches_per_subject: 2, batch_size: 3, subjects_per_epoch: 5,
-     val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1}
+     val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1, template_spacing_mm: 3.0}
 trainer:
   accelerator: cpu
   max_epochs: 5

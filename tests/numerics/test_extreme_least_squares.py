@@ -14,6 +14,7 @@ from g3r.gaussians.amplitudes import AmplitudeSystem
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.gate import DensityGate, confidence_from_density
+from g3r.prior.inputs import PriorInputs
 from tests.gradients import gradient_of
 from tests.numerics.oracles import naive_amplitudes, naive_render
 from tests.numerics.scenes import head_scene, single, slender_scenes
@@ -159,15 +160,16 @@ def test_confidence_keeps_its_digits_where_the_naive_form_has_none() -> None:
 @pytest.mark.parametrize("density", [0.0, 1e-30, 1.0, 1e6])
 def test_the_prior_network_at_every_density(density: float, tally: Tally) -> None:
     torch.manual_seed(0)
-    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False)
+    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False, use_template=False)
     network = DensityGatedPriorNetwork(config)
     torch.nn.init.normal_(network.refiner.head.weight)
     coarse = torch.rand(1, 1, 8, 8, 8)
     m = torch.full_like(coarse, density).requires_grad_()
     with tally.case():
-        value = network(coarse, m)
-        value.sum().backward()
-        assert torch.isfinite(value).all()
+        found = network(PriorInputs(coarse=coarse, density=m))
+        (found.volume + found.brain_logit).sum().backward()
+        assert torch.isfinite(found.volume).all()
+        assert torch.isfinite(found.brain_logit).all()
         assert torch.isfinite(gradient_of(m)).all()
         assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
 

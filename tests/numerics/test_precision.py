@@ -12,6 +12,7 @@ from g3r.pose_network.geometry import moved_points, nearest_rotation, rotation_f
 from g3r.pose_network.network import PoseNetwork
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
+from g3r.prior.inputs import PriorInputs
 from tests.gradients import gradient_of
 from tests.numerics.scenes import head_scene, single
 from tests.tally import Tally
@@ -97,17 +98,18 @@ def moved_points_plainly(rotation: torch.Tensor, shift: torch.Tensor, points: to
 def test_the_prior_network_may_run_in_bfloat16_and_its_volume_stays_float32(density: float, tally: Tally) -> None:
     """Rounding reaches the residual alone; where slices are dense the gate passes a twentieth of it."""
     torch.manual_seed(0)
-    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False)
+    config = PriorNetworkConfig(channels=(4, 8), units=(1, 1), tail_channels=2, use_sharp=False, use_template=False)
     network = DensityGatedPriorNetwork(config).eval()
     torch.nn.init.normal_(network.refiner.head.weight, std=0.1)
     coarse = torch.rand(1, 1, 16, 16, 16)
     m = torch.full_like(coarse, density)
     with torch.no_grad(), tally.case():
-        plain = network(coarse, m)
+        given = PriorInputs(coarse=coarse, density=m)
+        plain = network(given).volume
         with torch.autocast("cpu", torch.bfloat16):
-            mixed = network(coarse, m)
+            mixed = network(given).volume
         assert mixed.dtype == torch.float32
-        residual = network.refiner(coarse, m).abs().max()
+        residual = network.refiner(given)[0].abs().max()
         gate = float(network.gate(torch.tensor(density)))
         assert (mixed - plain).abs().max() <= 0.05 * gate * residual
         assert np.isfinite(mixed.numpy()).all()

@@ -77,6 +77,40 @@ def test_a_row_per_volume_and_a_bar_for_maps(tmp_path: Path) -> None:
         assert np.asarray(three.convert("HSV"))[..., 1].max() > 200, "the density row is in colour"
 
 
+def outline_of(path: Path) -> np.ndarray:
+    """The pixels of a picture that have the colour of the outline."""
+    red, green, blue = np.moveaxis(np.asarray(Image.open(path).convert("RGB")).astype(int), -1, 0)
+    return (blue > 120) & (blue > red + 60) & (green > red + 40)
+
+
+def test_a_marked_part_is_outlined_where_it_lies(tmp_path: Path) -> None:
+    """Around the right, anterior, superior part: its sides are those of the volume."""
+    data = ball(radius=13) * 100
+    save_sections(tmp_path / "plain.png", {"volume": data}, AFFINE)
+    assert not outline_of(tmp_path / "plain.png").any()
+    save_sections(tmp_path / "a.png", {"volume": data}, AFFINE, marked=ball((28, 34, 20), 12))
+    found = outline_of(tmp_path / "a.png")
+    assert 100 < found.sum() < 0.05 * found.size
+    for panel in columns(found.astype(float) * 255):
+        assert panel.max() > 200  # in each of the three sections
+        assert side(panel) == (True, True)
+    # turned with the volume, whatever the header
+    save_sections(
+        tmp_path / "b.png",
+        {"volume": data.transpose(2, 0, 1)},
+        AFFINE[:, [2, 0, 1, 3]],
+        marked=ball((28, 34, 20), 12).transpose(2, 0, 1),
+    )
+    np.testing.assert_array_equal(outline_of(tmp_path / "b.png"), found)
+    # in every row, and none where nothing or everything is marked
+    save_sections(tmp_path / "two.png", {"volume": data, "density": data}, AFFINE, marked=ball((28, 34, 20), 12))
+    upper, lower = np.array_split(outline_of(tmp_path / "two.png"), 2)
+    assert min(upper.sum(), lower.sum()) > 100
+    for nothing in (np.zeros(SHAPE), np.ones(SHAPE)):
+        save_sections(tmp_path / "none.png", {"volume": data}, AFFINE, marked=nothing)
+        assert not outline_of(tmp_path / "none.png").any()
+
+
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e-30, 1e30, np.nan])
 def test_constant_volumes_are_drawn(tmp_path: Path, value: float) -> None:
     save_sections(tmp_path / "a.png", {"volume": np.full(SHAPE, value)}, AFFINE, np.zeros(SHAPE))

@@ -18,12 +18,14 @@ from g3r.bench.command_run import CommandRun, run_infer
 from g3r.cli import infer
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.prior_volume import prior_volume
 from g3r.planning.memory_estimate import estimate_memory
 from g3r.planning.memory_limit import MIN_PROJECTION_BYTES, PLANNED_HALO_VOXELS, plan_memory
 from g3r.planning.memory_size import gigabytes, parsed_size
 from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
+from g3r.prior.inference import Tiling
 
 DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
 PROCESS = 500_000_000
@@ -246,10 +248,11 @@ def test_a_time_budget_keeps_what_was_planned(slices: Slices) -> None:
     )
     ones = np.ones(len(slices))
     start = InitialVolumes.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
+    prior = prior_volume(start, ones, None, None, n_views=1, tiling=Tiling())
     budget = TimeBudget.of(planned, 30.0)
     budget.for_registration()
     budget.for_prior(0.1)
-    budget.for_fit_to_prior(start, start.sharp, 0.1, 1000)
+    budget.for_fit_to_prior(prior, 0.1, 1000)
     settings = budget.settings
     assert settings.prior_stage.projection_bytes == settings.slice_stage.projection_bytes == 30 * MB
     assert (settings.prior_whole_voxels, settings.prior_tile_voxels) == (0, 32)

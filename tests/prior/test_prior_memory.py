@@ -10,13 +10,19 @@ from torch import nn
 
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.inference import _tiles
+from g3r.prior.inputs import PriorInputs
 from g3r.prior.network import SLAB_ROWS, ResidualRefiner
+
+
+def noise(*shape: int) -> PriorInputs:
+    v_coarse, m_rho = torch.rand(2, 1, 1, *shape)
+    return PriorInputs(coarse=v_coarse, density=m_rho)
 
 
 @pytest.fixture(scope="module")
 def refiner() -> ResidualRefiner:
     torch.manual_seed(0)
-    config = PriorNetworkConfig(channels=(8, 16), units=(1, 1), tail_channels=4, use_sharp=False)
+    config = PriorNetworkConfig(channels=(8, 16), units=(1, 1), tail_channels=4, use_sharp=False, use_template=False)
     refiner = ResidualRefiner(config).eval()
     nn.init.normal_(refiner.head.weight, std=0.1)
     return refiner
@@ -25,14 +31,15 @@ def refiner() -> ResidualRefiner:
 @pytest.mark.parametrize("extra", [-1, 2, 3, SLAB_ROWS, SLAB_ROWS + 5, 2 * SLAB_ROWS + 1])
 def test_slabs_give_what_the_whole_gives(refiner: ResidualRefiner, extra: int) -> None:
     rows = 2 * (SLAB_ROWS + extra)
-    v_coarse, m_rho = torch.rand(2, 1, 1, rows, 12, 20)
-    whole = refiner(v_coarse, m_rho)  # a gradient is wanted: all at once
-    assert whole.requires_grad
+    given = noise(rows, 12, 20)
+    whole = refiner(given)  # a gradient is wanted: all at once
     with torch.inference_mode():
-        slabs = refiner(v_coarse, m_rho)
-    assert slabs.shape == v_coarse.shape
-    assert whole.std() > 0.01
-    assert (slabs - whole).abs().max() < 1e-5
+        slabs = refiner(given)
+    for one, two in zip(slabs, whole, strict=True):
+        assert two.requires_grad
+        assert one.shape == given.coarse.shape
+        assert two.std() > 0.01
+        assert (one - two).abs().max() < 1e-5
 
 
 def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,9 +51,8 @@ def test_slabs_all_have_one_shape(refiner: ResidualRefiner, monkeypatch: pytest.
         return layers(features, inputs)
 
     monkeypatch.setattr(refiner, "_at_full_resolution", watched)
-    volume = torch.rand(1, 1, 2 * (3 * SLAB_ROWS + 7), 8, 8)
     with torch.inference_mode():
-        refiner(volume, volume)
+        refiner(noise(2 * (3 * SLAB_ROWS + 7), 8, 8))
     ((features, _),) = seen
     assert features[2] == SLAB_ROWS + 2
 
@@ -58,9 +64,9 @@ def test_gradients_are_those_of_a_network_that_keeps_everything(refiner: Residua
         if isinstance(module, nn.LeakyReLU):
             assert module.inplace
             module.inplace = False
-    v_coarse, m_rho = torch.rand(2, 1, 1, 12, 8, 8)
+    given = noise(12, 8, 8)
     found, expected = (
-        torch.autograd.grad(network(v_coarse, m_rho).square().sum(), list(network.parameters()))
+        torch.autograd.grad(torch.cat(network(given)).square().sum(), list(network.parameters()))
         for network in (refiner, other)
     )
     for one, two in zip(found, expected, strict=True):

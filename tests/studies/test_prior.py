@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.metrics import score
+from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
 from g3r.planning.presets import PRESETS, changed
 from g3r.prior.config import PriorNetworkConfig
+from g3r.prior.model import Prior
 from studies.motion import sweep
 from studies.prior import ablation, alone, cases, network_scores, networks
 from studies.prior.figures import draw_ablation, draw_networks
-from studies.prior.volumes import slices_at_true_poses
+from studies.prior.volumes import prior_volumes, slices_at_true_poses, template_at_truth, tiling_difference
 from studies.subjects import read_case
 
 SETTINGS = {"preset": "balanced", "weights": "abc", "threads": 2, "n_views": 4}
@@ -106,6 +110,8 @@ def test_network_table() -> None:
 def test_networks_differ_from_the_configuration() -> None:
     config = networks.configuration()
     found = {variant.name for variant in networks.distinct_variants(config)}
+    assert {"no-template", "as-printed"} <= found
+    assert "sharp-base" in found or config["model"]["init_args"]["network"].get("sharp_base")
     assert "size-" + "-".join(map(str, config["model"]["init_args"]["network"]["channels"])) not in found
     assert {"full", "no-gate", "no-density", "no-density-no-gate", "no-sharp"} <= found
     per_epoch = networks.epochs_of(10**6, config) / 10**6
@@ -167,3 +173,47 @@ def test_slices_without_a_true_pose_are_left_out(tmp_path: Path, rng: np.random.
     motion = slices.world_from_header()
     np.testing.assert_allclose(motion.translation_mm[:, 0], range(5), atol=1e-9)
     np.testing.assert_allclose(motion.rotvec_rad()[:, 2], 0.1, atol=1e-9)
+
+
+def small_prior() -> Prior:
+    """An untrained network with the template of two phantoms."""
+    from data_synth.heads import PhantomSubject
+    from data_synth.template import atlas_templates
+    from g3r.prior.dgpn import DensityGatedPriorNetwork
+
+    template = atlas_templates([PhantomSubject("a", 22.0, 1), PhantomSubject("b", 28.0, 2)], 3.0)
+    config = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, template_spacing_mm=3.0)
+    network = DensityGatedPriorNetwork(config).eval()
+    network.set_template(torch.from_numpy(template.volume))
+    return Prior(network=network, voxel_mm=2.5, weeks=tuple(template.weeks.tolist()), training_data="nothing")
+
+
+def test_volumes_of_a_case_start_from_a_template_at_the_truth(subject: Path) -> None:
+    case, prior = read_case(subject), small_prior()
+    placed = template_at_truth(prior.template, case.truth, case.truth_mask)
+    true = case.truth.grid.world(np.argwhere(case.truth_mask))
+    here = placed.grid.world(np.argwhere(placed.volume > 0))
+    np.testing.assert_allclose(here.mean(0), true.mean(0), atol=0.01)
+    n_mm3 = len(here) * placed.grid.voxel_volume_mm3
+    assert n_mm3 == pytest.approx(len(true) * case.truth.grid.voxel_volume_mm3, rel=1e-3)
+    for head in (placed, None):
+        made = prior_volumes(prior, slices_at_true_poses(case, 3), head)
+        assert set(made.by_name) == set(alone.VOLUMES)
+        assert set(made.seconds) >= set(alone.VOLUMES)
+        assert {one.shape for one in made.by_name.values()} == {made.grid.shape}
+        dense = made.maps.density > 2
+        assert dense.any()
+        # not trained: the base of Eq. 7
+        np.testing.assert_allclose(made.by_name["V_prior"][dense], made.by_name["V_coarse"][dense], atol=2e-3)
+        assert made.maps.outline is not None
+        inside = score_dice(made.maps.outline > 0.5, resample_mask(case, made.grid))
+        assert inside > 0.9
+        assert tiling_difference(prior, made, 16) < 1e-6
+
+
+def score_dice(one: np.ndarray, other: np.ndarray) -> float:
+    return float(2 * (one & other).sum() / (one.sum() + other.sum()))
+
+
+def resample_mask(case: SimulatedCase, grid: VolumeGrid) -> np.ndarray:
+    return on_grid(case.truth_mask.astype(np.float32), case.truth.grid, grid, outside=0.0) > 0.5

@@ -26,6 +26,7 @@ from g3r.prior.model import Prior
 from g3r.reconstruct import GaussianReconstructor
 from g3r.training import prior_module as training
 from g3r.training import prior_validation as validation
+from g3r.training.prior_batches import loss_weight
 from tests.training.small_runs import in_memory, logged, trainer
 
 NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
@@ -34,6 +35,8 @@ TINY_TRAINING = [
     "lightning_configs/prior.yaml",
     "--model.network.channels=[8,8]",
     "--model.network.units=[1,1]",
+    "--model.network.template_spacing_mm=3.0",
+    "--data.template_spacing_mm=3.0",
     "--data.spacing_mm=3.0",
     "--data.patch_size=16",
     "--data.patches_per_subject=4",
@@ -51,7 +54,7 @@ TINY_TRAINING = [
 
 def volumes(n: int, seed: int = 0, size: int = 12) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    names = ("coarse", "density", "sharp", "truth")
+    names = ("coarse", "density", "share", "sharp", "template", "outline", "truth")
     batch = {name: torch.rand(n, 1, size, size, size, generator=generator) for name in names}
     return {**batch, "mask": torch.ones_like(batch["truth"])}
 
@@ -99,7 +102,8 @@ def test_scores_are_means_over_volumes(log: Any) -> None:
     assert last("val/psnr_coarse") == pytest.approx(expected, abs=1e-4)
     assert last("val/psnr_gain") == pytest.approx(last("val/psnr_prior") - last("val/psnr_coarse"), abs=1e-4)
     one = next(iter(ValidatedByStacks().val_dataloader()))
-    l1 = float((one["coarse"] - one["truth"]).abs().mean())
+    weight = loss_weight(one, 1.0)
+    l1 = float((weight * (one["coarse"] - one["truth"]).abs()).sum() / weight.sum())
     assert last("val/l1_coarse_1stack") == pytest.approx(l1, abs=1e-6)
 
 
@@ -108,13 +112,13 @@ def test_images_show_gate_and_confidence_for_each_number_of_stacks(log: Any) -> 
     assert sorted(tags) == [f"val/{n}: {validation.PANEL_TAG}" for n in ("1stack", "3stacks")]
     assert "confidence, gate" in validation.PANEL_TAG
     image = log.Images(tags[0])[-1]
-    assert (image.height, image.width) == (12, 7 * 12)
+    assert (image.height, image.width) == (12, 8 * 12)
 
 
 def test_panel_of_a_network_without_a_gate() -> None:
     batch = volumes(1)
     shown = validation.panel(batch, batch["coarse"], None)
-    coarse, _, confidence, gate, prior, _, _ = shown.split(12, 1)
+    coarse, _, _, confidence, gate, prior, _, _ = shown.split(12, 1)
     assert bool((gate == 1).all())
     assert 0 < float(confidence.max()) < 1
     assert torch.equal(prior, coarse)  # which stands for the prior here
@@ -129,7 +133,7 @@ def test_going_on_at_another_voxel_size_is_refused(tmp_path: Path) -> None:
     run.save_checkpoint(tmp_path / "run.ckpt")
     path = tmp_path / "prior.safetensors"
     assert first.voxel_mm is not None
-    Prior(network=first.network, voxel_mm=first.voxel_mm, training_data="noise").save(path)
+    Prior(network=first.network, voxel_mm=first.voxel_mm, weeks=(30.0,), training_data="noise").save(path)
     data = ValidatedByStacks()
     data.spacing_mm = 1.0
     again = training.PriorModule(NETWORK, start_from=str(path))

@@ -13,10 +13,10 @@ import pytest
 import torch
 import yaml
 
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.checkpoints.plain_values import config_from_plain
 from g3r.cli import export
 from g3r.errors import InputError
-from g3r.evaluation.metrics import score
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.model import Prior
@@ -29,37 +29,27 @@ from torch.utils.data import DataLoader
 from g3r.training import prior_batches as batches
 from g3r.training import prior_module as training
 from g3r.training.annealed_module import cosine_factor
-from g3r.training.prior_validation import sample_scores
+from g3r.training.prior_validation import PLACES
 from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
+from tests.training.small_volumes import given_at_random, sample
 
-NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4)
+NETWORK = PriorNetworkConfig(channels=(8, 8), units=(1, 1), tail_channels=4, template_spacing_mm=4.0)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
 CONFIG = "lightning_configs/prior.yaml"
 Trained = tuple[Path, Path, training.PriorModule]
 
 
-def smooth_noise(generator: torch.Generator, size: int) -> torch.Tensor:
-    coarse_noise = torch.rand(1, 1, size // 4, size // 4, size // 4, generator=generator)
-    return torch.nn.functional.interpolate(coarse_noise, scale_factor=4, mode="trilinear")[0]
-
-
-def sample(seed: int, size: int = 16) -> dict[str, torch.Tensor]:
-    """One training sample: a smooth truth, and coarse volumes that are wrong where the density is low."""
-    generator = torch.Generator().manual_seed(seed)
-    truth, density = smooth_noise(generator, size), 3 * smooth_noise(generator, size)
-    error = -0.5 * torch.exp(-density) * truth + 0.02 * torch.randn(truth.shape, generator=generator)
-    mask = torch.ones_like(truth)
-    mask[:, :3] = 0
-    coarse, sharp = mask * (truth + error), mask * (truth + 0.8 * error)
-    return {"coarse": coarse, "density": density, "sharp": sharp, "truth": mask * truth, "mask": mask}
-
-
 class TinyData(lightning.LightningDataModule):
-    """Four samples in memory."""
+    """Four samples in memory, and a template of two ages."""
 
-    def __init__(self, spacing_mm: float = 0.8, source: str = "/some/where/atlas") -> None:
+    def __init__(self, spacing_mm: float = 0.8, template_mm: float = 4.0, source: str = "/some/where/atlas") -> None:
         super().__init__()
         self.save_hyperparameters()
+
+    def template(self) -> AtlasTemplate:
+        config = replace(NETWORK, template_shape=(2, 5, 6, 4), template_spacing_mm=self.hparams["template_mm"])
+        heads = np.random.default_rng(0).random(config.template_shape).astype(np.float32)
+        return AtlasTemplate(heads, config.template_grid.affine, np.array([25.0, 31.0]))
 
     def train_dataloader(self) -> DataLoader:
         return in_memory([sample(seed) for seed in range(4)], 2)
@@ -82,12 +72,17 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 def test_tensorboard_has_scalars_and_the_panel(trained: Trained) -> None:
     log = logged(trained[0] / "run" / "version_0")
-    scores = {f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "coarse")}
+    scores = {
+        f"val/{metric}_{name}" for metric in ("l1", "psnr", "ssim") for name in ("prior", "sharp", "coarse", "template")
+    }
+    by_confidence = {f"train/l1_prior_{name}" for name in ("hardly_seen", "thinly_seen", "seen")}
+    by_place = {f"val/psnr_prior_seen_{place}" for place in PLACES}
     speed = {"train/samples_per_second", "train/waiting_for_data"}
-    assert scores | speed | {"train/l1_prior", "train/l1_coarse"} <= set(log.Tags()["scalars"])
+    losses = {"train/loss", "train/l1_prior", "train/l1_coarse"}
+    assert scores | speed | losses | by_confidence | by_place <= set(log.Tags()["scalars"])
     (tag,) = log.Tags()["images"]
     image = log.Images(tag)[0]
-    assert (image.height, image.width) == (16, 7 * 16)
+    assert (image.height, image.width) == (16, 8 * 16)
 
 
 def test_training_moves_the_weights(trained: Trained) -> None:
@@ -106,11 +101,15 @@ def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys:
     path = tmp_path / "prior.safetensors"
     assert export.main([str(checkpoint), str(path)]) == 0
     prior = Prior.load(path)
-    inputs = torch.rand(3, 1, 1, 12, 16, 9)
+    given = given_at_random(12, 16, 9)
     with torch.no_grad():
-        torch.testing.assert_close(prior.network(*inputs), module.eval()(*inputs), rtol=1e-6, atol=1e-6)
+        for one, other in zip(prior.network(given), module.eval()(given), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
     assert (prior.network.config.alpha, prior.voxel_mm) == (0.1, 0.8)
-    assert "TinyData(spacing_mm=0.8, source=atlas)" in prior.training_data
+    assert prior.template.weeks.tolist() == [25, 31]
+    np.testing.assert_allclose(prior.template.volume, TinyData().template().volume, atol=1e-3)  # float16
+    np.testing.assert_allclose(prior.template.affine, TinyData().template().affine)
+    assert "TinyData(spacing_mm=0.8, template_mm=4.0, source=atlas)" in prior.training_data
     assert "/some/where" not in prior.training_data
     assert prior.validation["val/psnr_prior"] > 0
     assert "val/psnr_prior" in capsys.readouterr().out
@@ -143,6 +142,7 @@ def spoil(content: dict[str, Any]) -> None:
         (without("state_dict"), "not written by this version of g3r-pretrain"),
         (lambda content: content["g3r_export"].update(voxel_mm=None), "cannot be exported"),
         (lambda content: content["g3r_export"].update(voxel_mm=1e3), "voxel size is 1000.0 mm"),
+        (lambda content: content["g3r_export"].update(weeks=[25.0]), "1 ages for a template of 2"),
         (lambda content: content["state_dict"].popitem(), "cannot be exported"),
         (spoil, "NaN or infinity"),
     ],
@@ -181,88 +181,58 @@ def test_voxel_size_must_agree_with_the_data(tmp_path: Path) -> None:
         trainer(tmp_path, max_steps=2).fit(module, TinyData())
 
 
+def test_the_template_s_voxels_must_agree_with_the_data(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"not on a grid of 4 mm.*template_spacing_mm"):
+        trainer(tmp_path, max_steps=2).fit(training.PriorModule(**SMALL), TinyData(template_mm=3.0))
+
+
 def test_a_patch_can_be_learnt() -> None:
     """Sixty steps on one patch bring the prior's error to half the coarse volume's."""
     torch.manual_seed(0)
     module = training.PriorModule(**SMALL, learning_rate=3e-3)
     batch = {name: value[None] for name, value in sample(0, size=24).items()}
-    weight = batches.loss_weight(batch["mask"], 0.1)
+    weight = batches.loss_weight(batch, 0.1)
     optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
     for _ in range(60):
-        prior = module(batch["coarse"], batch["density"], batch["sharp"])
-        loss = batches.weighted_l1(prior, batch["truth"], weight)
+        found = module(batches.prior_inputs(batch))
         optimizer.zero_grad()
-        loss.backward()
+        batches.prior_loss(found, batch, weight).backward()
         optimizer.step()
-    coarse_loss = batches.weighted_l1(batch["coarse"], batch["truth"], weight)
+    loss, coarse_loss = (
+        batches.weighted_l1(volume, batch["truth"], weight) for volume in (found.volume, batch["coarse"])
+    )
     assert loss.item() < 0.5 * coarse_loss.item(), (loss.item(), coarse_loss.item())
 
 
-@pytest.mark.parametrize("use_sharp", [False, True])
-def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_sharp: bool) -> None:
-    """Channels that the file lacks have no effect at first; on another base the residual begins at zero."""
+@pytest.mark.parametrize("use_template", [False, True])
+def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_template: bool) -> None:
+    """On another base the residual begins at zero; the template is the data's, not the file's."""
     torch.manual_seed(0)
-    old = DensityGatedPriorNetwork(replace(NETWORK, use_sharp=use_sharp))
+    old = DensityGatedPriorNetwork(replace(NETWORK, use_template=use_template))
     torch.nn.init.normal_(old.refiner.head.weight)
     path = tmp_path / "old.safetensors"
-    Prior(network=old, voxel_mm=0.8, training_data="noise").save(path)
-    volumes = [torch.rand(1, 1, 8, 8, 8) for _ in range(3)]
+    old.set_template(torch.rand(3, 2, 2, 2))  # of another shape, and not taken
+    Prior(network=old, voxel_mm=0.8, weeks=(25.0, 28.0, 31.0), training_data="noise").save(path)
+    given = given_at_random(8, 8, 8)
     new = training.PriorModule(NETWORK, start_from=str(path)).network
-    torch.testing.assert_close(new(*volumes), old(*volumes))
-    moved = training.PriorModule(replace(NETWORK, sharp_base=True), start_from=str(path)).network
-    torch.testing.assert_close(moved(*volumes), volumes[2])
+    assert new.config.template_shape == NETWORK.template_shape
+    if use_template:
+        for one, other in zip(new(given), old(given), strict=True):
+            torch.testing.assert_close(one, other)
+    else:
+        torch.testing.assert_close(new(given).volume, given.base(NETWORK))
+        # channels that the file lacks have no effect at first
+        shown = replace(given, template=torch.rand(1, 1, 8, 8, 8))
+        new.refiner.head.load_state_dict(old.refiner.head.state_dict())
+        torch.testing.assert_close(new.refiner(shown)[0], old.refiner(given)[0])
+    moved_base = replace(NETWORK, sharp_base=True)
+    moved = training.PriorModule(moved_base, start_from=str(path)).network
+    torch.testing.assert_close(moved(given).volume, given.base(moved_base))
+    for other_inputs in ({"use_sharp": False}, {"use_density": False}):
+        with pytest.raises(InputError, match="V_sharp and densities"):
+            training.PriorModule(replace(NETWORK, **other_inputs), start_from=str(path))
     with pytest.raises(InputError, match="give it the same channels and units"):
         training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
-
-
-def test_loss_weight_is_one_in_the_mask_and_small_outside() -> None:
-    mask = torch.zeros(1, 1, 5, 5, 5)
-    mask[0, 0, 2, 2, 2] = 1
-    weight = batches.loss_weight(mask, 0.1)
-    assert float(weight[0, 0, 2, 2, 2]) == 1
-    assert float(weight.sum()) == pytest.approx(1 + 0.1 * 124)
-
-
-def test_weighted_l1_of_an_empty_mask_without_background_is_zero() -> None:
-    ones = torch.ones(1, 1, 4, 4, 4)
-    assert float(batches.weighted_l1(ones, 0 * ones, 0 * ones)) == 0.0
-
-
-def test_symmetries_turn_all_volumes_alike() -> None:
-    batch = {name: value[None] for name, value in sample(0, size=8).items()}
-    batch["density"] = batch["truth"].clone()
-    seen = set()
-    for seed in range(200):
-        torch.manual_seed(seed)
-        turned = batches.random_cube_symmetry(batch)
-        assert torch.equal(turned["density"], turned["truth"])
-        seen.add(turned["truth"].numpy().tobytes())
-    assert 40 < len(seen) <= 48
-
-
-def test_symmetries_keep_the_shape() -> None:
-    batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
-    assert {tuple(batches.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
-
-
-def test_validation_scores_are_those_of_an_evaluation() -> None:
-    truth = sample(3, size=24)["truth"]
-    mask = torch.zeros_like(truth)
-    mask[:, 4:20, 5:21, 6:18] = 1
-    torch.manual_seed(0)
-    made = 0.8 * truth + 0.05 * torch.randn(truth.shape)
-    found = sample_scores(made, truth, mask, weight=mask)
-    expected = score(made[0].numpy(), truth[0].numpy(), mask[0].numpy() > 0)
-    assert (found["psnr"], found["ssim"]) == (expected.psnr_db, expected.ssim)
-    assert found["l1"] == pytest.approx(float((made - truth).abs()[mask > 0].mean()), rel=1e-5)
-
-
-def test_a_sample_without_a_brain_has_no_psnr_and_a_diverged_one_has_nan() -> None:
-    truth = sample(3)["truth"]
-    assert sample_scores(truth, truth, torch.zeros_like(truth), torch.ones_like(truth)).keys() == {"l1"}
-    found = sample_scores(torch.full_like(truth, torch.nan), truth, torch.ones_like(truth), torch.ones_like(truth))
-    assert all(np.isnan(value) for value in found.values())
-    assert found.keys() == {"l1", "psnr", "ssim"}
 
 
 def test_learning_rate_follows_the_budget_that_ends_first(tmp_path: Path) -> None:

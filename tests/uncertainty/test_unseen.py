@@ -1,0 +1,69 @@
+"""What is said of the part of the brain that no slice saw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE, UnseenPart
+
+BRAIN = np.zeros((20, 20, 20), bool)
+BRAIN[5:15, 5:15, 5:15] = True  # 1000 voxels
+
+
+def part(n_unseen: int, shown: str = "estimate from other brains", voxel_mm3: float = 8.0) -> UnseenPart:
+    unseen = np.zeros_like(BRAIN)
+    unseen[tuple(np.argwhere(BRAIN)[:n_unseen].T)] = True
+    return UnseenPart.of(unseen, BRAIN, voxel_mm3, shown=shown)
+
+
+def test_share_and_volume() -> None:
+    found = part(125)
+    assert found.share == pytest.approx(0.125)
+    assert found.volume_ml == pytest.approx(1.0)
+    assert found.usable
+    line = found.line()
+    assert line == "12 % of the brain was not seen by any slice (1 ml): it is shown as an estimate from other brains"
+
+
+@pytest.mark.parametrize(
+    ("shown", "words"),
+    [
+        ("estimate from other brains", "it is shown as an estimate from other brains"),
+        ("smooth continuation", "it is shown as a smooth continuation"),
+        ("blank", "it was left blank"),
+    ],
+)
+def test_it_is_said_what_is_shown(shown: str, words: str) -> None:
+    line = part(200, shown).line()
+    assert line is not None
+    assert line.startswith("20 % of the brain was not seen by any slice (2 ml)")
+    assert line.endswith(words)
+
+
+def test_slivers_are_not_mentioned_and_small_shares_have_a_decimal() -> None:
+    limit = round(1000 * MENTIONED_ABOVE)
+    assert part(0).line() is None
+    assert part(limit - 1).line() is None
+    line = part(limit).line()
+    assert line is not None
+    assert line.startswith("0.5 % of the brain")
+
+
+def test_too_much_must_not_be_used() -> None:
+    limit = round(1000 * DO_NOT_USE_ABOVE)
+    assert part(limit).usable
+    line = part(limit).line()
+    assert line is not None
+    assert "do not use" not in line
+    over = part(limit + 1)
+    assert not over.usable
+    line = over.line()
+    assert line is not None
+    assert line.endswith("; do not use this volume")
+
+
+def test_no_brain_is_no_division_by_zero() -> None:
+    nothing = UnseenPart.of(0 * BRAIN > 0, 0 * BRAIN > 0, 1.0, shown="blank")
+    assert nothing.share == 0
+    assert nothing.line() is None
