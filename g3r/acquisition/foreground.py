@@ -30,8 +30,12 @@ SEEN_SHARE = 1 / 3
 """Coverage, in shares of what one stack gives on average, below which a voxel is unseen: with the smoothing over half
 the slice spacing it ends 0.75 of the spacing beyond a stack's last slice."""
 
-BRAIN_PROBABILITY = 0.5
-"""Of an unseen voxel, to be taken as brain."""
+CORE_SHARE = 1 / 2
+"""The same share for the mask that is written: the edge of a mask, so that its volume is right."""
+
+LIKELY, POSSIBLE = 0.5, 0.25
+"""Brain probability of an unseen voxel, to be in the mask, and to be shown: a voxel of the rim that is left out costs
+as much as many that are a little wrong."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +43,24 @@ class Foreground:
     """What slices say of each voxel.
 
     Attributes:
-        brain: [I, J, K] seen, and called brain.
+        brain: [I, J, K] seen, and called brain by a third of the slices.
+        core: [I, J, K] the same by one half.
         unseen: [I, J, K] not seen.
     """
 
     brain: NDArray[np.bool_]
+    core: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
 
-    def completed(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
+    def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
+        """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
+
+        Args:
+            brain_probability: see `mask`.
+        """
+        return self._completed(self.brain, brain_probability, POSSIBLE)
+
+    def mask(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """The brain mask [I, J, K]: what was seen, and of the unseen voxels those that are brain by their shape.
 
         The largest connected piece is taken, and its holes are filled.
@@ -54,13 +68,18 @@ class Foreground:
         Args:
             brain_probability: [I, J, K]; the convex hull of what was seen decides where there is none.
         """
+        return self._completed(self.core if self.core.any() else self.brain, brain_probability, LIKELY)
+
+    def _completed(
+        self, seen_brain: NDArray[np.bool_], brain_probability: NDArray[np.floating] | None, least: float
+    ) -> NDArray[np.bool_]:
         if not self.unseen.any():
             likely = self.unseen
         elif brain_probability is None:
-            likely = _hull(self.brain, self.unseen)
+            likely = _hull(seen_brain, self.unseen)
         else:
-            likely = brain_probability > BRAIN_PROBABILITY
-        brain = self.brain | (self.unseen & likely)
+            likely = brain_probability > least
+        brain = seen_brain | (self.unseen & likely)
         pieces, n_pieces = label(brain)
         if n_pieces > 1:
             brain = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
@@ -97,7 +116,7 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     brain = seen & (inside > INSIDE_SHARE * total)
     if not brain.any():
         raise InputError("no voxel is covered by a slice; check masks and headers")
-    return Foreground(brain, ~seen)
+    return Foreground(brain, seen & (inside > CORE_SHARE * total), ~seen)
 
 
 def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:

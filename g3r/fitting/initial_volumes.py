@@ -113,6 +113,7 @@ class PriorVolume:
         values: V_prior [I, J, K] on their grid (G3R Eq. 7); V_sharp, smoothly continued, where no network is used.
         brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
         mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
+        support: [I, J, K] where Gaussians are fitted: the mask and its margin.
         has_template: whether an atlas template was fitted, for V_prior to show where no slice looked.
         gain: [K] intensity factors of the slices.
         scale: what intensities were divided by since registration.
@@ -123,6 +124,7 @@ class PriorVolume:
     values: NDArray[np.float32]
     brain: NDArray[np.float32] | None
     mask: NDArray[np.bool_]
+    support: NDArray[np.bool_]
     has_template: bool
     gain: NDArray[np.float64]
     scale: float

@@ -42,7 +42,7 @@ def fit_to_prior(
     if adaptive is not None:
         cloud, found = fit_adaptive(
             values,
-            prior.mask,
+            prior.support,
             volumes.grid,
             finest_spacing_mm=spacing_mm,
             settings=adaptive,
@@ -53,9 +53,9 @@ def fit_to_prior(
         )
         counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
         return PriorCloud(cloud, found.loss, counts)
-    cloud = seed_cloud(values, prior.mask, volumes.grid, spacing_mm)
+    cloud = seed_cloud(values, prior.support, volumes.grid, spacing_mm)
     counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-    target = VolumeTarget.of(values, prior.mask.astype(np.float32), volumes.grid)
+    target = VolumeTarget.of(values, prior.support.astype(np.float32), volumes.grid)
     cloud, history = fit_prior(cloud, target, stage, rng, progress=progress, deadline=deadline)
     return PriorCloud(cloud, history, counts)
 
@@ -70,4 +70,4 @@ def distillation_target(prior: PriorVolume) -> VolumeTarget:
     volumes = prior.volumes
     power = 1 if volumes.slices.n_stacks == 1 else 2
     unmeasured = np.maximum((1 - confidence(volumes.masked_density)) ** power, MIN_DISTILLATION)
-    return VolumeTarget.of(prior.values, (unmeasured * prior.mask).astype(np.float32), volumes.grid)
+    return VolumeTarget.of(prior.values, (unmeasured * prior.support).astype(np.float32), volumes.grid)

@@ -49,7 +49,7 @@ def prior_volume(
         guess, outline = fitted.values, fitted.inside
     else:
         guess = smooth_fill(volumes.sharp, np.clip(volumes.density / KNOWN_DENSITY, 0, 1))
-        outline = volumes.foreground.completed().astype(np.float32)
+        outline = volumes.foreground.mask().astype(np.float32)
     values, brain = guess, None
     if prior is not None:
         maps = PriorMaps(
@@ -62,12 +62,12 @@ def prior_volume(
         )
         found = prior.estimate(maps, n_views=n_views, tiling=tiling)
         values, brain = found.volume, found.brain
-    mask = volumes.foreground.completed(brain)
     return PriorVolume(
         volumes=volumes,
         values=values,
         brain=brain,
-        mask=mask,
+        mask=volumes.foreground.mask(brain),
+        support=volumes.foreground.support(brain),
         has_template=placed is not None,
         gain=gain,
         scale=volumes.scale,

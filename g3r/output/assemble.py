@@ -87,9 +87,9 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     fit = found.fit or _no_fit(found)
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.clock(Stage.VOLUME):
-        mask = found.prior.mask if grid is volumes.grid else _mask_on(grid, found.prior, fit)
+        mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
-        volume = _volume(found, mask, density, grid, settings)
+        volume = _volume(found, support, density, grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
         unseen_part = UnseenPart.of(unseen, mask, grid.voxel_volume_mm3, shown=_shown_unseen(found.prior, settings))
     line = unseen_part.line()
@@ -135,7 +135,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         uncertainty, uncertainty_record = estimated.expected_error, estimated.record
     intensity = np.float32(found.intensity)
     if not settings.fill_unseen:
-        volume, mask = volume * ~unseen, mask & ~unseen
+        volume, mask = volume * (density >= UNSEEN_BELOW), mask & ~unseen
         uncertainty = None if uncertainty is None else uncertainty * ~unseen
     return ReconstructionResult(
         volume=volume * intensity,
@@ -158,11 +158,14 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     )
 
 
-def _mask_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> NDArray[np.bool_]:
-    """The brain mask on another grid, from the slices as the fit left them."""
+def _masks_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Brain mask and support on the output grid; on another than the prior's from the slices as the fit left them."""
+    if grid is prior.volumes.grid:
+        return prior.mask, prior.support
     brain = prior.brain
     likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
-    return foreground(fit.slices, grid, fit.weight).completed(likely)
+    found = foreground(fit.slices, grid, fit.weight)
+    return found.mask(likely), found.support(likely)
 
 
 def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
@@ -191,7 +194,7 @@ def _left_to_prior(density: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _volume(
     found: StageResults,
-    mask: NDArray[np.bool_],
+    support: NDArray[np.bool_],
     density: NDArray[np.float32],
     grid: VolumeGrid,
     settings: ReconstructionSettings,
@@ -199,10 +202,10 @@ def _volume(
     """The Gaussians on the output grid, and the prior where no slice looked; the prior alone before there are any."""
     prior = on_grid(found.prior.values, found.prior.volumes.grid, grid, outside=0.0)
     if found.fit is None:
-        return prior * mask
+        return prior * support
     pixels = render(found.fit.cloud, volume_planes(grid), cutoff_sigma=settings.slice_stage.cutoff_sigma).numpy()
     fitted = volume_from_pixels(pixels, grid)
-    volume = (fitted + _left_to_prior(density) * (prior - fitted)) * mask
+    volume = (fitted + _left_to_prior(density) * (prior - fitted)) * support
     if not np.isfinite(volume).all():
         raise NumericalError("the volume holds values that are not finite; lower the step sizes")
     return volume

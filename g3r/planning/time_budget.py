@@ -144,7 +144,7 @@ class TimeBudget:
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
             return self._take("draft", PRESETS["draft"].share_probes, reserve_s)
         probed = PRESETS["fast"].gaussian_spacing_pixels
-        cloud = seed_cloud(prior.values, prior.mask, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
+        cloud = seed_cloud(prior.values, prior.support, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):

@@ -97,7 +97,7 @@ def prior_volumes(prior: Prior, slices: Slices, placed: PlacedTemplate | None, n
     share = brain_share(masked, density)
     if placed is None:
         known = np.clip(density / KNOWN_DENSITY, 0, 1)
-        template, outline = smooth_fill(sharp, known), foreground(slices, grid).completed().astype(np.float32)
+        template, outline = smooth_fill(sharp, known), foreground(slices, grid).mask().astype(np.float32)
     else:
         fitted = _timed(seconds, "template", lambda: placed.fitted(sharp, share, density, grid))
         template, outline = fitted.values, fitted.inside

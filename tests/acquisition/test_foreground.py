@@ -67,7 +67,7 @@ def without(stack: Stack, low_mm: float, high_mm: float) -> Stack:
 
 def foreground_mask(slices: Slices, weight: np.ndarray | None = None) -> np.ndarray:
     """The brain mask where no network tells of unseen voxels."""
-    return foreground(slices, GRID, weight).completed()
+    return foreground(slices, GRID, weight).support()
 
 
 def volume_of(mask: np.ndarray) -> float:
@@ -80,12 +80,14 @@ def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: flo
     stacks = [ellipsoid_stack(t, thickness_mm=thickness_mm, gap_mm=gap_mm) for t in TURNS[:n_stacks]]
     found = foreground(slices_from_stacks(stacks), GRID)
     assert not found.unseen[depth(WORLD) > -0.2].any()
-    mask = found.completed()
+    mask = found.support()
     # generous (INSIDE_SHARE below one half) by a share of the slice distance, with one stack as with three
     excess_mm = np.cbrt(RADII_MM.prod()) * (np.cbrt(volume_of(mask) / TRUE_MM3) - 1)
     assert 0 < excess_mm < 0.27 * (thickness_mm + gap_mm)
     if thickness_mm + gap_mm < 3:
         assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.08)
+        assert volume_of(found.mask()) == pytest.approx(TRUE_MM3, rel=0.02)
+    assert not (found.mask() & ~mask).any()
     assert mask[depth(WORLD) > 0.05].all()  # gaps are closed
     assert not mask[depth(WORLD) < -0.2].any()
     assert label(mask)[1] == 1
@@ -108,10 +110,10 @@ def test_a_cut_off_end_is_unseen_and_not_background() -> None:
     assert found.brain[(z > 2) & (depth(WORLD) > 0.15)].all()
     assert not (found.brain & found.unseen).any()
     # nobody says more: the mask ends with the slices
-    assert not found.completed()[z < -3.8].any()
+    assert not found.support()[z < -3.8].any()
     # a network does: the whole head
     likely = (depth(WORLD) > 0).astype(np.float32)
-    mask = found.completed(likely)
+    mask = found.support(likely)
     assert mask[depth(WORLD) > 0.05].all()
     assert volume_of(mask) == pytest.approx(TRUE_MM3, rel=0.12)
 
@@ -121,7 +123,7 @@ def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> N
     found = foreground(missing, GRID)
     slab = np.abs(WORLD[..., 2]) < 4
     assert found.unseen[slab].all()
-    mask = found.completed()
+    mask = found.support()
     assert mask[slab & (depth(WORLD) > 0.06)].all()
     assert not mask[depth(WORLD) < -0.2].any()
     assert label(mask)[1] == 1
@@ -129,7 +131,7 @@ def test_without_a_network_the_hull_of_what_was_seen_fills_a_missing_slab() -> N
         volume_of(foreground_mask(slices_from_stacks([ellipsoid_stack()]))), rel=0.05
     )
     # without any filling one of the two ends would be lost
-    nothing = found.completed(np.zeros(GRID.shape))
+    nothing = found.support(np.zeros(GRID.shape))
     assert volume_of(nothing) < 0.55 * volume_of(mask)
 
 
@@ -138,9 +140,8 @@ def test_the_hull_reaches_the_borders_of_the_grid() -> None:
     brain[1:3], brain[8:11] = True, True
     unseen = np.zeros_like(brain)
     unseen[4:7], unseen[11] = True, True
-    mask = Foreground(
-        brain | (np.arange(12) == 3)[:, None, None] | (np.arange(12) == 7)[:, None, None], unseen
-    ).completed()
+    seen = brain | (np.arange(12) == 3)[:, None, None] | (np.arange(12) == 7)[:, None, None]
+    mask = Foreground(seen, seen, unseen).support()
     assert mask[1:11].all()
     assert not mask[[0, 11]].any()
 
@@ -148,7 +149,7 @@ def test_the_hull_reaches_the_borders_of_the_grid() -> None:
 def test_a_flat_or_lone_brain_has_no_hull() -> None:
     brain, unseen = np.zeros((6, 6, 6), bool), np.ones((6, 6, 6), bool)
     brain[3, 1:5, 1:5], unseen[3] = True, False
-    np.testing.assert_array_equal(Foreground(brain, unseen).completed(), brain)
+    np.testing.assert_array_equal(Foreground(brain, brain, unseen).support(), brain)
 
 
 def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
@@ -156,10 +157,11 @@ def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
     found = foreground(slices, GRID)
     right = (WORLD[..., 0] > 0) & (WORLD[..., 2] < 0)  # one piece with what was seen
     contrary = np.where(found.unseen, right, ~found.brain).astype(np.float32)
-    mask = found.completed(contrary)
+    mask = found.support(contrary)
     np.testing.assert_array_equal(mask, found.brain | (found.unseen & right))
-    # undecided is not brain
-    np.testing.assert_array_equal(found.completed(np.full(GRID.shape, 0.5)), found.completed(0 * contrary))
+    # what is hardly possible is not shown, what is undecided is not in the mask
+    np.testing.assert_array_equal(found.support(np.full(GRID.shape, 0.25)), found.support(0 * contrary))
+    np.testing.assert_array_equal(found.mask(np.full(GRID.shape, 0.5)), found.mask(0 * contrary))
 
 
 def test_a_factor_common_to_all_weights_says_nothing() -> None:
@@ -206,7 +208,7 @@ def test_what_one_stack_alone_has_seen_stays_inside() -> None:
     slices = slices_from_stacks([whole, *partly])
     found = foreground(slices, GRID)
     assert not found.unseen[depth(WORLD) > -0.2].any()
-    mask = found.completed()
+    mask = found.support()
     uncovered = (WORLD @ TURNS[1][:, 2] < -8) & (WORLD @ TURNS[2][:, 2] < -8) & (depth(WORLD) > 0.1)
     assert uncovered.sum() > 500
     assert mask[uncovered].all()
