@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_fill_holes, gaussian_filter, label
+from scipy.ndimage import binary_dilation, binary_fill_holes, gaussian_filter, label
 from scipy.spatial import Delaunay, QhullError
 
-from g3r.acquisition.coverage import coverage
+from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slice_spacing_mm
 from g3r.acquisition.voxel_operator import VoxelOperator
@@ -33,6 +33,8 @@ the slice spacing it ends 0.75 of the spacing beyond a stack's last slice."""
 CORE_SHARE = 1 / 2
 """The same share for the mask that is written: the edge of a mask, so that its volume is right."""
 
+THIN_MARGIN_VOXELS = 2
+
 LIKELY, POSSIBLE = 0.5, 0.25
 """Brain probability of an unseen voxel, to be in the mask, and to be shown: a voxel of the rim that is left out costs
 as much as many that are a little wrong."""
@@ -46,19 +48,26 @@ class Foreground:
         brain: [I, J, K] seen, and called brain by a third of the slices.
         core: [I, J, K] the same by one half.
         unseen: [I, J, K] not seen.
+        thin: [I, J, K] hardly seen or not, between two slices as well.
     """
 
     brain: NDArray[np.bool_]
     core: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
+    thin: NDArray[np.bool_]
 
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
 
+        Where slices hardly looked the margin is wider with a network: its image ends with the brain.
+
         Args:
             brain_probability: see `mask`.
         """
-        return self._completed(self.brain, brain_probability, POSSIBLE)
+        brain = self._completed(self.brain, brain_probability, POSSIBLE)
+        if brain_probability is None:
+            return brain
+        return brain | (self.thin & binary_dilation(brain, iterations=THIN_MARGIN_VOXELS))
 
     def mask(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """The brain mask [I, J, K]: what was seen, and of the unseen voxels those that are brain by their shape.
@@ -109,6 +118,7 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
     distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
     sigma = 0.5 * distance_mm.max() / grid.spacing_mm.mean()
+    thin = total < 2 * UNSEEN_BELOW * np.median(weight)
     inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
     thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
     lone = float((thickness_mm / distance_mm).min() * np.median(weight))
@@ -116,7 +126,8 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     brain = seen & (inside > INSIDE_SHARE * total)
     if not brain.any():
         raise InputError("no voxel is covered by a slice; check masks and headers")
-    return Foreground(brain, seen & (inside > CORE_SHARE * total), ~seen)
+    core = seen & (inside > CORE_SHARE * total)
+    return Foreground(brain, core, ~seen, thin)
 
 
 def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
