@@ -97,7 +97,8 @@ def estimate_memory(
     if settings.use_prior:
         seen = _seen_voxels(sizes.prior_shape, settings)
         begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
-        stages[Stage.PRIOR] = volumes + begin + per_voxel * seen + 16 * voxels
+        network = begin + per_voxel * seen + MAPS_PER_VOXEL * voxels
+        stages[Stage.PRIOR] = volumes + max(network, TEMPLATE_FIT_PER_VOXEL * voxels)
     stages |= {
         Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
         Stage.FIT_TO_SLICES: volumes + cloud + projections + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
@@ -117,6 +118,8 @@ VOLUMES_PER_VOXEL = 20
 REGISTRATION_PER_PIXEL = 150
 COARSE_PER_PIXEL, COARSE_VOLUMES = 130, 5
 NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with, and per voxel
+# Share, template and outline, all six maps padded, and the two results; the template on the whole grid.
+MAPS_PER_VOXEL, TEMPLATE_FIT_PER_VOXEL = 44, 115
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
