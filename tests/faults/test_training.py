@@ -134,12 +134,13 @@ CONFIG = """
 seed_everything: 5
 model:
   class_path: g3r.training.prior_module.PriorModule
-  init_args: {network: {channels: [4, 4], units: [1, 1], tail_channels: 2}, warmup_steps: 2}
+  init_args:
+    {network: {channels: [4, 4], units: [1, 1], tail_channels: 2, template_spacing_mm: 3.0}, warmup_steps: 2}
 data:
   class_path: data_synth.prior_data.StackSynthesisDataModule
   init_args:
     {spacing_mm: 3.0, patch_size: 24, patches_per_subject: 2, batch_size: 3, subjects_per_epoch: 5,
-     val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1}
+     val_subjects: 1, val_crop: 24, seed: 3, num_workers: 1, template_spacing_mm: 3.0}
 trainer:
   accelerator: cpu
   max_epochs: 5
