@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -91,7 +92,7 @@ def test_what_is_needed_is_asked_for(given: PriorInputs) -> None:
     network = DensityGatedPriorNetwork(SMALL)
     for missing, says in (("sharp", "needs V_sharp"), ("template", "fitted template"), ("outline", "fitted template")):
         with pytest.raises(ValueError, match=says):
-            network(replace(given, **{missing: None}))
+            network(replace(given, **dict[str, Any]({missing: None})))
     plain = replace(SMALL, use_sharp=False, use_template=False)
     DensityGatedPriorNetwork(plain)(replace(given, sharp=None, template=None, outline=None, share=None))
 
