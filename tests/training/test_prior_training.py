@@ -228,10 +228,9 @@ def test_beginning_with_the_weights_of_another_prior(tmp_path: Path, use_templat
     moved_base = replace(NETWORK, sharp_base=True)
     moved = training.PriorModule(moved_base, start_from=str(path)).network
     torch.testing.assert_close(moved(given).volume, given.base(moved_base))
-    changes: dict[str, Any]
-    for changes in ({"use_sharp": False}, {"use_density": False}):
+    for config in (replace(NETWORK, use_sharp=False), replace(NETWORK, use_density=False)):
         with pytest.raises(InputError, match="V_sharp and densities"):
-            training.PriorModule(replace(NETWORK, **changes), start_from=str(path))
+            training.PriorModule(config, start_from=str(path))
     with pytest.raises(InputError, match="give it the same channels and units"):
         training.PriorModule(replace(NETWORK, channels=(8, 16)), start_from=str(path))
 
