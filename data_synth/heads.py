@@ -84,17 +84,27 @@ def training_and_validation(
     return train, [*train]
 
 
-def weeks_of(subject: Subject) -> float:
+USUAL_WEEKS = 30.0
+"""Age that is taken for heads of no known age, where only a rough one is needed."""
+
+
+def weeks_of(subject: Subject, otherwise: float | None = None) -> float:
     """Gestational age in weeks: a phantom's own, or the first number in the last part of an atlas name.
 
+    Args:
+        subject: with a name.
+        otherwise: the age of a subject whose name has none.
+
     Raises:
-        InputError: no number that can be an age, as in `sta27` or `sb23-notoperated`.
+        InputError: no number that can be an age, as in `sta27` or `sb23-notoperated`, and no `otherwise`.
     """
     if isinstance(subject, PhantomSubject):
         return subject.weeks
     found = re.search(r"\d+(\.\d+)?", subject.name.rsplit("/", 1)[-1])
     low, high = WEEKS_RANGE
     if found is None or not low <= float(found[0]) <= high:
+        if otherwise is not None:
+            return otherwise
         raise InputError(
             f"{subject.image}: no gestational age in the name {subject.name!r}; expected a number of weeks "
             f"between {low:g} and {high:g}, as in sta27; rename the folder"

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from data_synth.data_module import VALIDATION_SEED, SyntheticDataModule
-from data_synth.heads import phantom_subjects
+from data_synth.heads import USUAL_WEEKS, phantom_subjects
 from data_synth.prior_samples import Patches, SyntheticSubjects
 from data_synth.subject_dataset import EpochSampler
 from data_synth.template import atlas_templates
@@ -85,7 +85,9 @@ class StackSynthesisDataModule(SyntheticDataModule):
         """The atlas template of the training subjects, which the network carries."""
         if self._template is None:
             self._template = atlas_templates(
-                self.subjects(self.hparams["val_subjects"])[0], self.hparams["template_spacing_mm"]
+                self.subjects(self.hparams["val_subjects"])[0],
+                self.hparams["template_spacing_mm"],
+                unknown_weeks=USUAL_WEEKS,
             )
         return self._template
 

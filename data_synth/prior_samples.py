@@ -15,7 +15,7 @@ from torch import Tensor
 from data_synth.artefacts import with_artefacts
 from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
-from data_synth.heads import Subject, load_volume_of, weeks_of
+from data_synth.heads import USUAL_WEEKS, Subject, load_volume_of, weeks_of
 from data_synth.mask_errors import SKULL_RIM_SHARE, SMALL_MASK_SHARE, with_mask_errors, with_skull_rim
 from data_synth.protocol_sampling import draw_settings
 from data_synth.registration_errors import ResidualKind, draw_residual_kind, mean_motion, residual_errors
@@ -97,7 +97,8 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         self.distinct = distinct
         self.augmentation = None if in_order else augmentation()
         # all that decides the subjects, apart from the code
-        spec = ([one.name for one in subjects], spacing_mm, seed, patch_size, artefact_share, in_order)
+        made_of = (template.weeks.tolist(), template.volume.shape, float(template.volume.mean()))
+        spec = ([one.name for one in subjects], made_of, spacing_mm, seed, patch_size, artefact_share, in_order)
         self.cache = SubjectCache(cache, repr(spec)) if cache is not None else None
 
     def make(self, epoch: int, index: int) -> Patches:
@@ -133,7 +134,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
             truth = augmented(truth, self.augmentation, rng)
         truth = _padded(cropped(truth, MARGIN_VOXELS), self.patch_size)
         n_stacks = 1 + index % MAX_VALIDATION_STACKS if self.in_order else None
-        head = self._template_head(weeks_of(self.subjects[which]), rng)
+        head = self._template_head(weeks_of(self.subjects[which], USUAL_WEEKS), rng)
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
 
     def _template_head(self, weeks: float, rng: np.random.Generator) -> TemplateHead:

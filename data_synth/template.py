@@ -23,7 +23,10 @@ HALF_WINDOW_WEEKS = 2.0
 
 
 def atlas_templates(
-    subjects: Sequence[Subject], spacing_mm: float = 3.0, weeks: Sequence[float] = TEMPLATE_WEEKS
+    subjects: Sequence[Subject],
+    spacing_mm: float = 3.0,
+    weeks: Sequence[float] = TEMPLATE_WEEKS,
+    unknown_weeks: float | None = None,
 ) -> AtlasTemplate:
     """Mean heads in the atlas frame: centred, normalised, averaged over near ages, left-right symmetric.
 
@@ -35,11 +38,12 @@ def atlas_templates(
         subjects: to average.
         spacing_mm: isotropic voxel size of the template.
         weeks: gestational ages wanted.
+        unknown_weeks: age of subjects whose names have none.
 
     Raises:
-        InputError: no subject near any of the ages, or a subject without an age in its name.
+        InputError: no subject near any of the ages, or a subject without an age in its name, and no `unknown_weeks`.
     """
-    ages = np.array([weeks_of(subject) for subject in subjects])
+    ages = np.array([weeks_of(subject, unknown_weeks) for subject in subjects])
     members = {w: np.flatnonzero(np.abs(ages - w) <= HALF_WINDOW_WEEKS + 1e-6) for w in weeks}
     used = [w for w in weeks if len(members[w])]
     if not used:

@@ -23,6 +23,9 @@ from g3r.geometry.grid import on_grid
 WORKING_VOXEL_MM = 3.0
 """Voxels in which template and head are compared."""
 
+BLUR_VOXELS = 0.4
+"""Of the working voxels: standard deviation of the blur of both before they are compared."""
+
 LATTICE_MM = 13.0
 """Distance of the control points of the deformation."""
 
@@ -94,9 +97,13 @@ def _fitted(
     n_steps: tuple[int, int],
 ) -> TemplateFit:
     working = grid.respaced(WORKING_VOXEL_MM)
-    observed, outline, weight = (_reduced(one, grid, working) for one in (head, share, seen))
-    weight = torch.clamp(weight, 0, 1)
-    pair = torch.from_numpy(np.stack([template, (template > 0).astype(np.float32)]))[None]
+    # means over what was seen alone: zeros of unseen voxels are no evidence
+    weight = _reduced(seen, grid, working)
+    observed, outline = (_reduced(one * seen, grid, working) / weight.clamp_min(1e-3) for one in (head, share))
+    weight = weight.clamp(0, 1)
+    sharp = [template, (template > 0).astype(np.float32)]
+    sigma = BLUR_VOXELS * WORKING_VOXEL_MM / template_grid.spacing_mm
+    pair = torch.from_numpy(np.stack([gaussian_filter(one, sigma) for one in sharp]))[None]
     deformation = _Deformation(working, template_grid)
     affine_steps, total = n_steps[0], sum(n_steps)
     adams = [_Adam(deformation.affine)]
@@ -115,7 +122,7 @@ def _fitted(
             adam.step(STEP_MM * 0.1 ** (step / max(total - 1, 1)))
         deformation.control.grad = None
     with torch.no_grad():
-        warped, inside = deformation.on(grid).sample(pair)
+        warped, inside = deformation.on(grid).sample(torch.from_numpy(np.stack(sharp))[None])
         values = _coloured(warped, colour).clamp_min(0)
     return TemplateFit(values=values.numpy(), inside=inside.numpy(), loss=float(mismatch.detach()))
 
@@ -207,7 +214,7 @@ def _cubic_basis(position: NDArray[np.float64], n_spans: int) -> NDArray[np.floa
 
 def _reduced(volume: NDArray[np.float32], grid: VolumeGrid, coarse: VolumeGrid) -> Tensor:
     """A volume on coarser voxels, averaged over about one of them."""
-    sigma = 0.4 * coarse.spacing_mm / grid.spacing_mm
+    sigma = BLUR_VOXELS * coarse.spacing_mm / grid.spacing_mm
     found = on_grid(gaussian_filter(volume, sigma), grid, coarse, outside=0.0)
     # the filter's tails are denormal numbers, on which a CPU takes a hundred times as long
     found[np.abs(found) < 1e-6] = 0

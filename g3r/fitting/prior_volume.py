@@ -48,7 +48,7 @@ def prior_volume(
         fitted = placed.fitted(volumes.sharp, share, volumes.density, volumes.grid)
         guess, outline = fitted.values, fitted.inside
     else:
-        guess = smooth_fill(volumes.sharp, np.clip(volumes.density / KNOWN_DENSITY, 0, 1))
+        guess = smooth_fill(volumes.sharp, np.clip(volumes.density / KNOWN_DENSITY, 0, 1), share)
         outline = volumes.foreground.mask().astype(np.float32)
     values, brain = guess, None
     if prior is not None:

@@ -22,9 +22,9 @@ class PriorOutput(NamedTuple):
 class DensityGatedPriorNetwork(nn.Module):
     """The structural prior: V_prior = base + G(c) F, Eq. 7 with a base that reaches into what no slice saw.
 
-    The paper's base is V_coarse, which is zero where nothing was measured. Here it is V_sharp where slices looked and
-    an atlas template, fitted to what they saw, where none did (`PriorInputs.base`). `sharp_base=False,
-    use_sharp=False, use_template=False` is Eq. 7 as printed, but for the bound: |F| < 1, so that alpha is the
+    The paper's base is V_coarse, which is zero where nothing was measured. Here it is V_coarse where slices looked and
+    an atlas template, fitted to what they saw, where none did (`PriorInputs.base`). `use_sharp=False,
+    use_template=False` is Eq. 7 as printed, but for the bound: |F| < 1, so that alpha is the
     most by which the network may change a densely measured voxel, in units of the brightest tissue.
 
     The network carries the atlas template that its training used; fitting it is the caller's work
