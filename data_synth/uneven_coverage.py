@@ -72,7 +72,8 @@ def without_slices(one: SimulatedStack, first: int, last: int) -> SimulatedStack
         first: number of a slice.
         last: number of the slice after the run.
     """
-    return replace(one, stack=emptied(one.stack, first, last))
+    stack = emptied(one.stack, first, last)
+    return one if stack is one.stack else replace(one, stack=stack)
 
 
 def _with_missing_run(one: SimulatedStack, rng: np.random.Generator) -> SimulatedStack:
