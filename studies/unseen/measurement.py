@@ -1,0 +1,198 @@
+"""One head of which part was never seen: reconstructed, and seen and unseen brain compared with the truth."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_synth.uneven_coverage import emptied
+from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
+from g3r.acquisition.images import Volume
+from g3r.acquisition.stacks import Stack
+from g3r.evaluation.align import resample
+from g3r.evaluation.case import SimulatedCase
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.output.result import ReconstructionResult
+from g3r.planning.presets import PRESETS
+from g3r.reconstruct import GaussianReconstructor
+from studies.harness import Row
+from studies.prior.volumes import slices_at_true_poses
+from studies.runs import aligned
+from studies.tables import Cell
+from studies.unseen.fills import FILLS, filled_volumes
+
+MIN_VOXELS = 100
+"""Parts of a brain with fewer voxels are not scored."""
+
+
+@dataclass(frozen=True)
+class Hole:
+    """What one stack misses of its masked slices.
+
+    Args:
+        stack: number of the stack.
+        first: where it begins, as a share of the masked slices.
+        last: where it ends, as a share.
+        n_slices: length in slices, in place of `last`.
+    """
+
+    stack: int
+    first: float
+    last: float = 1.0
+    n_slices: int | None = None
+
+
+def with_holes(stacks: Sequence[Stack], holes: Sequence[Hole]) -> tuple[Stack, ...]:
+    """The stacks without the slices of the holes, which stay in them as zeros with empty masks.
+
+    Args:
+        stacks: whole.
+        holes: at most one of each stack.
+    """
+    result = list(stacks)
+    for hole in holes:
+        masked = np.flatnonzero(stacks[hole.stack].mask.any((0, 1)))
+        first = round(hole.first * len(masked))
+        end = round(hole.last * len(masked)) if hole.n_slices is None else first + hole.n_slices
+        chosen = masked[first:end]
+        if len(chosen):
+            result[hole.stack] = emptied(stacks[hole.stack], int(chosen[0]), int(chosen[-1]) + 1)
+    return tuple(result)
+
+
+def measured(case: SimulatedCase, options: argparse.Namespace) -> Row:
+    """Reconstruct a case, and score seen and unseen brain of every fill.
+
+    Args:
+        case: with the stacks as they are to be used.
+        options: of the command; preset and prior count.
+    """
+    reconstructor = GaussianReconstructor(options.ckpt, PRESETS[options.preset])
+    start = time.perf_counter()
+    poses = reconstructor.register_stacks(case.stacks)
+    result = reconstructor.reconstruct(case.stacks, poses)
+    seconds = time.perf_counter() - start
+    error = case.pose_error(result.slices)
+    assert reconstructor.prior is not None
+    fills, made_of = filled_volumes(poses, reconstructor.prior, reconstructor.prior.voxel_mm)
+    volumes: dict[str, tuple[NDArray[np.float32], VolumeGrid]] = {
+        **{name: (values, made_of.grid) for name, values in fills.items()},
+        "V_prior": (result.prior, result.prior_grid),
+        "volume": (result.volume, result.grid),
+    }
+    unseen = truly_unseen(case)
+    brain_mm3 = float(result.mask.sum()) * result.grid.voxel_volume_mm3
+    true_mm3 = float(case.truth_mask.sum()) * case.truth.grid.voxel_volume_mm3
+    registration = result.record.registration
+    return {
+        "n_stacks": len(case.stacks),
+        "unseen_share": float(unseen.sum()) / float(case.truth_mask.sum()),
+        "stated_share": result.record.unseen.share if result.record.unseen else 0.0,
+        **error.figures(),
+        "volume_error": brain_mm3 / true_mm3 - 1,
+        "scores": {name: scored(case, *volumes[name], error.common, unseen) for name in FILLS},
+        "calibration": calibration_ratio(case, result, error.common),
+        "warned": bool(result.record.warnings),
+        "reliable": registration.reliable if registration else None,
+        "seconds": round(seconds, 1),
+    }
+
+
+def truly_unseen(case: SimulatedCase) -> NDArray[np.bool_]:
+    """Voxels of the true brain that no slice saw at its true pose."""
+    density = coverage(slices_at_true_poses(case, len(case.stacks)), case.truth.grid)
+    return case.truth_mask & (density < UNSEEN_BELOW)
+
+
+def scored(
+    case: SimulatedCase, values: NDArray[np.float32], grid: VolumeGrid, common: RigidPose, unseen: NDArray[np.bool_]
+) -> dict[str, float]:
+    """PSNR (dB) of the whole brain, of its seen and of its unseen part, after alignment and one gain and offset.
+
+    Args:
+        case: with the truth.
+        values: [I, J, K] a volume.
+        grid: its grid.
+        common: motion of all slices to the truth.
+        unseen: on the truth's grid.
+    """
+    alignment = aligned(case, values, grid, common).alignment
+    assert alignment is not None
+    volume = Volume(values, grid.moved(common).affine, "volume")
+    moved = resample(volume, case.truth.grid, alignment.volume_from_reference)
+    truth, brain = case.truth.data, case.truth_mask
+    seen = brain & ~unseen
+    design = np.stack([moved[seen], np.ones(int(seen.sum()))], axis=1)
+    gain, offset = np.linalg.lstsq(design, truth[seen], rcond=None)[0]
+    squared = (gain * moved + offset - truth) ** 2
+    peak = float(np.percentile(truth[brain], 99.9))
+    parts = {"whole": brain, "seen": seen, "unseen": unseen}
+    return {
+        name: round(float(10 * np.log10(peak**2 / squared[part].mean())), 3)
+        for name, part in parts.items()
+        if part.sum() > MIN_VOXELS
+    }
+
+
+def calibration_ratio(case: SimulatedCase, result: ReconstructionResult, common: RigidPose) -> dict[str, float]:
+    """Stated expected error over the true mean error, in the seen and in the unseen part of the result.
+
+    Args:
+        case: with the truth.
+        result: of the reconstruction.
+        common: motion of all slices to the truth.
+    """
+    alignment = aligned(case, result.volume, result.grid, common).alignment
+    assert alignment is not None
+    assert result.uncertainty is not None
+    truth_from_result = alignment.volume_from_reference.inverse() @ common
+    truth = resample(case.truth, result.grid, truth_from_result)
+    inside = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
+    both = result.mask & (resample(inside, result.grid, truth_from_result) > 0.5)
+    seen = both & ~result.unseen
+    factor = float(result.volume[seen].mean()) / float(truth[seen].mean())
+    error = np.abs(result.volume - factor * truth)
+    parts = {"seen": seen, "unseen": both & result.unseen}
+    return {
+        name: round(float(result.uncertainty[part].mean() / error[part].mean()), 3)
+        for name, part in parts.items()
+        if part.sum() > MIN_VOXELS
+    }
+
+
+def line(key: str, row: Row) -> str:
+    """A finished case."""
+    unseen = ", ".join(f"{name} {row['scores'][name].get('unseen', float('nan')):.1f}" for name in FILLS)
+    return (
+        f"{key}: {row['unseen_share']:.1%} unseen, TRE {row['median_mm']:.2f} mm, brain {row['volume_error']:+.1%}, "
+        f"whole {row['scores']['volume']['whole']:.2f} dB, unseen dB: {unseen}, {row['seconds']:.0f} s"
+        f"{', warned' * row['warned']}"
+    )
+
+
+def _unseen(name: str) -> Cell:
+    return lambda row: f"{row['scores'][name]['unseen']:.1f}" if "unseen" in row["scores"][name] else "-"
+
+
+def _ratio(row: Row) -> str:
+    return f"{row['calibration']['unseen']:.2f}" if "unseen" in row["calibration"] else "-"
+
+
+EACH: dict[str, Cell] = {
+    "case": "{name}",
+    "unseen": "{unseen_share:.1%}",
+    "stated": "{stated_share:.1%}",
+    "TRE mm, median / p90": "{median_mm:.2f} / {p90_mm:.2f}",
+    "brain volume": "{volume_error:+.1%}",
+    **{f"{name}, unseen dB": _unseen(name) for name in FILLS},
+    "whole dB": "{scores[volume][whole]:.2f}",
+    "stated / true error": _ratio,
+    "warned": lambda row: "yes" if row["warned"] else "-",
+    "s": "{seconds:.0f}",
+}
+"""Columns of a table of cases."""
