@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -38,13 +38,13 @@ def reconstructed(options: argparse.Namespace, *, fitting: bool) -> list[Judged]
     settings = replace(PRESETS[options.preset], use_prior=not options.no_prior)
     reconstructor = GaussianReconstructor(options.ckpt, settings)
     subjects = (FIT_SUBJECTS if fitting else CHECK_SUBJECTS)[: options.subjects]
-    todo = [(*one, reconstructor) for one in subjects]
+    todo = [(one, reconstructor) for one in subjects]
     if not fitting and not options.subjects:
         unregistered = GaussianReconstructor(options.ckpt, changed(settings, NO_REGISTRATION))
-        todo.append((*UNREGISTERED, unregistered))
+        todo.append((UNREGISTERED, unregistered))
     found = []
-    for spec, n_stacks, by in todo:
-        one = judged(spec, n_stacks, by, options.cache, registered=by is reconstructor)
+    for subject, by in todo:
+        one = judged(subject, by, options.cache, registered=by is reconstructor)
         found.append(one)
         print(
             f"{one.label}: {one.psnr_db:.2f} dB, poses {one.median_mm:.2f} mm, mean error "
@@ -71,8 +71,14 @@ def fit(options: argparse.Namespace) -> Row:
         "prior": _weights(options),
         "voxels_per_subject": len(found[0].error),
         "subjects": [
-            {"volume": one.spec.volume, "motion": one.spec.motion, "seed": one.spec.seed, "stacks": one.n_stacks}
-            for one in found
+            {
+                "volume": one.spec.volume,
+                "motion": one.spec.motion,
+                "seed": one.spec.seed,
+                "stacks": one.n_stacks,
+                "holes": [asdict(hole) for hole in one.holes],
+            }
+            for one in (judged.subject for judged in found)
         ],
     }
     save_calibration(CALIBRATION, {**models, name: model}, records)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,49 +19,66 @@ from g3r.output.result import ReconstructionResult
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from g3r.uncertainty.estimate import UncertaintyInputs
+from studies.holes import Hole, with_holes
 from studies.runs import aligned
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import stacks
 
-Subject = tuple[SubjectSpec, int]
-"""A subject and the number of its stacks that are used."""
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A subject, the number of its stacks that are used, and what they miss."""
+
+    spec: SubjectSpec
+    n_stacks: int
+    holes: tuple[Hole, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """For tables: name, number of stacks, and whether something is missing."""
+        missing = ", slices missing" if self.holes else ""
+        return f"{self.spec.name}, {stacks(self.n_stacks)}{missing}"
 
 
-def _subjects(*chosen: tuple[str, int, str, int]) -> list[Subject]:
-    """Subjects from volume, number of stacks, motion and seed."""
-    return [(SubjectSpec(volume=volume, motion=motion, seed=seed), n) for volume, n, motion, seed in chosen]
+def _subject(volume: str, n_stacks: int, motion: str, seed: int, *holes: Hole) -> Subject:
+    return Subject(spec=SubjectSpec(volume=volume, motion=motion, seed=seed), n_stacks=n_stacks, holes=holes)
 
 
-FIT_SUBJECTS = _subjects(
-    ("spina-bifida/sb26-operated", 3, "mild", 51_200),
-    ("spina-bifida/sb33-operated", 1, "mild", 51_209),
-    ("spina-bifida/sb28-operated", 3, "moderate", 51_201),
-    ("spina-bifida/sb25-operated", 1, "mild", 51_205),
-    ("spina-bifida/sb30-operated", 3, "mild", 51_202),
-    ("spina-bifida/sb27-operated", 1, "none", 51_206),
-    ("spina-bifida/sb32-operated", 3, "moderate", 51_203),
-    ("spina-bifida/sb29-operated", 1, "mild", 51_207),
-    ("spina-bifida/sb34-operated", 3, "mild", 51_204),
-    ("spina-bifida/sb31-operated", 1, "mild", 51_208),
-)
-"""Volume, stacks, motion and seed of the subjects that the coefficients are fitted to. No prior was
+def _in_each(first: float, last: float) -> tuple[Hole, ...]:
+    """The same hole in each of three stacks."""
+    return tuple(Hole(stack, first, last) for stack in range(3))
+
+
+FIT_SUBJECTS = [
+    _subject("spina-bifida/sb26-operated", 3, "mild", 51_200),
+    _subject("spina-bifida/sb33-operated", 1, "mild", 51_209, Hole(0, 0.4, n_slices=3)),
+    _subject("spina-bifida/sb28-operated", 3, "moderate", 51_201, *_in_each(0.3, 0.6)),
+    _subject("spina-bifida/sb25-operated", 1, "mild", 51_205),
+    _subject("spina-bifida/sb30-operated", 3, "mild", 51_202),
+    _subject("spina-bifida/sb27-operated", 1, "none", 51_206, Hole(0, 0.7)),
+    _subject("spina-bifida/sb32-operated", 3, "moderate", 51_203),
+    _subject("spina-bifida/sb29-operated", 1, "mild", 51_207),
+    _subject("spina-bifida/sb34-operated", 3, "mild", 51_204, *_in_each(0.7, 1.0)),
+    _subject("spina-bifida/sb31-operated", 1, "mild", 51_208, Hole(0, 0.55, n_slices=6)),
+]
+"""Volume, stacks, motion, seed and missing slices of the subjects that the coefficients are fitted to. No prior was
 trained on these volumes (checkpoints are chosen by them)."""
 
-CHECK_SUBJECTS = _subjects(
-    ("crl-sta/sta24", 3, "mild", 52_200),
-    ("crl-sta/sta30", 1, "mild", 52_201),
-    ("crl-sta/sta34", 3, "moderate", 52_202),
-    ("crl-sta/sta24", 1, "mild", 52_203),
-    ("crl-sta/sta30", 3, "mild", 52_204),
-    ("crl-sta/sta34", 1, "mild", 52_205),
-    ("crl-sta/sta24", 3, "moderate", 52_206),
-    ("crl-sta/sta30", 1, "none", 52_207),
-    ("crl-sta/sta34", 3, "mild", 52_208),
-    ("crl-sta/sta24", 1, "mild", 52_209),
-)
+CHECK_SUBJECTS = [
+    _subject("crl-sta/sta24", 3, "mild", 52_200),
+    _subject("crl-sta/sta30", 1, "mild", 52_201, Hole(0, 0.45, n_slices=4)),
+    _subject("crl-sta/sta34", 3, "moderate", 52_202, *_in_each(0.35, 0.6)),
+    _subject("crl-sta/sta24", 1, "mild", 52_203, Hole(0, 0.0, 0.3)),
+    _subject("crl-sta/sta30", 3, "mild", 52_204, *_in_each(0.7, 1.0)),
+    _subject("crl-sta/sta34", 1, "mild", 52_205),
+    _subject("crl-sta/sta24", 3, "moderate", 52_206),
+    _subject("crl-sta/sta30", 1, "none", 52_207),
+    _subject("crl-sta/sta34", 3, "mild", 52_208),
+    _subject("crl-sta/sta24", 1, "mild", 52_209, Hole(0, 0.6, n_slices=2)),
+]
 """Subjects that the coefficients are checked on: weeks excluded from every training and choice."""
 
-UNREGISTERED = _subjects(("crl-sta/sta24", 3, "moderate", 52_250))[0]
+UNREGISTERED = _subject("crl-sta/sta24", 3, "moderate", 52_250)
 """One more of the check, reconstructed as if headers were right: does the map say that it is wrong?"""
 
 NO_REGISTRATION = {
@@ -81,9 +98,9 @@ class Judged:
     """One reconstruction, voxel by voxel.
 
     Attributes:
-        spec: the subject.
-        n_stacks: how many of its stacks were used.
+        subject: which, from how many stacks, what they miss.
         predictors: [n] by name, a random choice of the voxels inside both masks.
+        unseen: [n] voxels that no slice saw.
         error: [n] volume minus truth, in normalised intensities.
         psnr_db: of the volume.
         median_mm: error of the poses.
@@ -93,9 +110,9 @@ class Judged:
         map_seconds: of the map alone, processor time.
     """
 
-    spec: SubjectSpec
-    n_stacks: int
+    subject: Subject
     predictors: dict[str, NDArray[np.float64]]
+    unseen: NDArray[np.bool_]
     error: NDArray[np.float64]
     psnr_db: float
     median_mm: float
@@ -107,26 +124,23 @@ class Judged:
     @property
     def label(self) -> str:
         """Subject and number of stacks."""
-        name = f"{self.spec.name}, {stacks(self.n_stacks)}"
-        return name if self.registered else f"{name}, not registered"
+        return self.subject.label if self.registered else f"{self.subject.label}, not registered"
 
 
-def judged(
-    spec: SubjectSpec, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path, *, registered: bool = True
-) -> Judged:
+def judged(subject: Subject, reconstructor: GaussianReconstructor, cache: Path, *, registered: bool = True) -> Judged:
     """Simulate, register (or take that from the cache), reconstruct and compare with the truth.
 
     Args:
-        spec: the subject.
-        n_stacks: of its stacks.
+        subject: which, from how many stacks, what they miss.
         reconstructor: with or without prior.
         cache: folder of simulated subjects and their registrations.
         registered: False reconstructs from the headers.
     """
-    case = simulated_case(spec, cache)
-    motion = _cached_registration(case, n_stacks, reconstructor, cache) if registered else None
+    case = simulated_case(subject.spec, cache, subject.n_stacks)
+    case = replace(case, stacks=with_holes(case.stacks, subject.holes))
+    motion = _cached_registration(case, subject, reconstructor, cache) if registered else None
     start = time.perf_counter()
-    result = reconstructor.reconstruct(case.stacks[:n_stacks], motion)
+    result = reconstructor.reconstruct(case.stacks, motion)
     pose_error = case.pose_error(result.slices)
     alignment = aligned(case, result.volume, result.grid, pose_error.common).alignment
     assert alignment is not None
@@ -135,13 +149,13 @@ def judged(
     mask = Volume(case.truth_mask.astype(np.float32), case.truth.affine, "mask")
     both = result.mask & (resample(mask, result.grid, truth_from_result) > 0.5)
     error = relative_error(result.volume, truth, both) / result.intensity_scale
-    rng = np.random.default_rng(spec.seed)
+    rng = np.random.default_rng(subject.spec.seed)
     inside = np.flatnonzero(both[result.mask])
     chosen = np.sort(rng.choice(inside, min(VOXELS_PER_SUBJECT, len(inside)), replace=False))
     return Judged(
-        spec=spec,
-        n_stacks=n_stacks,
+        subject=subject,
         predictors={name: one[chosen] for name, one in predictors_of(result).items()},
+        unseen=result.unseen[result.mask][chosen],
         error=error[result.mask][chosen],
         psnr_db=score(result.volume, truth, both).psnr_db,
         median_mm=pose_error.median_mm,
@@ -194,14 +208,15 @@ def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]
 
 
 def _cached_registration(
-    case: SimulatedCase, n_stacks: int, reconstructor: GaussianReconstructor, cache: Path
+    case: SimulatedCase, subject: Subject, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
-    """Registration of the first stacks; it does not depend on the prior, so it is made once and kept."""
-    path = cache / f"{case.name}-{n_stacks}.whole-slices.motion.pkl"
+    """Registration of the stacks; it does not depend on the prior, so it is made once and kept."""
+    missing = "".join(f"-{h.stack}_{h.first:g}_{h.n_slices or h.last:g}" for h in subject.holes)
+    path = cache / f"{case.name}-{subject.n_stacks}{missing}.whole-slices.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:
             return pickle.load(stream)
-    motion = reconstructor.register_stacks(case.stacks[:n_stacks])
+    motion = reconstructor.register_stacks(case.stacks)
     with path.open("wb") as stream:
         pickle.dump(motion, stream)
     return motion

@@ -19,6 +19,9 @@ COVERAGE_FACTORS = (1.0, 2.0, 3.0)
 EXPONENTIAL_COVERAGE = tuple(1 - np.exp(-np.array(COVERAGE_FACTORS)))
 """Coverage of exponentially distributed errors."""
 
+MIN_VOXELS = 100
+"""Parts of a brain with fewer voxels are not judged."""
+
 REMOVED_SHARES = np.linspace(0, 0.95, 20)
 """Shares of the most uncertain voxels removed, for the sparsification curve."""
 
@@ -28,7 +31,7 @@ def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
     stated = [model.expected(one.predictors) for one in found]
     subjects = {
         one.label: {
-            "n_stacks": one.n_stacks,
+            "n_stacks": one.subject.n_stacks,
             "psnr_db": one.psnr_db,
             "poses_mm": one.median_mm,
             "reliable": one.reliable,
@@ -36,14 +39,16 @@ def check_record(found: Sequence[Judged], model: ErrorModel) -> dict[str, Any]:
             "seconds": one.seconds,
             "map_seconds": one.map_seconds,
             **judge(u, np.abs(one.error)),
+            "unseen": sizes(u, np.abs(one.error), one.unseen),
         }
         for one, u in zip(found, stated, strict=True)
     }
     together = {}
-    for n in sorted({one.n_stacks for one in found}):
-        of_n = [k for k, one in enumerate(found) if one.n_stacks == n and one.registered]
+    for n in sorted({one.subject.n_stacks for one in found}):
+        of_n = [k for k, one in enumerate(found) if one.subject.n_stacks == n and one.registered]
         size = np.concatenate([np.abs(found[k].error) for k in of_n])
-        together[str(n)] = judge(np.concatenate([stated[k] for k in of_n]), size)
+        u, unseen = np.concatenate([stated[k] for k in of_n]), np.concatenate([found[k].unseen for k in of_n])
+        together[str(n)] = {**judge(u, size), "unseen": sizes(u, size, unseen)}
     return {
         "intercept": model.intercept,
         "coefficients": model.coefficients,
@@ -89,6 +94,13 @@ def judge(stated: NDArray[np.float64], size: NDArray[np.float64]) -> dict[str, A
     }
 
 
+def sizes(stated: NDArray[np.float64], size: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, float] | None:
+    """Mean stated and found size [n] of the errors of some voxels; None of fewer than `MIN_VOXELS`."""
+    if chosen.sum() < MIN_VOXELS:
+        return None
+    return {"mean_stated": float(stated[chosen].mean()), "mean_error": float(size[chosen].mean())}
+
+
 def sparsification(by: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean error of the voxels that are kept as those with the largest `by` are removed [20]."""
     total = np.cumsum(size[np.argsort(by, kind="stable")])
@@ -110,7 +122,7 @@ def check_text(record: Mapping[str, Mapping[str, Any]]) -> str:
             ratios = [s["mean_error"] / s["mean_stated"] for s in of_n]
             rows.append({"calibration": name, "n_stacks": n, "ratios": ratios, **figures})
         each += [{"calibration": name, "subject": label, **s} for label, s in one["subjects"].items()]
-    exponential = ["errors of exponential size", *["-"] * 4, "1.00", "-"]
+    exponential = ["errors of exponential size", *["-"] * 4, "1.00", "-", "-"]
     exponential += [*(f"{share:.0%}" for share in EXPONENTIAL_COVERAGE), "1.00", "-", "-"]
     terms = "; ".join(
         f"{name}: ln u = {one['intercept']:.2f} "
@@ -135,6 +147,10 @@ def _ratio(figures: Mapping[str, Any]) -> str:
     return f"{figures['mean_error'] / figures['mean_stated']:.2f}"
 
 
+def _unseen_ratio(figures: Mapping[str, Any]) -> str:
+    return _ratio(figures["unseen"]) if figures["unseen"] else "-"
+
+
 def _coverage(n: int) -> Callable[[Mapping[str, Any]], str]:
     return lambda figures: f"{figures['coverage'][n]:.0%}"
 
@@ -148,6 +164,7 @@ SIZES: dict[str, Cell] = {
     "mean error %": lambda figures: f"{100 * figures['mean_error']:.2f}",
     "stated %": lambda figures: f"{100 * figures['mean_stated']:.2f}",
     "error / stated": _ratio,
+    "unseen: error / stated": _unseen_ratio,
 }
 RANKS: dict[str, Cell] = {"rank correlation": "{spearman:.2f}", "gain over constant": "{gain_over_constant:.0%}"}
 SUMMARY: dict[str, Cell] = {

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from studies.harness import FITS, Record, Row, Study, Task
+from studies.holes import Hole, with_holes
 from studies.subjects import data_folder, read_case
 from studies.tables import table
-from studies.unseen.measurement import EACH, Hole, line, measured, with_holes
+from studies.unseen.measurement import EACH, line, measured
 
 
 @dataclass(frozen=True, kw_only=True)

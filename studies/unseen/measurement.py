@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.uneven_coverage import emptied
 from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
 from g3r.acquisition.images import Volume
-from g3r.acquisition.stacks import Stack
 from g3r.evaluation.align import resample
 from g3r.evaluation.case import SimulatedCase
 from g3r.geometry import RigidPose, VolumeGrid
@@ -28,41 +24,6 @@ from studies.unseen.fills import FILLS, filled_volumes
 
 MIN_VOXELS = 100
 """Parts of a brain with fewer voxels are not scored."""
-
-
-@dataclass(frozen=True)
-class Hole:
-    """What one stack misses of its masked slices.
-
-    Args:
-        stack: number of the stack.
-        first: where it begins, as a share of the masked slices.
-        last: where it ends, as a share.
-        n_slices: length in slices, in place of `last`.
-    """
-
-    stack: int
-    first: float
-    last: float = 1.0
-    n_slices: int | None = None
-
-
-def with_holes(stacks: Sequence[Stack], holes: Sequence[Hole]) -> tuple[Stack, ...]:
-    """The stacks without the slices of the holes, which stay in them as zeros with empty masks.
-
-    Args:
-        stacks: whole.
-        holes: at most one of each stack.
-    """
-    result = list(stacks)
-    for hole in holes:
-        masked = np.flatnonzero(stacks[hole.stack].mask.any((0, 1)))
-        first = round(hole.first * len(masked))
-        end = round(hole.last * len(masked)) if hole.n_slices is None else first + hole.n_slices
-        chosen = masked[first:end]
-        if len(chosen):
-            result[hole.stack] = emptied(stacks[hole.stack], int(chosen[0]), int(chosen[-1]) + 1)
-    return tuple(result)
 
 
 def measured(case: SimulatedCase, options: argparse.Namespace) -> Row:

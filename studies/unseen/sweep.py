@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from studies.harness import FITS, Record, Row, Study, Task
+from studies.holes import Hole, with_holes
 from studies.runs import BAD_MEDIAN_MM
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import details, new_figure, save_figure, table
 from studies.unseen.fills import FILLS
-from studies.unseen.measurement import EACH, Hole, line, measured, with_holes
+from studies.unseen.measurement import EACH, line, measured
 
 VOLUMES = (
     "crl-sta/sta24",

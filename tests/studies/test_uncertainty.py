@@ -61,10 +61,12 @@ def test_error_does_not_depend_on_the_scale_of_the_volume() -> None:
 
 
 def test_fit_and_check_share_no_volume_and_no_seed() -> None:
-    fitted, checked = ([spec for spec, _ in chosen] for chosen in (FIT_SUBJECTS, CHECK_SUBJECTS))
+    fitted, checked = ([one.spec for one in chosen] for chosen in (FIT_SUBJECTS, CHECK_SUBJECTS))
     for what in ("volume", "seed"):
         assert not {getattr(spec, what) for spec in fitted} & {getattr(spec, what) for spec in checked}
     assert len({spec.name for spec in fitted}) == len(fitted)
+    for subjects in (FIT_SUBJECTS, CHECK_SUBJECTS):  # whole ones and ones with a hole, from one stack and from three
+        assert {(one.n_stacks, bool(one.holes)) for one in subjects} == {(1, True), (1, False), (3, True), (3, False)}
     assert all(spec.volume.startswith("spina-bifida/") and spec.volume.endswith("-operated") for spec in fitted)
 
 
@@ -81,8 +83,9 @@ def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:
     }
     return SimpleNamespace(
         label=name,
-        n_stacks=n_stacks,
+        subject=SimpleNamespace(n_stacks=n_stacks),
         predictors=predictors,
+        unseen=predictors["unmeasured"] > (0.9 if n_stacks == 1 else 1),
         error=rng.exponential(predictors["residual"]),
         psnr_db=28.0,
         median_mm=0.1,
@@ -101,6 +104,9 @@ def test_record_table_and_figure(tmp_path: Path) -> None:
     record = check_record(found, ErrorModel(-0.1, {"log residual": 1.0}))  # type: ignore[arg-type]
     assert set(record["by_stacks"]) == {"1", "3"}
     assert record["by_stacks"]["3"]["mean_error"] < 0.1
+    assert record["by_stacks"]["3"]["unseen"] is None  # nothing was unseen
+    unseen = record["by_stacks"]["1"]["unseen"]
+    assert unseen["mean_error"] == pytest.approx(np.abs(found[2].error[found[2].unseen]).mean())
     text = check_text({"with prior": {"preset": "p", "weights": "w", **record}})
     assert text.count("| with prior |") == 2 + 4
     assert "+ 1.00 log residual" in text
