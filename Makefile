@@ -13,6 +13,8 @@ PRETRAIN_ARGS ?=
 POSE_ARGS ?=
 BENCH_ARGS ?=
 STUDY_ARGS ?=
+# processes of `make test`; the tests of a file stay together, since they share what they reconstruct
+TEST_JOBS ?= 2
 # of `make bench`: folders of g3r-simulate; phantoms are made when empty
 CASES ?=
 PHANTOM_CASES := runs/bench/phantom-cases
@@ -58,7 +60,7 @@ test: install ## lint, types and all quick tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
 
 coverage: install ## the quick tests, and which lines they reach
 	$(BIN)/pytest --cov --cov-report=term:skip-covered

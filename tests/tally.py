@@ -23,7 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import pytest
 
@@ -119,8 +120,18 @@ def tally(request: pytest.FixtureRequest) -> Tally:
     return Tally(name, request.config.stash[ROWS])
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Add up what a worker of pytest-xdist counted."""
+    for name, counts in getattr(node, "workeroutput", {}).get("tally", {}).items():
+        Tally(name, node.config.stash[ROWS]).add(**counts)
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    if any(row.lost for row in session.config.stash[ROWS].values()) and session.exitstatus == 0:
+    rows = session.config.stash[ROWS]
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["tally"] = {name: asdict(row) for name, row in rows.items()}
+    if any(row.lost for row in rows.values()) and session.exitstatus == 0:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 

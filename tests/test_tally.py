@@ -36,8 +36,9 @@ def test_cases_are_counted_and_errors_are_lost_and_go_on() -> None:
     assert table(rows)[-1].split() == ["all", "15", "4", "8", "3"]
 
 
+@pytest.mark.parametrize("workers", [[], ["-n", "2"]])
 @pytest.mark.parametrize("refused", [1, 2])
-def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int) -> None:
+def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refused: int, workers: list[str]) -> None:
     test = f"def test_one(tally):\n    tally.add(tried=3, survived=1, refused={refused})\n"
     (tmp_path / "test_kills.py").write_text(test)
     line = [
@@ -51,6 +52,7 @@ def test_the_table_is_printed_and_a_lost_case_fails_the_run(tmp_path: Path, refu
         str(tmp_path),
         "--rootdir",
         str(tmp_path),
+        *workers,
     ]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
