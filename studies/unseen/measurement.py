@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
 from g3r.acquisition.images import Volume
+from g3r.acquisition.planes import Slices
 from g3r.evaluation.align import resample
 from g3r.evaluation.case import SimulatedCase
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
+from g3r.registration import Registration
 from studies.harness import Row
 from studies.prior.volumes import slices_at_true_poses
 from studies.runs import aligned
@@ -26,12 +29,13 @@ MIN_VOXELS = 100
 """Parts of a brain with fewer voxels are not scored."""
 
 
-def measured(case: SimulatedCase, options: argparse.Namespace) -> Row:
+def measured(case: SimulatedCase, options: argparse.Namespace, *, true_poses: bool = False) -> Row:
     """Reconstruct a case, and score seen and unseen brain of every fill.
 
     Args:
         case: with the stacks as they are to be used.
         options: of the command; preset and prior count.
+        true_poses: whether to reconstruct from the true poses, too, which tells what wrong ones cost.
     """
     reconstructor = GaussianReconstructor(options.ckpt, PRESETS[options.preset])
     start = time.perf_counter()
@@ -50,7 +54,13 @@ def measured(case: SimulatedCase, options: argparse.Namespace) -> Row:
     brain_mm3 = float(result.mask.sum()) * result.grid.voxel_volume_mm3
     true_mm3 = float(case.truth_mask.sum()) * case.truth.grid.voxel_volume_mm3
     registration = result.record.registration
+    without_errors = {}
+    if true_poses:
+        best = reconstructor.reconstruct(case.stacks, at_true_poses(case, poses))
+        common = case.pose_error(best.slices).common
+        without_errors["at_true_poses"] = scored(case, best.volume, best.grid, common, unseen)
     return {
+        **without_errors,
         "n_stacks": len(case.stacks),
         "unseen_share": float(unseen.sum()) / float(case.truth_mask.sum()),
         "stated_share": result.record.unseen.share if result.record.unseen else 0.0,
@@ -62,6 +72,25 @@ def measured(case: SimulatedCase, options: argparse.Namespace) -> Row:
         "reliable": registration.reliable if registration else None,
         "seconds": round(seconds, 1),
     }
+
+
+def at_true_poses(case: SimulatedCase, found: Registration) -> Registration:
+    """A registration whose slices are where they were truly taken, in the frame that it found; unknown ones stay.
+
+    Args:
+        case: with the true poses.
+        found: the registration of its stacks.
+    """
+    true = slices_at_true_poses(case, len(case.stacks))
+    row = {key: n for n, key in enumerate(_keys(true))}
+    known = [(n, row[key]) for n, key in enumerate(_keys(found.slices)) if key in row]
+    here, there = (np.array(rows) for rows in zip(*known, strict=True))
+    pose = case.pose_error(found.slices).common.inverse() @ true.planes.pose.take(there)
+    return replace(found, slices=found.slices.with_pose(found.slices.planes.pose.with_rows(here, pose)))
+
+
+def _keys(slices: Slices) -> list[tuple[int, int]]:
+    return list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
 
 
 def truly_unseen(case: SimulatedCase) -> NDArray[np.bool_]:
