@@ -1,10 +1,13 @@
 """`g3r-pretrain`: train the prior network or the pose network with LightningCLI."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from g3r._version import __version__
+from g3r.errors import G3RError
 
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
@@ -38,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
     from g3r.cli.failures import missing_extra
-    from g3r.errors import G3RError
 
     try:
         from lightning.pytorch import LightningDataModule, Trainer
@@ -63,10 +65,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             save_config_kwargs={"overwrite": True},  # a resumed run writes its settings again
             args=arguments,
         )
-    except G3RError as error:
-        print(f"g3r-pretrain: {error}", file=sys.stderr)
-        return error.exit_code
+    except (G3RError, ValueError, SystemExit) as error:
+        own = _own_error(error)  # jsonargparse wraps what the model raises in an error of its own
+        if own is None:
+            raise
+        print(f"g3r-pretrain: {own}", file=sys.stderr)
+        return own.exit_code
     return 0
+
+
+def _own_error(error: BaseException | None) -> G3RError | None:
+    """The first error of g3r's own among an error and those that led to it."""
+    while error is not None and not isinstance(error, G3RError):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 if __name__ == "__main__":

@@ -233,3 +233,17 @@ def test_one_command_trains_both(
     network = shown["model"]["init_args"]["network"]
     assert network[setting] == 64
     assert network["channels"] == {"pose": [24, 48, 96], "prior": [32, 64, 96]}[config]  # the rest is kept
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # jsonargparse's, of its own
+def test_weights_that_cannot_be_started_from_are_refused_in_one_line(
+    pytestconfig: pytest.Config, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The error of the model comes wrapped in one of jsonargparse."""
+    path = pytestconfig.rootpath / "lightning_configs" / "prior.yaml"
+    file = tmp_path / "prior.safetensors"
+    file.write_bytes(b"not weights")
+    code = pretrain.main(["fit", "--config", str(path), f"--model.start_from={file}"])
+    assert code == InputError.exit_code
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("g3r-pretrain: ")]
+    assert str(file) in line
