@@ -91,7 +91,13 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
         volume = _volume(found, support, density, grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
-        unseen_part = UnseenPart.of(unseen, mask, grid.voxel_volume_mm3, shown=_shown_unseen(found.prior, settings))
+        unseen_part = UnseenPart.of(
+            unseen,
+            mask,
+            grid.voxel_volume_mm3,
+            shown=_shown_unseen(found.prior, settings),
+            extent_known=_extent_known(found),
+        )
     line = unseen_part.line()
     if line:
         run.warnings.append(line)
@@ -173,6 +179,12 @@ def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
     if not settings.fill_unseen:
         return "blank"
     return "estimate from other brains" if prior.has_template else "smooth continuation"
+
+
+def _extent_known(found: StageResults) -> bool:
+    """Whether the brain ends where slices or template say; not so for a single cut stack that no template fits."""
+    profiles = found.registration.profiles
+    return found.prior.has_template or len(profiles) != 1 or not profiles[0].is_cut
 
 
 def _no_fit(found: StageResults) -> SliceFit:

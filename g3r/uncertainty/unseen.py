@@ -21,17 +21,26 @@ class UnseenPart:
         share: of the brain's volume, 0 to 1.
         volume_ml: of it.
         shown: "estimate from other brains", "smooth continuation" (no template was used) or "blank".
-        usable: False where the share is so large that the volume must not be used.
+        extent_known: False where the only field of view cuts the head and no template says how large the head is; the
+            share is then too small.
+        usable: False where the share is so large, or so little known, that the volume must not be used.
     """
 
     share: float
     volume_ml: float
     shown: str
+    extent_known: bool
     usable: bool
 
     @classmethod
     def of(
-        cls, unseen: NDArray[np.bool_], brain: NDArray[np.bool_], voxel_volume_mm3: float, *, shown: str
+        cls,
+        unseen: NDArray[np.bool_],
+        brain: NDArray[np.bool_],
+        voxel_volume_mm3: float,
+        *,
+        shown: str,
+        extent_known: bool = True,
     ) -> UnseenPart:
         """Measure it.
 
@@ -40,17 +49,24 @@ class UnseenPart:
             brain: [I, J, K] all of it.
             voxel_volume_mm3: of both.
             shown: what the volume shows there.
+            extent_known: whether the brain may not go on beyond all fields of view.
         """
         share = float(unseen.sum()) / max(int(brain.sum()), 1)
         return cls(
             share=share,
             volume_ml=float(unseen.sum()) * voxel_volume_mm3 / 1000,
             shown=shown,
-            usable=share <= DO_NOT_USE_ABOVE,
+            extent_known=extent_known,
+            usable=extent_known and share <= DO_NOT_USE_ABOVE,
         )
 
     def line(self) -> str | None:
         """The sentence for terminal, run.json and picture; None where next to nothing is unseen."""
+        if not self.extent_known:
+            return (
+                "the field of view cuts the head, and no atlas template fits that would say how much of the brain lies "
+                "beyond; do not use this volume"
+            )
         if self.share < MENTIONED_ABOVE:
             return None
         verb = "was left blank" if self.shown == "blank" else f"is shown as {_with_article(self.shown)}"

@@ -15,7 +15,7 @@ from studies.harness import FITS, Record, Row, Study, Task
 from studies.holes import Hole, with_holes
 from studies.runs import BAD_MEDIAN_MM
 from studies.subjects import SubjectSpec, simulated_case
-from studies.tables import details, new_figure, save_figure, table
+from studies.tables import details, new_figure, save_figure, stacks, table
 from studies.unseen.fills import FILLS
 from studies.unseen.measurement import EACH, line, measured
 
@@ -62,7 +62,7 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
     for n in range(options.subjects):
         spec = SubjectSpec(volume=VOLUMES[n % len(VOLUMES)], motion=("mild", "moderate")[(n // 2) % 2], seed=seed + n)
         n_stacks, holes = hole_of(n, np.random.default_rng([seed, n]))
-        yield Task(f"{spec.name}, {n_stacks} stacks", measure, (spec, n_stacks, holes, options))
+        yield Task(f"{spec.name}, {stacks(n_stacks)}", measure, (spec, n_stacks, holes, options))
 
 
 def measure(spec: SubjectSpec, n_stacks: int, holes: tuple[Hole, ...], options: argparse.Namespace) -> Row:

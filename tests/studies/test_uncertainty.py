@@ -67,7 +67,8 @@ def test_fit_and_check_share_no_volume_and_no_seed() -> None:
     assert len({spec.name for spec in fitted}) == len(fitted)
     for subjects in (FIT_SUBJECTS, CHECK_SUBJECTS):  # whole ones and ones with a hole, from one stack and from three
         assert {(one.n_stacks, bool(one.holes)) for one in subjects} == {(1, True), (1, False), (3, True), (3, False)}
-    assert all(spec.volume.startswith("spina-bifida/") and spec.volume.endswith("-operated") for spec in fitted)
+    never_trained_on = ("-operated", "sta24", "sta30", "sta34")
+    assert all(spec.volume.endswith(never_trained_on) for spec in (*fitted, *checked))
 
 
 def judged_subject(name: str, n_stacks: int, seed: int) -> SimpleNamespace:

@@ -67,3 +67,14 @@ def test_no_brain_is_no_division_by_zero() -> None:
     nothing = UnseenPart.of(0 * BRAIN > 0, 0 * BRAIN > 0, 1.0, shown="blank")
     assert nothing.share == 0
     assert nothing.line() is None
+
+
+def test_a_cut_head_of_unknown_size_must_not_be_used() -> None:
+    """However little of what is called brain is unseen."""
+    found = UnseenPart.of(np.zeros_like(BRAIN), BRAIN, 8.0, shown="smooth continuation", extent_known=False)
+    assert found.share == 0
+    assert not found.usable
+    line = found.line()
+    assert line is not None
+    assert "no atlas template fits" in line
+    assert line.endswith("do not use this volume")
