@@ -3,7 +3,6 @@
 import dataclasses
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -172,18 +171,6 @@ def test_time_is_used_if_known(network: PoseNetwork, slices: Slices) -> None:
     with_time, without = (poses_of(network, slice_batch([some])) for some in (known, images))
     distance_mm, _ = pose_errors(with_time, without)
     assert distance_mm.max() > 1e-3
-
-
-def test_quick_enough() -> None:
-    network = PoseNetwork(PoseNetworkConfig(template_shape=(6, 39, 45, 43))).eval()
-    model = PoseModel(network=network, weeks=(22.0, 25.0, 28.0, 31.0, 34.0, 37.0), training_data="nothing")
-    stacks = [
-        blob_stack(turn, seed, (70, 70, 44)) for seed, turn in enumerate(Rotation.random(6, random_state=1).as_matrix())
-    ]
-    slices = slices_from_stacks(stacks)
-    start = time.process_time()
-    model.predict(slices)
-    assert time.process_time() - start < 3.0 * max(len(slices) / 130, 1)
 
 
 def test_stack_motions_ignore_a_minority(rng: np.random.Generator) -> None:
