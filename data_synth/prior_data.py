@@ -27,7 +27,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
     """Patches of a subject's volumes from an atlas folder or the built-in phantom.
 
     A batch is a dict of float32 tensors [B, 1, I, J, K] with the keys `coarse`, `density`, `share`, `sharp`,
-    `template`, `outline`, `truth` and `mask`, and `n_stacks`, int64 [B].
+    `template`, `outline`, `truth` and `mask`, `n_stacks`, int64 [B], and `thickness_mm`, float32 [B].
 
     Args:
         phantom_share: share (0 to 1) of phantoms among the training subjects of an atlas folder.

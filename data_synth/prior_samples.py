@@ -34,7 +34,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 
 IMAGE_KEYS = ("coarse", "density", "share", "sharp", "template", "outline", "truth", "mask")
 Patches = dict[str, Tensor]
-"""`IMAGE_KEYS` float32 [P, 1, I, J, K] and `n_stacks` int64 [P]."""
+"""`IMAGE_KEYS` float32 [P, 1, I, J, K], `n_stacks` int64 [P] and `thickness_mm` float32 [P]."""
 
 MARGIN_VOXELS = 6
 """Background kept around a head: the network must learn that nothing is there."""
@@ -110,7 +110,8 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         boxes = [tuple(slice(a, a + self.patch_size) for a in corner) for corner in first]
         images = {key: np.stack([getattr(one, key)[box] for box in boxes])[:, None] for key in IMAGE_KEYS}
         patches = {key: torch.from_numpy(image.astype(np.float32, copy=False)) for key, image in images.items()}
-        return {**patches, "n_stacks": torch.full((len(boxes),), one.n_stacks)}
+        facts = {"n_stacks": one.n_stacks, "thickness_mm": one.thickness_mm}
+        return {**patches, **{name: torch.full((len(boxes),), value) for name, value in facts.items()}}
 
     def sample(self, epoch: int, index: int) -> SyntheticSubject:
         """Subject (epoch, index), whole."""
@@ -229,6 +230,7 @@ def synthesise(
         affine=truth.affine,
         name=truth.name,
         n_stacks=slices.n_stacks,
+        thickness_mm=float(slices.thickness_mm.mean()),
         residual=residual,
     )
 

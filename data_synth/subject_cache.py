@@ -14,7 +14,7 @@ from data_synth.registration_errors import ResidualKind
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
-SYNTHESIS_VERSION = 3
+SYNTHESIS_VERSION = 4
 """Raised whenever the synthesis changes, so that subjects of an earlier one are not taken."""
 
 
@@ -34,6 +34,7 @@ class SyntheticSubject:
         affine: [4, 4] RAS+ mm from index.
         name: of the subject that it was made from.
         n_stacks: stacks that it was made from.
+        thickness_mm: of the slices, which is that of all stacks.
         residual: kind of its pose errors.
     """
 
@@ -48,6 +49,7 @@ class SyntheticSubject:
     affine: NDArray[np.float64]
     name: str
     n_stacks: int
+    thickness_mm: float
     residual: ResidualKind
 
 

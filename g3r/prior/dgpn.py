@@ -62,5 +62,5 @@ class DensityGatedPriorNetwork(nn.Module):
         """
         residual, logit = self.refiner(given)
         if self.config.use_gate:
-            residual = self.gate(given.density) * residual
+            residual = self.gate(given.read_density) * residual
         return PriorOutput(given.base(self.config) + residual, given.base_logit(self.config) + logit)

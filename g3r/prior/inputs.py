@@ -26,6 +26,9 @@ class PriorInputs:
         sharp: V_sharp; needed with `use_sharp`.
         template: the template as fitted to the seen voxels, zero outside its brain; needed with `use_template`.
         outline: share of brain in the fitted template, 0 to 1; needed with `use_template`.
+        gating: what gate and F take for M_rho, to compare definitions of it; None takes `density`, which the base
+            is made with in any case.
+        gating_share: share of `gating` whose masks say brain; None takes all of it as brain.
     """
 
     coarse: Tensor
@@ -34,6 +37,13 @@ class PriorInputs:
     sharp: Tensor | None = None
     template: Tensor | None = None
     outline: Tensor | None = None
+    gating: Tensor | None = None
+    gating_share: Tensor | None = None
+
+    @property
+    def read_density(self) -> Tensor:
+        """What gate and F take for M_rho."""
+        return self.density if self.gating is None else self.gating
 
     def shown(self, config: PriorNetworkConfig) -> list[Tensor]:
         """The volumes that F sees, in the order of its first layer.
@@ -45,12 +55,13 @@ class PriorInputs:
             raise ValueError("this network needs V_sharp")
         if config.use_template and (self.template is None or self.outline is None):
             raise ValueError("this network needs a fitted template")
-        of_brain = self.density if self.share is None else self.density * self.share
+        density, share = self.read_density, self.share if self.gating is None else self.gating_share
+        of_brain = density if share is None else density * share
         given = [
             self.coarse,
             confidence_from_density(of_brain) if config.use_density else None,
             self.sharp if config.use_sharp else None,
-            confidence_from_density(self.density) if config.use_density else None,
+            confidence_from_density(density) if config.use_density else None,
             self.template if config.use_template else None,
         ]
         return [one for one in given if one is not None]

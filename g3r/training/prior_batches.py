@@ -12,8 +12,12 @@ from g3r.prior.inputs import PriorInputs
 Batch = Mapping[str, Tensor]
 """Volumes by `IMAGE_KEYS` of the data module, each float32 [B, 1, I, J, K], intensities "p99-coarse-v1".
 
-`n_stacks`, int64 [B], is optional: scores are also logged by the number of stacks where it is there. Other
-entries are left as they are."""
+`n_stacks`, int64 [B], is optional: scores are also logged by the number of stacks where it is there. `thickness_mm`,
+float32 [B], is needed for the printed density. Other entries are left as they are."""
+
+DENSITY_KINDS = ("coverage", "masked", "printed")
+"""What gate and F may take for M_rho: Eq. 6 over whole slices, dimensionless; over masked pixels alone; or over whole
+slices as printed, which has the unit 1/mm."""
 
 BAND_VOXELS = 5
 """Width of the band of background next to the brain, where the prior must end as the brain does."""
@@ -29,9 +33,20 @@ SEEN_BRAIN_WEIGHT = 0.1
 """Weight in it of voxels whose masks are known, next to unseen ones."""
 
 
-def prior_inputs(batch: Batch) -> PriorInputs:
-    """What the network sees of a batch."""
-    return PriorInputs(**{name: batch[name] for name in ("coarse", "density", "share", "sharp", "template", "outline")})
+def prior_inputs(batch: Batch, density: str = "coverage") -> PriorInputs:
+    """What the network sees of a batch.
+
+    Args:
+        batch: see `Batch`.
+        density: one of `DENSITY_KINDS`; only the first is for use, the others are for comparison.
+    """
+    maps = {name: batch[name] for name in ("coarse", "density", "share", "sharp", "template", "outline")}
+    if density == "masked":
+        return PriorInputs(**maps, gating=batch["density"] * batch["share"])
+    if density == "printed":
+        thickness_mm = batch["thickness_mm"].reshape(-1, 1, 1, 1, 1)
+        return PriorInputs(**maps, gating=batch["density"] / thickness_mm, gating_share=batch["share"])
+    return PriorInputs(**maps)
 
 
 def loss_weight(batch: Batch, background_weight: float) -> Tensor:

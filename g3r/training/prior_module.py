@@ -14,7 +14,15 @@ from g3r.prior.dgpn import DensityGatedPriorNetwork, PriorOutput
 from g3r.prior.inputs import PriorInputs
 from g3r.prior.model import VOXEL_MM_TOLERANCE, Prior
 from g3r.training.annealed_module import AnnealedModule
-from g3r.training.prior_batches import Batch, loss_weight, prior_inputs, prior_loss, random_cube_symmetry, weighted_l1
+from g3r.training.prior_batches import (
+    DENSITY_KINDS,
+    Batch,
+    loss_weight,
+    prior_inputs,
+    prior_loss,
+    random_cube_symmetry,
+    weighted_l1,
+)
 from g3r.training.prior_validation import (
     PANEL_TAG,
     VALIDATED,
@@ -45,6 +53,8 @@ class PriorModule(AnnealedModule):
         background_weight: loss weight outside the brain mask, 0 to 1; see `loss_weight`.
         augment_orientation: rotate and mirror each training batch by a random symmetry of the cube, so that
             the prior does not depend on the orientation in which a subject is reconstructed.
+        density: what gate and F take for M_rho, of `DENSITY_KINDS`. All but the first are for comparison: such a
+            network cannot be exported.
         voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
         start_from: exported prior whose weights to begin with; channels that it lacks begin at zero, and so
             does the last layer if its prior has another base.
@@ -65,12 +75,16 @@ class PriorModule(AnnealedModule):
         warmup_steps: int = 100,
         background_weight: float = 0.01,
         augment_orientation: bool = True,
+        density: str = "coverage",
         voxel_mm: float | None = None,
         start_from: str | None = None,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
         if not 0 <= background_weight <= 1:
             raise ValueError(f"got {background_weight=}")
+        if density not in DENSITY_KINDS:
+            raise ValueError(f"got {density=}, expected one of {', '.join(DENSITY_KINDS)}")
+        self.density = density
         self.keep_hyperparameters(network)
         self.network = DensityGatedPriorNetwork(network)
         self._learnt_at_mm: dict[str, float] = {}
@@ -92,7 +106,7 @@ class PriorModule(AnnealedModule):
         if self.augment_orientation:
             batch = random_cube_symmetry(batch)
         weight = loss_weight(batch, self.background_weight)
-        found = self(prior_inputs(batch))
+        found = self(prior_inputs(batch, self.density))
         loss = prior_loss(found, batch, weight)
         n_samples = batch["truth"].shape[0]
         self.log("train/loss", loss, prog_bar=True, batch_size=n_samples)
@@ -113,7 +127,7 @@ class PriorModule(AnnealedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the prior of every sample in its mask, and V_sharp and V_coarse for comparison."""
-        prior = self(prior_inputs(batch)).volume.to(batch["truth"].dtype)
+        prior = self(prior_inputs(batch, self.density)).volume.to(batch["truth"].dtype)
         volumes = {"prior": prior, **{name: batch[name] for name in VALIDATED[1:]}}
         self._scores.add(volumes, batch, loss_weight(batch, self.background_weight))
         for b, n in enumerate(stack_numbers(batch)):
@@ -193,7 +207,9 @@ class PriorModule(AnnealedModule):
 
     def own_description(self) -> dict[str, Any]:
         """Values that a `Prior` needs apart from its weights."""
-        return {"voxel_mm": self.voxel_mm, "weeks": self.weeks}
+        # g3r-infer gives every prior the coverage
+        kind = self.kind if self.density == DENSITY_KINDS[0] else f"{self.kind} of the {self.density} density"
+        return {"voxel_mm": self.voxel_mm, "weeks": self.weeks, "kind": kind}
 
 
 def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:

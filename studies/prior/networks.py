@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
 import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from g3r.bench.record import machine
 from g3r.errors import InputError
@@ -23,42 +18,18 @@ from studies.prior.figures import draw_networks
 from studies.prior.network_scores import (
     BASELINES,
     EXPORTED,
-    LEFT_OUT,
     SPEED_SHAPE,
-    VALIDATED_ON,
     evaluate,
     inference_seconds,
     scores_by_stacks,
     validation_volumes,
 )
-from studies.subjects import REPOSITORY, data_folder
+from studies.prior.trainings import CONFIG, Variant, configuration, data_arguments, epochs_of, train
+from studies.subjects import data_folder
 from studies.tables import Cell, stacks, table
-
-CONFIG = REPOSITORY / "lightning_configs" / "prior.yaml"
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A network to be trained.
-
-    Args:
-        name: of its folder, and in tables.
-        what: how it differs, in words.
-        options: of the network, in addition to the configuration.
-        is_size: whether it belongs to the curve of error against seconds.
-    """
-
-    name: str
-    what: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    is_size: bool = False
-
 
 VARIANTS = (
     Variant("full", "the configuration as it is", is_size=True),
-    Variant("no-gate", "G = 1 everywhere", {"use_gate": False}),
-    Variant("no-density", "F does not see M_rho; gated", {"use_density": False}),
-    Variant("no-density-no-gate", "neither", {"use_density": False, "use_gate": False}),
     Variant("alpha-0.05", "the paper's gate", {"alpha": 0.05}),
     Variant("no-sharp", "F does not see V_sharp", {"use_sharp": False}),
     Variant("no-template", "no template under the residual", {"use_template": False}),
@@ -73,11 +44,6 @@ VARIANTS = (
     Variant("size-48-96-128", "channels 48, 96, 128", {"channels": [48, 96, 128]}, is_size=True),
 )
 NAMES = tuple(variant.name for variant in VARIANTS)
-
-
-def configuration() -> dict[str, Any]:
-    """The training that the variants differ from."""
-    return dict(yaml.safe_load(CONFIG.read_text(encoding="utf-8")))
 
 
 def settings(options: argparse.Namespace) -> Record:
@@ -122,7 +88,7 @@ def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], optio
         The row of the record, or None when training failed.
     """
     run = options.output / variant.name
-    checkpoint, seconds = _train(variant, run, n_epochs, [*_data_arguments(*data), *options.train_args])
+    checkpoint, seconds = train(variant, run, n_epochs, [*data_arguments(*data), *options.train_args])
     if checkpoint is None:
         print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
         return None
@@ -153,66 +119,6 @@ def distinct_variants(config: Mapping[str, Any]) -> list[Variant]:
         for variant in VARIANTS
         if not variant.options or any(model.get(name) != value for name, value in variant.options.items())
     ]
-
-
-def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = ()) -> int:
-    """Whole epochs nearest to a number of optimiser steps, at least one.
-
-    Args:
-        steps: of the optimiser.
-        config: of the training.
-        arguments: that may change the size of an epoch, such as `--data.batch_size=2`.
-    """
-    data = dict(config["data"]["init_args"])
-    for argument in arguments:
-        name, _, value = argument.removeprefix("--data.").partition("=")
-        if name in data and value.isdecimal():
-            data[name] = int(value)
-    per_epoch = data["subjects_per_epoch"] * data["patches_per_subject"] // data["batch_size"]
-    return max(1, round(steps / per_epoch))
-
-
-def _data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
-    """Arguments about the data, the same for all variants."""
-    listed = {"exclude": LEFT_OUT, "val_include": VALIDATED_ON}
-    return [
-        f"--data.source={source}",
-        f"--data.cache={cache}",
-        f"--data.val_subjects={val_subjects}",
-        *(f"--data.{name}={json.dumps(patterns)}" for name, patterns in listed.items()),
-    ]
-
-
-def _train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
-    """Train a variant in a process of its own, going on where an earlier one stopped.
-
-    Returns:
-        Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
-    """
-    run.mkdir(parents=True, exist_ok=True)
-    last = newest_checkpoint(run)
-    command = [
-        *(sys.executable, "-m", "g3r.cli.pretrain", "fit", "--config", str(CONFIG), *arguments),
-        *(f"--model.network.{name}={json.dumps(value)}" for name, value in variant.options.items()),
-        f"--trainer.max_epochs={n_epochs}",
-        "--trainer.max_time=null",
-        "--trainer.enable_progress_bar=false",
-        f"--trainer.logger.init_args.save_dir={run}",
-        "--trainer.logger.init_args.name=logs",
-        *([f"--ckpt_path={last}"] if last else []),
-    ]
-    print(f"{variant.name}: {'going on' if last else 'training'}, {n_epochs} epochs", flush=True)
-    start = time.perf_counter()
-    with (run / "train.log").open("ab") as log:
-        done = subprocess.run(command, cwd=REPOSITORY, stdout=log, stderr=log, check=False)
-    seconds = time.perf_counter() - start
-    return (newest_checkpoint(run) if done.returncode == 0 else None), seconds
-
-
-def newest_checkpoint(run: Path) -> Path | None:
-    """The last checkpoint of the last process that trained in a folder."""
-    found = sorted(run.glob("logs/version_*/checkpoints/last*.ckpt"), key=lambda path: path.stat().st_mtime)
-    return found[-1] if found else None
 
 
 def tables(record: Record) -> dict[str, str]:

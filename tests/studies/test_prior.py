@@ -17,8 +17,9 @@ from g3r.geometry.grid import on_grid
 from g3r.planning.presets import PRESETS, changed
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.model import Prior
+from g3r.training.prior_batches import DENSITY_KINDS
 from studies.motion import sweep
-from studies.prior import ablation, alone, cases, network_scores, networks
+from studies.prior import ablation, alone, cases, gate, network_scores, networks, trainings
 from studies.prior.figures import draw_ablation, draw_networks
 from studies.prior.volumes import prior_volumes, slices_at_true_poses, template_at_truth, tiling_difference
 from studies.subjects import read_case
@@ -108,22 +109,56 @@ def test_network_table() -> None:
 
 
 def test_networks_differ_from_the_configuration() -> None:
-    config = networks.configuration()
+    config = trainings.configuration()
     found = {variant.name for variant in networks.distinct_variants(config)}
     assert {"no-template", "as-printed"} <= found
     assert "sharp-base" in found or config["model"]["init_args"]["network"].get("sharp_base")
     assert "size-" + "-".join(map(str, config["model"]["init_args"]["network"]["channels"])) not in found
-    assert {"full", "no-gate", "no-density", "no-density-no-gate", "no-sharp"} <= found
-    per_epoch = networks.epochs_of(10**6, config) / 10**6
-    assert networks.epochs_of(1, config) == 1
-    assert networks.epochs_of(300, config) == max(1, round(300 * per_epoch))
+    assert {"full", "alpha-0.05", "no-sharp"} <= found
+    per_epoch = trainings.epochs_of(10**6, config) / 10**6
+    assert trainings.epochs_of(1, config) == 1
+    assert trainings.epochs_of(300, config) == max(1, round(300 * per_epoch))
     own = ["--data.subjects_per_epoch=6", "--data.patches_per_subject=4", "--data.batch_size=2", "--data.source=9"]
-    assert networks.epochs_of(36, config, own) == 3
+    assert trainings.epochs_of(36, config, own) == 3
 
 
 def test_network_options_are_those_of_the_network() -> None:
     for variant in networks.VARIANTS:
         PriorNetworkConfig(**variant.options)
+
+
+def test_the_gate_s_factorial_is_complete_and_no_network_is_trained_twice() -> None:
+    found = gate.variants()
+    read = {(kind, *variant.options.values()) for kind, variant in found if any(variant.options.values())}
+    assert len(found) == len({variant.name for _, variant in found}) == 10
+    assert read == {(kind, f, g) for kind in DENSITY_KINDS for f in (True, False) for g in (True, False) if f or g}
+    for _, variant in found:
+        PriorNetworkConfig(**variant.options)
+
+
+def test_gate_table() -> None:
+    def row(db: float, **more: object) -> dict[str, Any]:
+        return {"scores": {"all": db, "unseen": db - 2, "seen": db + 1}, **more}
+
+    rows = {"V_coarse": row(20, variant="V_coarse")}
+    for seed, db in ((1, 22.0), (2, 23.0)):
+        rows[f"neither, seed {seed}"] = row(db, variant="neither", seed=seed, steps=384, train_seconds=90)
+    text = gate.tables({"val_subjects": 6, "arguments": [], "rows": rows})["gate"]
+    assert "|  | seeds | all | c of 0 to 0.05 | c of 0.6 to 1 | steps | trained, min |" in text
+    assert "| V_coarse |  | 20.00 | 18.00 | 21.00 |  |  |" in text
+    assert "| neither | 2 | 22.50 ± 0.71 | 20.50 ± 0.71 | 23.50 ± 0.71 | 384 | 2 |" in text
+
+
+def test_gate_scores_are_those_of_bins_of_coverage() -> None:
+    truth = torch.rand(1, 1, 16, 16, 16, generator=torch.Generator().manual_seed(0))
+    density = torch.zeros_like(truth)
+    density[..., 8:] = 3.0
+    one = {"truth": truth, "mask": torch.ones_like(truth), "density": density}
+    made = truth + torch.where(density > 0, 0.01, 0.1)
+    found = gate.scores([made], [one])
+    assert found["unseen"] == pytest.approx(20, abs=1e-4)
+    assert found["seen"] == pytest.approx(40, abs=1e-3)
+    assert found.keys() == {"all", "unseen", "seen"}
 
 
 def test_scores_by_number_of_stacks() -> None:
@@ -144,13 +179,13 @@ def test_a_table_without_training_needs_a_record(tmp_path: Path, capsys: pytest.
 
 
 def test_the_newest_checkpoint_is_gone_on_with(tmp_path: Path) -> None:
-    assert networks.newest_checkpoint(tmp_path) is None
+    assert trainings.newest_checkpoint(tmp_path) is None
     for version, age in ((0, 50), (1, 10)):
         path = tmp_path / "logs" / f"version_{version}" / "checkpoints" / "last.ckpt"
         path.parent.mkdir(parents=True)
         path.write_text("")
         os.utime(path, (1e9 - age, 1e9 - age))
-    assert networks.newest_checkpoint(tmp_path) == path
+    assert trainings.newest_checkpoint(tmp_path) == path
 
 
 def test_figures_are_drawn_from_records(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import PriorOutput
 from g3r.training import prior_batches as batches
 from tests.training.small_volumes import sample
@@ -83,3 +84,22 @@ def test_symmetries_turn_all_volumes_alike() -> None:
 def test_symmetries_keep_the_shape() -> None:
     batch = {"truth": torch.rand(1, 1, 4, 4, 6)}
     assert {tuple(batches.random_cube_symmetry(batch)["truth"].shape) for _ in range(20)} == {(1, 1, 4, 4, 6)}
+
+
+def test_kinds_of_density_change_what_f_and_gate_read_and_nothing_else() -> None:
+    batch = {name: value[None] for name, value in sample(0).items()} | {"thickness_mm": torch.tensor([2.5])}
+    config = PriorNetworkConfig()
+    given = {kind: batches.prior_inputs(batch, kind) for kind in batches.DENSITY_KINDS}
+    read = {
+        "coverage": batch["density"],
+        "masked": batch["density"] * batch["share"],
+        "printed": batch["density"] / 2.5,
+    }
+    of_brain = {**read, "coverage": read["masked"], "printed": read["masked"] / 2.5}
+    for kind, one in given.items():
+        torch.testing.assert_close(one.read_density, read[kind])
+        shown = one.shown(config)
+        torch.testing.assert_close(shown[1], -torch.expm1(-of_brain[kind]))
+        torch.testing.assert_close(shown[3], -torch.expm1(-read[kind]))
+        assert torch.equal(one.base(config), given["coverage"].base(config))
+        assert torch.equal(one.base_logit(config), given["coverage"].base_logit(config))

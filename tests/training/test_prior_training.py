@@ -165,6 +165,20 @@ def test_export_wants_the_ending_of_its_format(
     assert not (tmp_path / "prior.pt").exists()
 
 
+def test_a_network_of_another_density_is_for_comparison_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """g3r-infer would show it the coverage."""
+    module = training.PriorModule(**SMALL, density="masked")
+    done = trainer(tmp_path, max_steps=1)
+    done.fit(module, TinyData())
+    done.save_checkpoint(tmp_path / "run.ckpt")
+    assert export.main([str(tmp_path / "run.ckpt"), str(tmp_path / "prior.safetensors")]) == 3
+    assert "prior of the masked density" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="expected one of coverage, masked, printed"):
+        training.PriorModule(**SMALL, density="other")
+
+
 @pytest.mark.parametrize("content", [None, "text\n"])
 def test_export_refuses_what_is_no_checkpoint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None
