@@ -24,6 +24,8 @@ def harmonic(values: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray
         values: [I, J, K].
         unknown: [I, J, K] voxels to fill; none may touch the border of the volume.
     """
+    if not unknown.any():
+        return values.copy()
     number = np.full(values.shape, -1)
     number[unknown] = np.arange(unknown.sum())
     index = np.argwhere(unknown)

@@ -9,7 +9,7 @@ from g3r.acquisition.stacks import Stack
 from studies.harness import Row
 from studies.holes import Hole, with_holes
 from studies.unseen import sweep
-from studies.unseen.fills import FILLS
+from studies.unseen.fills import FILLS, harmonic
 
 
 def a_stack(n_slices: int = 20, n_empty: int = 5) -> Stack:
@@ -71,3 +71,11 @@ def test_the_sweep_counts_what_is_good_and_what_is_silent() -> None:
     assert "Brain volume within 3% of the truth: 1 of 3" in text
     assert "under 1 mm: 1 of 3; of the others 1 without a warning" in text
     assert "| volume | 19.00 | 22.00 |" in text
+
+
+def test_harmonic_fill_continues_a_linear_volume() -> None:
+    values = np.fromfunction(lambda i, j, k: i + 2 * j - k, (12, 11, 10))
+    hole = np.zeros(values.shape, bool)
+    hole[4:8, 3:7, 2:7] = True
+    np.testing.assert_allclose(harmonic(np.where(hole, 0, values), hole), values, atol=0.02)
+    assert np.array_equal(harmonic(values, np.zeros(values.shape, bool)), values)
