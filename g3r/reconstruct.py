@@ -15,6 +15,7 @@ from g3r.acquisition.foreground import Foreground
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
+from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
@@ -74,9 +75,11 @@ class GaussianReconstructor:
     """Reconstructs subjects with one prior and one set of settings.
 
     Args:
-        checkpoint: prior written by g3r-export; the one that ships with the package when None.
+        checkpoint: prior written by g3r-export, or the name of a set of weights that ships with the package
+            ("cc0"); the usual set when None.
         settings: see `ReconstructionSettings`, or the name of a preset.
-        pose_checkpoint: pose network and atlas template, written by g3r-export; those shipped when None.
+        pose_checkpoint: pose network and atlas template, written by g3r-export, or the name of a set; when None
+            those of the set that `checkpoint` names, else the usual ones.
         observer: sees the cloud during the fit to the slices.
 
     Raises:
@@ -98,7 +101,7 @@ class GaussianReconstructor:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
         self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
         needs_pose_model = self.settings.registration.template or self.settings.registration.network
-        self.pose_model = PoseModel.load(pose_checkpoint) if needs_pose_model else None
+        self.pose_model = PoseModel.load(pose_checkpoint or set_of(checkpoint)) if needs_pose_model else None
 
     def reconstruct(
         self,

@@ -56,7 +56,7 @@ def positive(text: str) -> int:
 
 SHARED: dict[str, dict[str, Any]] = {
     "--preset": {"default": "balanced", "choices": PRESETS, "help": "settings"},
-    "--ckpt": {"metavar": "PRIOR.safetensors", "help": "prior (None: the one shipped)"},
+    "--ckpt": {"metavar": "PRIOR.safetensors", "help": "prior, or the name of a set (None: the one shipped)"},
     "--threads": {"type": positive, "metavar": "N", "help": "(None: all cores, shared out)"},
     "--jobs": {"type": positive, "metavar": "N", "default": 1, "help": "measurements at the same time"},
     "--cache": {"type": Path, "default": FOLDER / "subjects", "help": "simulated subjects"},
@@ -249,9 +249,9 @@ def weights(checkpoint: str | None) -> str:
     Raises:
         InputError: no such file.
     """
-    from g3r.checkpoints.weights_file import SHIPPED_PRIOR
+    from g3r.checkpoints.shipped import weights_path
 
-    path = Path(checkpoint or SHIPPED_PRIOR)
+    path = weights_path(checkpoint, "prior")
     if not path.is_file():
         raise InputError(f"--ckpt {path}: no such file")
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

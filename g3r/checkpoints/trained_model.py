@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from g3r._version import __version__
 from g3r.checkpoints.plain_values import config_from_plain, named_numbers, one_line, shown, text
+from g3r.checkpoints.shipped import weights_path
 from g3r.checkpoints.weights_file import WeightsFile, another_file, read_weights, write_weights
 from g3r.errors import G3RError, InputError
 
@@ -59,7 +60,6 @@ class TrainedModel:
     file_sha256: str = ""
 
     kind: ClassVar[str]
-    shipped: ClassVar[Path]
     config_type: ClassVar[type]
     network_type: ClassVar[type[nn.Module]]
     conventions: ClassVar[Mapping[str, str]] = {}
@@ -121,14 +121,14 @@ class TrainedModel:
         """Read an exported file. Nothing in it is executed, and everything it claims is checked.
 
         Args:
-            source: path of a file written by `save`, or that file as `read_weights` gives it; None takes the
-                weights that ship with the package.
+            source: path of a file written by `save`, or that file as `read_weights` gives it; the name of a set of
+                weights that ships with the package (`SET_NAMES`), or None for the usual one.
 
         Raises:
             InputError: missing, of another kind, format version or convention, damaged, with weights that do not
                 fit the network, or with values that make no sense.
         """
-        file = source if isinstance(source, WeightsFile) else read_weights(Path(source or cls.shipped), cls.kind)
+        file = source if isinstance(source, WeightsFile) else read_weights(weights_path(source, cls.kind), cls.kind)
         description = file.description
         _check_identity(file, cls.kind, {"format_version": FORMAT_VERSION, **cls.conventions})
         try:

@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SUFFIX = ".safetensors"
-SHIPPED_PRIOR = Path(__file__).parent / "weights" / f"prior{SUFFIX}"
-SHIPPED_POSE = Path(__file__).parent / "weights" / f"pose{SUFFIX}"
-"""The weights that are part of the package."""
-
 DESCRIPTION_KEY = "g3r"
 """Entry of the header's `__metadata__` that holds the description, as JSON."""
 

@@ -31,11 +31,16 @@ def build_parser() -> argparse.ArgumentParser:
         help="slice thickness, one for all or one per stack (default: the distance of slices)",
     )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    parser.add_argument("--ckpt", metavar="PRIOR.safetensors", help="prior from g3r-export (default: the one shipped)")
+    parser.add_argument(
+        "--ckpt",
+        metavar="PRIOR.safetensors",
+        help="prior from g3r-export (default: the one shipped), or cc0: shipped weights, of both networks, that were "
+        "trained on data in the public domain alone",
+    )
     parser.add_argument(
         "--pose-ckpt",
         metavar="POSE.safetensors",
-        help="pose network and atlas template from g3r-export (default: shipped)",
+        help="pose network and atlas template from g3r-export, or cc0 (default: shipped, of the set that --ckpt names)",
     )
     parser.add_argument(
         "--space",

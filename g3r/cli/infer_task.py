@@ -59,12 +59,13 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     Raises:
         InputError: a file that is missing or cannot be used, or a folder that must not be written.
     """
+    from g3r.checkpoints.shipped import set_of, weights_path
     from g3r.checkpoints.weights_file import read_weights
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.output_folder import check_output_folder
 
-    paths = {"prior": options.ckpt, "pose": options.pose_ckpt}
-    networks = {kind: Path(path) for kind, path in paths.items() if path}
+    sources = {"prior": options.ckpt, "pose": options.pose_ckpt or set_of(options.ckpt)}
+    networks = {kind: weights_path(source, kind) for kind, source in sources.items() if source}
     inputs = [*options.stacks, *(options.masks or ()), *networks.values()]
     check_output_folder(folder, OUTPUT_NAMES, replace=replaces, inputs=inputs)
     if options.tensorboard:

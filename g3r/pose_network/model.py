@@ -16,7 +16,6 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.slice_images import slice_images
 from g3r.checkpoints.plain_values import numbers
 from g3r.checkpoints.trained_model import TrainedModel
-from g3r.checkpoints.weights_file import SHIPPED_POSE
 from g3r.geometry import RigidPose
 from g3r.pose_network.config import PoseNetworkConfig
 from g3r.pose_network.inference import poses_of, slice_batch
@@ -40,7 +39,6 @@ class PoseModel(TrainedModel):
     weeks: tuple[float, ...]
 
     kind: ClassVar = "pose"
-    shipped: ClassVar = SHIPPED_POSE
     config_type: ClassVar = PoseNetworkConfig
     network_type: ClassVar = PoseNetwork
 

@@ -16,7 +16,6 @@ from g3r.acquisition.coarse_volume import DENSITY_CONVENTION, INTENSITY_CONVENTI
 from g3r.acquisition.least_squares import SHARP_CONVENTION
 from g3r.checkpoints.plain_values import number, numbers
 from g3r.checkpoints.trained_model import TrainedModel
-from g3r.checkpoints.weights_file import SHIPPED_PRIOR
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
 from g3r.prior.inference import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling, estimate_prior
@@ -43,7 +42,6 @@ class Prior(TrainedModel):
     weeks: tuple[float, ...]
 
     kind: ClassVar = "prior"
-    shipped: ClassVar = SHIPPED_PRIOR
     config_type: ClassVar = PriorNetworkConfig
     network_type: ClassVar = DensityGatedPriorNetwork
     conventions: ClassVar = {

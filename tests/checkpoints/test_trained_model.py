@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from g3r.checkpoints.shipped import SET_NAMES, set_of, weights_path
 from g3r.checkpoints.trained_model import TrainedModel
-from g3r.checkpoints.weights_file import SHIPPED_POSE, SHIPPED_PRIOR, read_weights
+from g3r.checkpoints.weights_file import read_weights
 from g3r.errors import InputError
 from g3r.pose_network.model import PoseModel
 from g3r.prior.dgpn import DensityGatedPriorNetwork
@@ -91,13 +92,32 @@ def test_the_pose_network_s_file_holds_its_template(saved: dict[str, Path]) -> N
     assert saved["pose"].stat().st_size < 2 * n_values + 60_000  # two bytes each
 
 
-@pytest.mark.parametrize(("kind", "path"), [(Prior, SHIPPED_PRIOR), (PoseModel, SHIPPED_POSE)])
-def test_the_shipped_weights(kind: type[TrainedModel], path: Path) -> None:
+SHIPPED: dict[tuple[type[TrainedModel], str | None], str] = {
+    (Prior, None): "80b9cf79072f5d3e",
+    (PoseModel, None): "91988be504221c6d",
+    (Prior, "cc0"): "3b45b97d59086dcf",
+    (PoseModel, "cc0"): "b20fc91e61e6be69",
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), SHIPPED)
+def test_the_shipped_weights(kind: type[TrainedModel], name: str | None) -> None:
     """They have kept every value: the checksum is the one that their training's export wrote."""
-    shipped = kind.load()
-    assert shipped.file_name == path.name
-    expected = {"prior": "80b9cf79072f5d3e", "pose": "91988be504221c6d"}[kind.kind]
-    assert shipped.weights_sha256.startswith(expected)
+    shipped = kind.load(name)
+    assert shipped.file_name == weights_path(name, kind.kind).name
+    assert shipped.weights_sha256.startswith(SHIPPED[kind, name])
+
+
+def test_a_named_set_has_weights_of_every_kind() -> None:
+    assert {name for _, name in SHIPPED} == {None, *SET_NAMES}
+    assert all("source=spina-bifida," in kind.load(name).training_data for kind, name in SHIPPED if name == "cc0")
+
+
+def test_a_path_is_not_a_set(tmp_path: Path) -> None:
+    assert weights_path("./cc0", "prior") == Path("cc0")
+    assert weights_path(tmp_path, "pose") == tmp_path
+    assert set_of("cc0") == "cc0"
+    assert set_of("./cc0") is set_of(None) is set_of(tmp_path) is None
 
 
 def change(**entries: Any) -> Callable[[Content], object]:

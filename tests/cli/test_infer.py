@@ -14,7 +14,9 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from g3r import GaussianReconstructor, load_stack
 from g3r.acquisition.images import load_volume
-from g3r.checkpoints.weights_file import SHIPPED_PRIOR
+from g3r.checkpoints.shipped import weights_path
+from g3r.cli.infer_options import parsed_options
+from g3r.cli.infer_task import check_files
 from g3r.errors import InputError
 from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
 from g3r.gaussians import GaussianCloud
@@ -238,7 +240,6 @@ def test_a_dry_run_writes_nothing(subject: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not SHIPPED_PRIOR.exists(), reason="the shipped weights are not there yet")
 def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path) -> None:
     quick = [option for option in QUICK if option != "--no-prior"]
     done = run("infer", *inputs(subject), *quick, "--output", tmp_path / "out")
@@ -255,6 +256,33 @@ def test_the_shipped_prior_is_used_by_default(subject: Path, tmp_path: Path) -> 
     done = run("infer", *inputs(subject), *QUICK, "--force", "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == WHOLE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), {}),
+        (("--ckpt", "cc0"), {"prior": "prior-cc0", "pose": "pose-cc0"}),
+        (("--pose-ckpt", "cc0"), {"pose": "pose-cc0"}),
+        (("--ckpt", "cc0", "--pose-ckpt", str(weights_path(None, "pose"))), {"prior": "prior-cc0", "pose": "pose"}),
+    ],
+)
+def test_a_set_of_weights_is_named_once(
+    subject: Path, tmp_path: Path, arguments: tuple[str, ...], expected: dict[str, str]
+) -> None:
+    options = parsed_options([*map(str, inputs(subject)), "--output", str(tmp_path / "out"), *arguments])
+    networks = check_files(options, tmp_path / "out", replaces=False)
+    assert {kind: file.path.stem for kind, file in networks.items()} == expected
+
+
+def test_a_set_of_weights_by_its_name_in_python() -> None:
+    reconstructor = GaussianReconstructor("cc0")
+    assert reconstructor.prior is not None
+    assert reconstructor.pose_model is not None
+    assert (reconstructor.prior.file_name, reconstructor.pose_model.file_name) == (
+        "prior-cc0.safetensors",
+        "pose-cc0.safetensors",
+    )
 
 
 # -- refusals --------------------------------------------------------------------------------------

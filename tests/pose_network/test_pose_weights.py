@@ -8,7 +8,7 @@ from scipy.ndimage import center_of_mass
 
 from g3r.acquisition.images import load_mask, load_volume
 from g3r.acquisition.slicing import slices_from_stacks
-from g3r.checkpoints.weights_file import SHIPPED_POSE
+from g3r.checkpoints.shipped import weights_path
 from g3r.evaluation.case import load_case
 from g3r.geometry import RigidPose
 from g3r.pose_network.inference import pose_errors, stack_motions
@@ -21,7 +21,7 @@ def shipped() -> PoseModel:
 
 
 def test_the_file_is_small_and_says_what_it_is(shipped: PoseModel) -> None:
-    assert SHIPPED_POSE.stat().st_size <= 6_000_000
+    assert weights_path(None, "pose").stat().st_size <= 6_000_000
     assert "sta30" in shipped.training_data  # among what was left out
     assert shipped.template.weeks.tolist() == [22, 25, 28, 31, 34, 37]
     assert {"val/slice_mm", "val/stack_deg", "val/stacks_within_20deg"} <= set(shipped.validation)

@@ -18,8 +18,9 @@ from g3r.planning.presets import PRESETS, changed
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.model import Prior
 from g3r.training.prior_batches import DENSITY_KINDS
+from studies.harness import Row
 from studies.motion import sweep
-from studies.prior import ablation, alone, cases, gate, network_scores, networks, trainings
+from studies.prior import ablation, alone, cases, gate, network_scores, networks, sets, trainings
 from studies.prior.figures import draw_ablation, draw_networks
 from studies.prior.volumes import prior_volumes, slices_at_true_poses, template_at_truth, tiling_difference
 from studies.subjects import read_case
@@ -147,6 +148,25 @@ def test_gate_table() -> None:
     assert "|  | seeds | all | c of 0 to 0.05 | c of 0.6 to 1 | steps | trained, min |" in text
     assert "| V_coarse |  | 20.00 | 18.00 | 21.00 |  |  |" in text
     assert "| neither | 2 | 22.50 ± 0.71 | 20.50 ± 0.71 | 23.50 ± 0.71 | 384 | 2 |" in text
+
+
+def test_sets_of_weights_side_by_side() -> None:
+    def row(case: str, name: str, db: float, **unseen: float) -> Row:
+        scores = {"V_prior": {"whole": db - 1}, "volume": {"whole": db, **unseen}}
+        return {"case": case, "set": name, "median_mm": 0.3, "volume_error": -0.01, "scores": scores}
+
+    rows = [
+        row("a", "usual", 30),
+        row("a", "cc0", 29),
+        row("b", "usual", 25, unseen=20),
+        row("b", "cc0", 23, unseen=18),
+    ]
+    record = {"preset": "balanced", "rows": dict(enumerate([*rows, row("c", "usual", 40)]))}
+    text = sets.tables(record)["sets"]
+    assert "| a | 0.30 / 0.30 | -1.0% / -1.0% | 29.00 / 28.00 | 30.00 / 29.00 | - / - |" in text
+    assert "| b | 0.30 / 0.30 | -1.0% / -1.0% | 24.00 / 22.00 | 25.00 / 23.00 | 20.0 / 18.0 |" in text
+    assert "cc0 costs 1.50 dB of V_prior and 1.50 dB of the volume in the mean." in text
+    assert "| c |" not in text  # not measured with every set
 
 
 def test_gate_scores_are_those_of_bins_of_coverage() -> None:
