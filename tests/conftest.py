@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -13,10 +14,19 @@ from tests.phantoms import simulate_small_subject
 # torch's threads wait for each other busily: on two cores with anything beside them, small networks take
 # ten times as long; commands that tests start choose their own number
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# and with several processes of tests numba's threads should not, either
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 pytest_plugins = ["tests.tally"]
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure() -> None:
+    """Processes of pytest-xdist share the cores."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers > 1:
+        numba.set_num_threads(max(1, numba.get_num_threads() // workers))
 
 
 @pytest.fixture

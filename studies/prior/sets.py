@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
 from g3r.checkpoints.shipped import SET_NAMES
+from g3r.planning.presets import PRESETS
+from g3r.reconstruct import GaussianReconstructor
 from studies.harness import Record, Row, Study, Task
 from studies.holes import Hole, with_holes
 from studies.subjects import case_folders, read_case
 from studies.tables import Cell, table
 from studies.unseen.cases import CASES
-from studies.unseen.measurement import line, measured
+from studies.unseen.measurement import scored, truly_unseen
 
 USUAL = "usual"
 SETS: dict[str, str | None] = {USUAL: None, **{name: name for name in SET_NAMES}}
@@ -23,16 +26,16 @@ SETS: dict[str, str | None] = {USUAL: None, **{name: name for name in SET_NAMES}
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """Every case as it is, and with its holes if it has any, with one set of weights after the other."""
-    for set_name in SETS:
-        for folder in case_folders(options.cases):
-            subjects: list[tuple[str, int | None, tuple[Hole, ...]]] = [(folder.name, None, ())]
-            subjects += [
-                (f"{folder.name}, {what}", one.n_stacks, one.holes)
-                for what, one in CASES.items()
-                if one.case == folder.name
-            ]
-            for name, n_stacks, holes in subjects:
+    """Every case as it is, and with its holes if it has any, with each set of weights."""
+    for folder in case_folders(options.cases):
+        subjects: list[tuple[str, int | None, tuple[Hole, ...]]] = [(folder.name, None, ())]
+        subjects += [
+            (f"{folder.name}, {what}", one.n_stacks, one.holes)
+            for what, one in CASES.items()
+            if one.case == folder.name
+        ]
+        for name, n_stacks, holes in subjects:
+            for set_name in SETS:
                 yield Task(f"{name}: {set_name}", measure, (name, set_name, folder, n_stacks, holes, options))
 
 
@@ -50,8 +53,22 @@ def measure(
         options: of the command.
     """
     case = read_case(folder, n_stacks)
-    own = argparse.Namespace(**{**vars(options), "ckpt": SETS[set_name]})
-    return {"case": name, "set": set_name, **measured(replace(case, stacks=with_holes(case.stacks, holes)), own)}
+    case = replace(case, stacks=with_holes(case.stacks, holes))
+    start = time.perf_counter()
+    result = GaussianReconstructor(SETS[set_name], PRESETS[options.preset]).reconstruct(case.stacks)
+    seconds = time.perf_counter() - start
+    error = case.pose_error(result.slices)
+    unseen = truly_unseen(case)
+    volumes = {"V_prior": (result.prior, result.prior_grid), "volume": (result.volume, result.grid)}
+    true_mm3 = float(case.truth_mask.sum()) * case.truth.grid.voxel_volume_mm3
+    return {
+        "case": name,
+        "set": set_name,
+        **error.figures(),
+        "volume_error": float(result.mask.sum()) * result.grid.voxel_volume_mm3 / true_mm3 - 1,
+        "scores": {one: scored(case, *volume, error.common, unseen) for one, volume in volumes.items()},
+        "seconds": round(seconds, 1),
+    }
 
 
 def tables(record: Record) -> dict[str, str]:
@@ -101,7 +118,9 @@ STUDY = Study(
     document="prior.md",
     shared=("--preset", "--threads", "--jobs", "--cases"),
     tasks=tasks,
-    line=line,
+    line=lambda key, row: (
+        f"{key}: TRE {row['median_mm']:.2f} mm, {row['scores']['volume']['whole']:.2f} dB, {row['seconds']:.0f} s"
+    ),
     tables=tables,
 )
 
