@@ -34,7 +34,7 @@ def test_batches_of_training_and_validation() -> None:
     assert len(batches) == 4
     for batch in batches:
         assert type(batch) is dict
-        assert list(batch) == [*IMAGE_KEYS, "n_stacks"]
+        assert list(batch) == [*IMAGE_KEYS, "n_stacks", "thickness_mm"]
         assert batch["n_stacks"].shape == (2,)
         assert 1 <= int(batch["n_stacks"].min()) <= int(batch["n_stacks"].max()) <= 6
         for value in (batch[key] for key in IMAGE_KEYS):
@@ -75,7 +75,7 @@ def test_training_on_a_folder(atlas: Path) -> None:
     assert data.val_set is not None
     assert [s.name for s in data.train_set.subjects] == ["a/week24", "a/week30"]
     assert [s.name for s in data.val_set.subjects] == ["b/sub-27"]
-    assert len(next(iter(data.val_dataloader()))) == len(IMAGE_KEYS) + 1
+    assert len(next(iter(data.val_dataloader()))) == len(IMAGE_KEYS) + 2
     mixed = StackSynthesisDataModule(source=str(atlas), val_include=["week24"], phantom_share=0.5, **TINY)
     mixed.setup()
     assert mixed.train_set is not None
