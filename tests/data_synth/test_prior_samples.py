@@ -70,13 +70,14 @@ def test_synthesis_leaves_the_global_generator_alone() -> None:
 def test_patches_are_cut_from_the_subject() -> None:
     dataset = make_dataset(n_patches=3)
     one, patches = dataset.sample(2, 1), dataset[2 * 4 + 1]
-    assert list(patches) == [*IMAGE_KEYS, "n_stacks"]
+    assert list(patches) == [*IMAGE_KEYS, "n_stacks", "thickness_mm"]
     corners = patch_corners(one.mask, 30, 3, [7, 2, 1, 1])
     for k, corner in enumerate(corners):
         box = tuple(slice(a, a + 30) for a in corner)
         for key in IMAGE_KEYS:
             np.testing.assert_array_equal(patches[key][k, 0].numpy(), getattr(one, key)[box].astype(np.float32))
     assert patches["n_stacks"].tolist() == [one.n_stacks] * 3
+    assert patches["thickness_mm"].tolist() == [pytest.approx(one.thickness_mm)] * 3
 
 
 def test_coarse_and_truth_share_grid_and_scale() -> None:

@@ -126,7 +126,7 @@ def test_without_a_limit_nothing_changes(slices: Slices) -> None:
 def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices) -> None:
     free = plan_memory(slices, DRAFT, None, process_bytes=PROCESS).estimate.peak
     refused = []
-    for limit in range(free, PROCESS - 10 * MB, -10 * MB):
+    for limit in range(free, PROCESS - 10 * MB, -20 * MB):
         try:
             plan = plan_memory(slices, DRAFT, limit, process_bytes=PROCESS)
         except InputError as error:
@@ -221,6 +221,7 @@ def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     assert difference.max() < 1e-3 * volume.max()
 
 
+@pytest.mark.slow
 def test_a_time_budget_below_a_limit(subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path) -> None:
     needs = unlimited[0].record.memory
     assert needs is not None
