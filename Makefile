@@ -21,8 +21,9 @@ PHANTOM_CASES := runs/bench/phantom-cases
 # of `make study-prior.networks`: small patches of subjects that all variants share
 SHORT_TRAINING ?= --data.num_workers=0 --data.patch_size=32 --data.batch_size=2 --data.distinct_epochs=2 \
 	--model.warmup_steps=60 --trainer.check_val_every_n_epoch=2
-# of `make study-prior.gate`: a small network, so that thirty trainings end
-GATE_TRAINING ?= --data.num_workers=0 --data.patch_size=64 --data.batch_size=1 --data.distinct_epochs=2 \
+# of `make study-prior.gate`: a small network, so that thirty trainings end; torch convolves batches of one patch
+# three times more slowly
+GATE_TRAINING ?= --data.num_workers=0 --data.patch_size=64 --data.batch_size=2 --data.distinct_epochs=2 \
 	--data.subjects_per_epoch=24 --data.patches_per_subject=8 --model.network.channels=[16,32,48] \
 	--model.learning_rate=1e-3 --model.warmup_steps=40 --trainer.check_val_every_n_epoch=100
 PRIOR ?= runs/prior.safetensors

@@ -1,15 +1,15 @@
-"""`g3r-evaluate`: score a reconstruction against the truth."""
+"""`g3r-evaluate`: score a reconstruction against the truth, or by what it predicts of a stack that was held out."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r._version import __version__
+from g3r.cli import held_out
 from g3r.cli.failures import missing_extra
 from g3r.errors import G3RError, InputError
 
@@ -23,16 +23,18 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="g3r-evaluate",
         description="Score a volume against a reference inside the reference's mask: PSNR, SSIM, NCC, RMSE "
-        "after an affine fit of the intensities.",
+        "after an affine fit of the intensities. Or, where there is no truth, by how well it predicts a stack that it "
+        "was not made from (--held-out-stack), or each stack from the others (--leave-one-out).",
     )
-    parser.add_argument("--volume", required=True, help="reconstructed volume (NIfTI)")
-    parser.add_argument("--reference", required=True, help="true volume (NIfTI)")
-    parser.add_argument("--mask", required=True, help="mask on the reference's grid (NIfTI)")
+    parser.add_argument("--volume", help="reconstructed volume (NIfTI)")
+    parser.add_argument("--reference", help="true volume (NIfTI)")
+    parser.add_argument("--mask", help="mask on the grid of the reference, or of the stack (NIfTI)")
     parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
     parser.add_argument("--json", metavar="FILE", help="also write the scores here")
     parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
     parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, with mask-N.nii.gz in its folder)")
     parser.add_argument("--slices", metavar="TSV", help="estimated slice poses (slices.tsv); with --poses")
+    held_out.add_options(parser)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
@@ -43,8 +45,12 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if (options.poses is None) != (options.slices is None):
         parser.error("--poses and --slices belong together")
+    predicts = held_out.check_options(parser, options)
     logging.basicConfig(level=logging.WARNING, format="g3r-evaluate: %(message)s")
     try:
+        if predicts:
+            held_out.run(options)
+            return 0
         comparison = _compare(options)
         pose_error = _pose_error(options.poses, options.slices) if options.poses else None
         print(table(comparison, pose_error))
@@ -107,10 +113,7 @@ def _pose_error(poses: str, slices: str) -> PoseError:
 
 
 def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None) -> None:
-    """Write the scores, whole or not at all."""
     from dataclasses import asdict
-
-    from g3r.run.atomic_file import write_text
 
     record: dict[str, object] = asdict(comparison.scores)
     if comparison.alignment:
@@ -120,10 +123,7 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
         }
     if pose_error:
         record["poses"] = pose_error.figures()
-    try:
-        write_text(path, json.dumps(record, indent=2) + "\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None
+    held_out.write_json(path, record)
 
 
 if __name__ == "__main__":

@@ -99,9 +99,9 @@ def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: N
     fitted = np.where(inside, (volume[box].astype(np.float64) * gain + offset) / data_range, 0.0)
     rmse = float(np.sqrt(((fitted - truth)[inside] ** 2).mean()))
     return Scores(
-        psnr_db=_psnr_db(rmse),
-        ssim=_ssim(fitted, truth, inside),
-        ncc=_correlation(fitted[inside], truth[inside]) if gain else 0.0,
+        psnr_db=psnr_db(rmse),
+        ssim=mean_ssim(fitted, truth, inside),
+        ncc=correlation(fitted[inside], truth[inside]) if gain else 0.0,
         rmse=rmse,
         gain=gain,
         offset=offset,
@@ -110,12 +110,12 @@ def score(volume: NDArray[np.floating], reference: NDArray[np.floating], mask: N
     )
 
 
-def _psnr_db(rmse: float) -> float:
+def psnr_db(rmse: float) -> float:
     """PSNR of an error given as a fraction of the data range."""
     return PSNR_CAP_DB if rmse <= 10 ** (-PSNR_CAP_DB / 20) else float(-20 * np.log10(rmse))
 
 
-def _ssim(volume: NDArray[np.float64], truth: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
+def mean_ssim(volume: NDArray[np.float64], truth: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
     """Mean over the mask of the local structural similarity, data range 1 (Wang et al. 2004)."""
     short = [max(0, SSIM_WINDOW_VOXELS - n) for n in truth.shape]
     pad = [(0, n) for n in short]
@@ -125,7 +125,7 @@ def _ssim(volume: NDArray[np.float64], truth: NDArray[np.float64], mask: NDArray
     return float(similarity[np.pad(mask, pad)].mean())
 
 
-def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Correlation coefficient of two samples, 0 where one of them is constant."""
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.sqrt((a**2).sum() * (b**2).sum()))

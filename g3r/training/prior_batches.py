@@ -60,9 +60,18 @@ def loss_weight(batch: Batch, background_weight: float) -> Tensor:
         background_weight: 0 to 1.
     """
     brain = (batch["mask"] > 0.5).to(batch["mask"].dtype)
-    band = functional.max_pool3d(brain, 2 * BAND_VOXELS + 1, stride=1, padding=BAND_VOXELS)
+    band = _dilated(brain, BAND_VOXELS)
     outside = background_weight * (1 + (BAND_FACTOR - 1) * band)
     return torch.lerp(outside.clamp_max(1.0), 1 + UNSEEN_EMPHASIS * torch.exp(-batch["density"]), brain)
+
+
+def _dilated(mask: Tensor, n_voxels: int) -> Tensor:
+    """A mask [B, 1, I, J, K] grown by some voxels along every axis: axis by axis, a tenth of the time of a cube."""
+    for axis in range(3):
+        kernel, padding = [1, 1, 1], [0, 0, 0]
+        kernel[axis], padding[axis] = 2 * n_voxels + 1, n_voxels
+        mask = functional.max_pool3d(mask, kernel, stride=1, padding=padding)
+    return mask
 
 
 def prior_loss(found: PriorOutput, batch: Batch, weight: Tensor) -> Tensor:

@@ -192,7 +192,7 @@ STUDY = Study(
     document="prior.md",
     shared=("--threads", "--jobs", "--cache"),
     options={
-        "--steps": {"type": positive, "default": 384, "metavar": "N", "help": "of the optimiser, to whole epochs"},
+        "--steps": {"type": positive, "default": 288, "metavar": "N", "help": "of the optimiser, to whole epochs"},
         "--seeds": {"type": positive, "nargs": "+", "default": SEEDS, "metavar": "N", "help": "of the trainings"},
         "--source": {"type": Path, "help": "atlas folder (None: the one of the test data)"},
         "--val-subjects": {"type": positive, "default": 6, "metavar": "N", "help": "volumes to compare on"},

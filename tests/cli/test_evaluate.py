@@ -92,3 +92,62 @@ def test_usage_errors(files: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         main(options(files, poses="poses.tsv"))
     assert stop.value.code == 2
+
+
+# -- without a truth -------------------------------------------------------------------------------
+
+
+def held_out(subject: Path, **changes: str) -> list[str]:
+    names = {"volume": "truth.nii.gz", "held-out-stack": "stack-1.nii.gz", "mask": "mask-1.nii.gz"} | changes
+    return [*(part for name, file in names.items() for part in (f"--{name}", str(subject / file))), "--thickness", "4"]
+
+
+def test_a_stack_that_was_held_out(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*held_out(subject), "--json", str(tmp_path / "scores.json")]) == 0
+    head, row = capsys.readouterr().out.splitlines()
+    assert head.split()[0] == "PSNR"
+    assert row.endswith("stack-1.nii.gz")
+    (record,) = json.loads((tmp_path / "scores.json").read_text())["stacks"]
+    assert f"{record['psnr_db']:.2f}" == row.split()[0]
+    assert len(record["slices"]) == record["n_slices"] > 10
+    assert set(record["slices"][0]) == {"slice_index", "n_pixels", "mse", "ncc", "high_pass_ncc", "ssim"}
+
+
+def test_a_support_on_another_grid_is_refused(subject: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(held_out(subject, support="mask-1.nii.gz")) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "mask-1.nii.gz" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--volume", "a", "--reference", "b"], "required: --mask"),
+        (["--held-out-stack", "s", "--volume", "a"], "needs --volume and --mask"),
+        (["--held-out-stack", "s", "--leave-one-out"], "exclude each other"),
+        (["--held-out-stack", "s", "--volume", "a", "--mask", "m", "--align"], "compares with a truth"),
+        (["--held-out-stack", "s", "--volume", "a", "--mask", "m", "--eroded-pixels", "-1"], "expected 0 or above"),
+        (["--held-out-stack", "s", "--volume", "a", "--mask", "m", "--thickness", "3", "3"], "for one stack"),
+        (["--leave-one-out", "--stacks", "a"], "two or more"),
+        (["--leave-one-out", "--stacks", "a", "b", "--masks", "c"], "same order"),
+        (["--leave-one-out", "--stacks", "a", "b", "--masks", "c", "d", "--thickness", *"123"], "for 2 stacks"),
+    ],
+)
+def test_options_that_cannot_go_together(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_each_stack_is_predicted_by_the_others(subject: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stacks, masks = ([str(subject / f"{kind}-{n}.nii.gz") for n in range(3)] for kind in ("stack", "mask"))
+    arguments = ["--stacks", *stacks, "--masks", *masks, "--thickness", "4", "--preset", "draft"]
+    assert main(["--leave-one-out", *arguments]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert [row[-1] for row in rows] == ["stack-0.nii.gz", "stack-1.nii.gz", "stack-2.nii.gz", "mean"]
+    scores = [float(row[0]) for row in rows]
+    assert min(scores) > 15
+    assert scores[-1] == pytest.approx(np.mean(scores[:3]), abs=0.01)

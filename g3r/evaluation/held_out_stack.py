@@ -1,0 +1,146 @@
+"""How well a volume predicts a stack that it was not made from: what can be measured where there is no truth.
+
+Every method is judged alike. Each slice is placed in the volume by a rigid pose of its own, simulated there (a
+Gaussian PSF), fitted in its intensities, and compared inside the mask, where the volume covers the PSF: so that
+cutting a volume at its mask neither helps nor hurts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from g3r.acquisition.images import Volume
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import normalised_slices
+from g3r.acquisition.stacks import Stack
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.errors import InputError
+from g3r.evaluation.metrics import psnr_db
+from g3r.evaluation.slice_scores import SliceScore, score_slice
+from g3r.registration.stack_in_volume import place_in_volume
+
+PSF_POINTS = (3, 3, 7)
+
+MIN_SUPPORT = 0.95
+"""Share of a pixel's PSF that must lie where the volume shows something, for the pixel to count."""
+
+MIN_PIXELS = 100
+"""Slices with fewer counted pixels are left out."""
+
+ERODED_PIXELS = 1
+"""Pixels at the rim of the mask that do not count, as a default."""
+
+DATA_RANGE_PERCENTILE = 99
+"""The data range is this percentile of the stack in its mask."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackPrediction:
+    """Scores of a stack that was held out.
+
+    Attributes:
+        stack: name of its file.
+        slices: of those with enough counted pixels.
+        counted_share: counted pixels over those of the eroded masks.
+        search_correlation: how well the stack was found in the volume, before its slices were placed one by one.
+    """
+
+    stack: str
+    slices: tuple[SliceScore, ...]
+    counted_share: float
+    search_correlation: float
+
+    def _mean(self, name: str) -> float:
+        """A score of the slices, weighted by pixels."""
+        return float(np.average([getattr(s, name) for s in self.slices], weights=[s.n_pixels for s in self.slices]))
+
+    def figures(self) -> dict[str, float]:
+        """The scores of the stack: means over counted pixels, and the median correlation of its slices."""
+        return {
+            "psnr_db": psnr_db(float(np.sqrt(self._mean("mse")))),
+            "ssim": self._mean("ssim"),
+            "ncc": self._mean("ncc"),
+            "median_ncc": float(np.median([s.ncc for s in self.slices])),
+            "high_pass_ncc": self._mean("high_pass_ncc"),
+            "counted_share": self.counted_share,
+            "search_correlation": self.search_correlation,
+            "n_slices": len(self.slices),
+        }
+
+    def record(self) -> dict[str, object]:
+        """Everything, for JSON."""
+        return {"stack": self.stack, **self.figures(), "slices": [asdict(one) for one in self.slices]}
+
+
+def predict_stack(
+    volume: Volume,
+    stack: Stack,
+    *,
+    support: NDArray[np.bool_] | None = None,
+    eroded_pixels: int = ERODED_PIXELS,
+    seed: int = 0,
+) -> StackPrediction:
+    """Compare a stack with what a volume predicts of it.
+
+    Args:
+        volume: made without the stack, in any orientation.
+        stack: with its mask.
+        support: [I, J, K] voxels that count, of those that are not zero; all of these when None. Give two volumes the
+            same one to compare them.
+        eroded_pixels: at the rim of the mask that do not count.
+        seed: of the search.
+
+    Raises:
+        InputError: a volume or a stack that cannot be used, or a stack that is not found in the volume.
+    """
+    data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
+    shown = data != 0 if support is None else support & (data != 0)
+    scale = float(np.percentile(data[shown], DATA_RANGE_PERCENTILE)) if shown.any() else 0.0
+    if not scale > 0:
+        raise InputError(f"{volume.name}: shows nothing; expected a volume that is not zero where the head is")
+    slices, _ = normalised_slices([stack])
+    # the whole volume: slices do not fit one that was cut
+    slices, found = place_in_volume(slices, data / np.float32(scale), volume.grid, np.random.default_rng(seed))
+    predicted, seen = (_simulated(one, slices, volume) for one in (data, shown.astype(np.float32)))
+    data_range = float(np.percentile(slices.masked_value, DATA_RANGE_PERCENTILE))
+    scores, n_eroded = [], 0
+    offset = slices.planes.offset
+    for k in range(len(slices)):
+        shape, pixels = tuple(slices.planes.shape[k]), slice(offset[k], offset[k + 1])
+        inside = _eroded(slices.mask[pixels].reshape(shape), eroded_pixels)
+        counted = inside & (seen[pixels].reshape(shape) > MIN_SUPPORT)
+        n_eroded += int(inside.sum())
+        if counted.sum() >= MIN_PIXELS:
+            scores.append(
+                score_slice(
+                    predicted[pixels].reshape(shape),
+                    slices.value[pixels].reshape(shape),
+                    counted,
+                    spacing_mm=slices.planes.spacing_mm[k],
+                    data_range=data_range,
+                    slice_index=int(slices.slice_index[k]),
+                )
+            )
+    if not scores:
+        raise InputError(
+            f"{stack.name}: no slice of {MIN_PIXELS} pixels lies where {volume.name} shows something "
+            f"(correlation {found:.2f}); check that both show the same brain"
+        )
+    n_counted = sum(one.n_pixels for one in scores)
+    return StackPrediction(
+        stack=stack.name, slices=tuple(scores), counted_share=n_counted / n_eroded, search_correlation=found
+    )
+
+
+def _simulated(data: NDArray[np.float32], slices: Slices, volume: Volume) -> NDArray[np.float32]:
+    """Pixels [P] of slices through a volume."""
+    return VoxelOperator(slices.planes, volume.grid, None, PSF_POINTS).forward(data).astype(np.float32)
+
+
+def _eroded(mask: NDArray[np.bool_], n_pixels: int) -> NDArray[np.bool_]:
+    """A mask without its rim; the edge of the array counts as outside."""
+    return binary_erosion(mask, iterations=n_pixels) if n_pixels else mask
