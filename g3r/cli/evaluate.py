@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from g3r._version import __version__
 from g3r.cli import held_out
@@ -48,14 +49,9 @@ def main(argv: list[str] | None = None) -> int:
     predicts = held_out.check_options(parser, options)
     logging.basicConfig(level=logging.WARNING, format="g3r-evaluate: %(message)s")
     try:
-        if predicts:
-            held_out.run(options)
-            return 0
-        comparison = _compare(options)
-        pose_error = _pose_error(options.poses, options.slices) if options.poses else None
-        print(table(comparison, pose_error))
+        record = held_out.run(options) if predicts else _scored(options)
         if options.json:
-            _write_json(Path(options.json), comparison, pose_error)
+            _write_json(Path(options.json), record)
     except G3RError as error:
         print(f"g3r-evaluate: {error}", file=sys.stderr)
         return error.exit_code
@@ -112,10 +108,14 @@ def _pose_error(poses: str, slices: str) -> PoseError:
     return target_registration_error(slice_points(masks), true, estimated)
 
 
-def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None) -> None:
+def _scored(options: argparse.Namespace) -> dict[str, Any]:
+    """Compare with the truth, and print; returns the scores for --json."""
     from dataclasses import asdict
 
-    record: dict[str, object] = asdict(comparison.scores)
+    comparison = _compare(options)
+    pose_error = _pose_error(options.poses, options.slices) if options.poses else None
+    print(table(comparison, pose_error))
+    record: dict[str, Any] = asdict(comparison.scores)
     if comparison.alignment:
         record["alignment"] = {
             "rotation_deg": comparison.alignment.rotation_deg,
@@ -123,7 +123,17 @@ def _write_json(path: Path, comparison: Comparison, pose_error: PoseError | None
         }
     if pose_error:
         record["poses"] = pose_error.figures()
-    held_out.write_json(path, record)
+    return record
+
+
+def _write_json(path: Path, record: dict[str, Any]) -> None:
+    """Write the scores, whole or not at all."""
+    from g3r.run.atomic_file import write_text
+
+    try:
+        write_text(path, json.dumps(record, indent=2) + "\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None
 
 
 if __name__ == "__main__":

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import json
+import logging
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
 
-from g3r.errors import InputError
 from g3r.planning import PRESET_NAMES
 
 if TYPE_CHECKING:
     from g3r.evaluation.held_out_stack import StackPrediction
 
+logger = logging.getLogger(__name__)
+
 LOW_CORRELATION = 0.6
 """Below this a stack was hardly found in the volume, and its scores may be those of a wrong place."""
+
+TAKEN = {
+    "reference": (("volume", "reference", "mask"), ("align", "sections", "poses", "slices")),
+    "held_out_stack": (("volume", "mask"), ("held_out_stack", "thickness", "support", "eroded_pixels")),
+    "leave_one_out": (("stacks", "masks"), ("leave_one_out", "thickness", "preset", "ckpt", "eroded_pixels")),
+}
+"""Options that each way of scoring needs, and further ones that it takes; the others would be ignored."""
 
 COLUMNS = {
     "PSNR dB": ("psnr_db", ".2f"),
@@ -40,11 +47,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--thickness", nargs="+", type=float, metavar="MM", help="slice thickness, as g3r-infer takes it"
     )
-    group.add_argument("--preset", choices=PRESET_NAMES, default="balanced", help="of --leave-one-out")
+    group.add_argument("--preset", choices=PRESET_NAMES, help="of --leave-one-out (default: balanced)")
     group.add_argument("--ckpt", metavar="PRIOR.safetensors", help="of --leave-one-out, as g3r-infer takes it")
     group.add_argument("--support", metavar="NIFTI", help="voxels of --volume that count (default: those not zero)")
     group.add_argument(
-        "--eroded-pixels", type=int, metavar="N", default=1, help="rim of the masks that does not count (default 1)"
+        "--eroded-pixels", type=int, metavar="N", help="rim of the masks that does not count (default 1)"
     )
 
 
@@ -52,32 +59,34 @@ def check_options(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     """Whether a stack is to be predicted; ends the program with 2 where options cannot go together."""
     if options.held_out_stack and options.leave_one_out:
         parser.error("--held-out-stack and --leave-one-out exclude each other")
-    if not (options.held_out_stack or options.leave_one_out):
-        missing = [f"--{name}" for name in ("volume", "reference", "mask") if getattr(options, name) is None]
-        if missing:
-            parser.error(f"the following arguments are required: {', '.join(missing)}")
-        return False
-    for name in ("reference", "align", "sections", "poses"):
-        if getattr(options, name):
-            parser.error(f"--{name} compares with a truth; without one choose only --volume or --stacks")
+    way = "held_out_stack" if options.held_out_stack else "leave_one_out" if options.leave_one_out else "reference"
+    needed, further = TAKEN[way]
+    missing = [_option(name) for name in needed if getattr(options, name) is None]
+    if missing:
+        parser.error(f"the following arguments are required: {', '.join(missing)}")
+    every = {name for one in TAKEN.values() for names in one for name in names}
+    unused = sorted(every - {*needed, *further})
+    ignored = [_option(name) for name in unused if getattr(options, name) not in (None, False)]
+    if ignored:
+        parser.error(f"{', '.join(ignored)} cannot go with {_option(way)}")
+    if options.eroded_pixels is None:
+        options.eroded_pixels = 1
     if options.eroded_pixels < 0:
         parser.error(f"--eroded-pixels {options.eroded_pixels}; expected 0 or above")
-    if options.held_out_stack:
-        if options.volume is None or options.mask is None:
-            parser.error("--held-out-stack needs --volume and --mask")
-        if options.thickness and len(options.thickness) != 1:
-            parser.error(f"{len(options.thickness)} thicknesses for one stack")
-        return True
-    n_stacks = len(options.stacks or ())
-    if n_stacks < 2 or len(options.masks or ()) != n_stacks:
+    n_stacks = len(options.stacks or "1")
+    if options.leave_one_out and (n_stacks < 2 or len(options.masks) != n_stacks):
         parser.error("--leave-one-out needs two or more --stacks, and --masks in the same order")
     if options.thickness and len(options.thickness) not in (1, n_stacks):
         parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
-    return True
+    return way != "reference"
 
 
-def run(options: argparse.Namespace) -> None:
-    """Predict, print a row for each stack, and write --json.
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Predict, and print a row for each stack; returns the scores for --json.
 
     Raises:
         InputError: inputs that cannot be used, or a stack that is not found in the volume.
@@ -87,12 +96,11 @@ def run(options: argparse.Namespace) -> None:
     for found in _left_out(options) if options.leave_one_out else (_held_out(options),):
         print(line(found.figures(), found.stack), flush=True)
         if found.search_correlation < LOW_CORRELATION:
-            print(f"{found.stack}: found at a correlation of {found.search_correlation:.2f} only; look at its slices")
+            logger.warning("%s: found at a correlation of %.2f only", found.stack, found.search_correlation)
         rows.append(found)
     if len(rows) > 1:
         print(line({name: mean(row.figures()[name] for row in rows) for name, _ in COLUMNS.values()}, "mean"))
-    if options.json:
-        write_json(Path(options.json), {"stacks": [row.record() for row in rows]})
+    return {"stacks": [row.record() for row in rows]}
 
 
 def line(figures: dict[str, float], name: str) -> str:
@@ -121,7 +129,7 @@ def _left_out(options: argparse.Namespace) -> Iterator[StackPrediction]:
 
     n_stacks = len(options.stacks)
     stacks = load_stacks(options.stacks, options.masks, _one_each(options.thickness, n_stacks))
-    reconstructor = GaussianReconstructor(options.ckpt, PRESETS[options.preset])
+    reconstructor = GaussianReconstructor(options.ckpt, PRESETS[options.preset or "balanced"])
     for n, stack in enumerate(stacks):
         result = reconstructor.reconstruct(stacks[:n] + stacks[n + 1 :])
         volume = Volume(result.volume, result.grid.affine, f"the volume without {stack.name}")
@@ -132,17 +140,3 @@ def _one_each(thickness_mm: Sequence[float] | None, n_stacks: int) -> list[float
     if not thickness_mm:
         return None
     return list(thickness_mm) if len(thickness_mm) == n_stacks else list(thickness_mm) * n_stacks
-
-
-def write_json(path: Path, record: dict[str, Any]) -> None:
-    """Write scores, whole or not at all.
-
-    Raises:
-        InputError: a file that cannot be written.
-    """
-    from g3r.run.atomic_file import write_text
-
-    try:
-        write_text(path, json.dumps(record, indent=2) + "\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another file") from None

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from g3r.acquisition.psf import FWHM_PER_SIGMA
 from g3r.evaluation.metrics import correlation, fit_intensity, mean_ssim
 
 HIGH_PASS_FWHM_MM = 3.75
 """A slice less its blur by a Gaussian of this width holds edges and texture, which a blurred volume lacks."""
-
-FWHM_PER_SIGMA = 2.3548
 
 
 @dataclass(frozen=True, kw_only=True)
