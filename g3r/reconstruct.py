@@ -10,21 +10,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.area_profile import AreaProfile, head_volume_mm3
-from g3r.acquisition.foreground import Foreground
-from g3r.acquisition.planes import FieldsOfView, Planes, Slices
+from g3r.acquisition.area_profile import head_volume_mm3
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
+from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
-from g3r.gaussians import GaussianCloud
-from g3r.geometry import RigidPose, VolumeGrid
+from g3r.fitting.slice_targets import slice_target
 from g3r.output.assemble import StageResults, assemble
 from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import FixedPlan, Plan
@@ -34,41 +33,19 @@ from g3r.pose_network.model import PoseModel
 from g3r.prior.inference import Tiling
 from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
-from g3r.registration.atlas_frame import Orientation
 from g3r.registration.atlas_search import template_fits
-from g3r.registration.overlap import Overlap
 from g3r.registration.prior_registration import register_to_prior
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
 
-STORED_RECORDS = (
-    Registration,
-    AreaProfile,
-    Overlap,
-    InitialVolumes,
-    PriorVolume,
-    PriorCloud,
-    SliceFit,
-    Slices,
-    FieldsOfView,
-    Foreground,
-    Planes,
-    RigidPose,
-    Orientation,
-    VolumeGrid,
-    GaussianCloud,
-)
-"""Classes that the files of a stage store may hold."""
-
 RESOLUTION_RANGE_MM = (0.3, 3.0)
 
-NOTE_ON_SINGLE = {
+NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
     None: "slices of the single stack stay where the atlas template or the header has them",
     True: "slices of the single stack were registered to the prior volume",
     False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
 }
-"""By whether they moved to the prior; None where that was not tried."""
 
 
 class GaussianReconstructor:
@@ -126,18 +103,21 @@ class GaussianReconstructor:
             NumericalError: a fit that broke down.
         """
         plan, run = plan or FixedPlan(self.settings), run or RunContext()
-        slices, intensity = self._slices(stacks, run)
+        slices, intensity = normalised_slices(stacks)
+        run.notes += skipped_slice_notes(stacks, slices)
         poses = self._poses(slices, registration, plan, run)
         volumes = self._volumes(poses, run)
         prior = self._prior(volumes, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
-        fit = self._fit_to_slices(cloud, prior, poses, plan, run)
+        held_out = self._held_out(cloud, prior, poses, plan, run)
+        fit = self._fit_to_slices(cloud, prior, poses, held_out, plan, run)
         found = StageResults(
             stacks=stacks,
             registration=poses,
             prior=prior,
             intensity=intensity * prior.scale,
             cloud=cloud,
+            held_out=held_out,
             fit=fit,
             prior_record=self.prior.record() if self.prior else None,
             pose_record=self.pose_model.record() if self.pose_model else None,
@@ -170,20 +150,10 @@ class GaussianReconstructor:
         settings = settings or self.settings.registration
         template = self.pose_model.template if self.pose_model else None
         proposals = {}
-        wanted = settings.network
-        if settings.network_as_reserve:
-            wanted &= template is None or not template_fits(slices, template)
-        if self.pose_model is not None and wanted:
+        spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
+        if self.pose_model is not None and settings.network and not spare:
             proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
-
-    def _slices(self, stacks: Sequence[Stack], run: RunContext) -> tuple[Slices, float]:
-        """The slices at their header poses, in normalised intensities, and the intensity of 1."""
-        slices, scale = normalised_slices(stacks)
-        run.notes += skipped_slice_notes(stacks, slices)
-        if slices.n_stacks == 1:
-            run.notes.append("bias field not estimated: a single stack cannot separate it from anatomy")
-        return slices, scale
 
     def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:
         """The slices in their poses."""
@@ -204,24 +174,23 @@ class GaussianReconstructor:
 
     def _volumes(self, poses: Registration, run: RunContext) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
-        return run.stage(Stage.COARSE, lambda: self._volumes_of(poses.slices, poses.gain, poses))
+        wanted = self.settings.common_bias_field
+        return run.stage(Stage.COARSE, lambda: self._volumes_of(poses.slices, poses.gain, poses, wanted))
 
-    def _volumes_of(self, slices: Slices, gain: NDArray[np.float64], poses: Registration) -> InitialVolumes:
+    def _volumes_of(
+        self, slices: Slices, gain: NDArray[np.float64], poses: Registration, common_bias_field: bool
+    ) -> InitialVolumes:
         placed = placed_template(self.prior, poses.orientation)
         box_mm = placed.box_mm() if placed else None
-        return InitialVolumes.of(slices, gain, poses.weight, self._voxel_mm, box_mm)
-
-    @property
-    def _voxel_mm(self) -> float:
-        return self.prior.voxel_mm if self.prior else self.settings.resolution_mm
+        voxel_mm = self.prior.voxel_mm if self.prior else self.settings.resolution_mm
+        return InitialVolumes.of(slices, gain, poses.weight, voxel_mm, box_mm, common_bias_field=common_bias_field)
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
         plan.for_prior(run.clock.seconds[Stage.COARSE])
-        report = run.report(Stage.PRIOR)
-        report(0, 1)
+        run.report(Stage.PRIOR)(0, 1)
         prior = run.stage(Stage.PRIOR, lambda: self._prior_volume(volumes, poses, plan.settings))
-        report(1, 1)
+        run.report(Stage.PRIOR)(1, 1)
         if volumes.slices.n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
@@ -246,7 +215,7 @@ class GaussianReconstructor:
         slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
         if not accepted:
             return replace(prior, gain=gain, accepted=False)
-        volumes = self._volumes_of(slices, gain, poses)
+        volumes = replace(self._volumes_of(slices, gain, poses, False), field_rms=before.field_rms)
         after = self._prior_volume(volumes, poses, settings)
         return replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
 
@@ -270,23 +239,55 @@ class GaussianReconstructor:
 
         return run.droppable_stage(Stage.FIT_TO_PRIOR, fit)
 
-    def _fit_to_slices(
+    def _held_out(
         self, cloud: PriorCloud | None, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
+    ) -> HeldOutChoice | None:
+        """What held-out slices say of profile and prior; None where they are not asked."""
+        settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
+        if cloud is None or (asked := settings.held_out) is None:
+            return None
+
+        def ask() -> HeldOutChoice:
+            return ask_held_out_slices(
+                cloud.cloud,
+                prior,
+                poses.weight,
+                distillation=settings.use_prior and settings.distillation,
+                model=settings.slice_model,
+                stage=settings.slice_stage,
+                settings=asked,
+                rng=stage_rng(settings.seed, Stage.HELD_OUT),
+                progress=run.report(Stage.HELD_OUT),
+            )
+
+        return run.droppable_stage(Stage.HELD_OUT, ask)
+
+    def _fit_to_slices(
+        self,
+        cloud: PriorCloud | None,
+        prior: PriorVolume,
+        poses: Registration,
+        held_out: HeldOutChoice | None,
+        plan: Plan,
+        run: RunContext,
     ) -> SliceFit | None:
         """Gaussians and poses fitted to the slices (Eq. 9); as far as it came where a stop was requested."""
         if cloud is None:
             return None
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
+        model = settings.slice_model.of_width(held_out.width if held_out else None)
 
         def fit() -> SliceFit:
+            target = slice_target(prior, poses.weight, model)
             return fit_slices(
                 cloud.cloud,
-                prior.volumes.slices,
+                target.slices,
                 gain=prior.gain,
                 weight=poses.weight,
                 prior=distillation_target(prior) if settings.use_prior and settings.distillation else None,
                 settings=settings.slice_stage,
                 rng=stage_rng(settings.seed, Stage.FIT_TO_SLICES),
+                pixel_weight=target.pixel_weight,
                 progress=run.report(Stage.FIT_TO_SLICES),
                 deadline=run.deadline(plan.for_fit_to_slices()),
                 observer=self.observer,

@@ -31,8 +31,7 @@ MAY_IMPORT = {
     "uncertainty": "geometry acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
-    "reconstruct": "geometry run acquisition checkpoints gaussians prior pose_network registration fitting planning"
-    " output",
+    "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": "run acquisition checkpoints prior pose_network training planning evaluation output reconstruct",
 }

@@ -101,8 +101,8 @@ def _reconstructed(
 
 def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
     """Where stages are kept; nowhere under a time budget, whose choices follow the clock."""
+    from g3r.output.stored_records import STORED_RECORDS
     from g3r.planning.plan import FixedPlan
-    from g3r.reconstruct import STORED_RECORDS
     from g3r.run.provenance import provenance
     from g3r.run.stage_store import StageStore
 

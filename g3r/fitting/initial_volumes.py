@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
+from g3r.acquisition.common_bias_field import common_log_field, without_field
 from g3r.acquisition.coverage import brain_share, coverage
 from g3r.acquisition.foreground import Foreground, foreground
 from g3r.acquisition.least_squares import sharpened_volume
@@ -37,6 +38,8 @@ class InitialVolumes:
         foreground: what the slices' masks say of each voxel.
         grid: of all these.
         scale: what intensities were divided by.
+        field_rms: root mean square over the brain of the logarithm of the bias field that was divided out of slices
+            and volumes; 0 where none was.
     """
 
     slices: Slices
@@ -47,6 +50,7 @@ class InitialVolumes:
     foreground: Foreground
     grid: VolumeGrid
     scale: float
+    field_rms: float = 0.0
 
     @classmethod
     def of(
@@ -56,6 +60,8 @@ class InitialVolumes:
         weight: NDArray[np.float64],
         voxel_mm: float,
         expected_box_mm: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+        *,
+        common_bias_field: bool = True,
     ) -> InitialVolumes:
         """The volumes of slices in their poses.
 
@@ -66,11 +72,19 @@ class InitialVolumes:
             voxel_mm: voxel size of the grid.
             expected_box_mm: lowest and highest corner [3] of where the whole head is expected; where that is far
                 beyond the masked pixels, the grid reaches there.
+            common_bias_field: whether the bias field that stacks share is estimated and divided out.
         """
         grid = _with_room(grid_around(slices, voxel_mm, margin_mm=MARGIN_MM), expected_box_mm)
         slice_weight = weight[slices.pixel_plane]
         coarse, masked = coarse_and_density(slices, grid, gain, slice_weight)
         sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
+        seen = foreground(slices, grid, weight)
+        field_rms = 0.0
+        if common_bias_field:
+            log_field = common_log_field(sharp, seen.core, grid)
+            slices = without_field(slices, log_field, grid)
+            coarse, sharp = coarse * np.exp(-log_field), sharp * np.exp(-log_field)
+            field_rms = float(np.sqrt((log_field[seen.core] ** 2).mean())) if seen.core.any() else 0.0
         scale = normalisation_scale(coarse, masked)
         slices = slices.scaled(1 / scale)
         coarse, sharp = coarse / np.float32(scale), sharp / np.float32(scale)
@@ -80,9 +94,10 @@ class InitialVolumes:
             density=coverage(slices, grid, weight),
             masked_density=masked,
             sharp=sharp,
-            foreground=foreground(slices, grid, weight),
+            foreground=seen,
             grid=grid,
             scale=scale,
+            field_rms=field_rms,
         )
 
     @property

@@ -25,9 +25,6 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import RigidPose
 from g3r.run.deadline import Deadline, timed_steps
 
-MAX_PRIOR_STRENGTH = 1.0
-"""A pixel read off the prior never counts for more than a measured one."""
-
 AMPLITUDE_DAMPING = 0.05
 """Pull of the first amplitudes towards stage 1 (relative): slices leave those of Gaussians between them open."""
 
@@ -112,6 +109,7 @@ def fit_slices(
     prior: VolumeTarget | None,
     settings: SliceStageSettings,
     rng: np.random.Generator,
+    pixel_weight: NDArray[np.float32] | None = None,
     progress: Callable[[int, int], None] = NO_PROGRESS,
     deadline: Deadline | None = None,
     observer: FitObserver | None = None,
@@ -127,6 +125,7 @@ def fit_slices(
             without distillation.
         settings: how long and how hard.
         rng: draws the prior's planes.
+        pixel_weight: [P] not negative; the slices' masks when None.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it; schedules run to their ends even so.
         observer: sees the cloud during the fit.
@@ -135,12 +134,13 @@ def fit_slices(
         NumericalError: a loss that is not finite from the start.
     """
     slice_weight = weight.astype(np.float32)
+    counted = slices.mask.astype(np.float32) if pixel_weight is None else pixel_weight
     if settings.amplitude_iterations:
         cloud = solve_amplitudes(
             cloud,
             slices.planes,
             slices.value,
-            slices.mask * slice_weight[slices.planes.plane_id()],
+            counted * slice_weight[slices.planes.plane_id()],
             gain=gain,
             n_iterations=settings.amplitude_iterations,
             damping=AMPLITUDE_DAMPING,
@@ -159,6 +159,7 @@ def fit_slices(
         bias_field=bias_field,
         prior=prior,
         settings=settings,
+        pixel_weight=counted,
     )
     guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
@@ -200,6 +201,7 @@ class SliceLoss:
         bias_field: fields of the stacks, or None.
         prior: distillation target, or None.
         settings: weights of the terms.
+        pixel_weight: [P] not negative; the slices' masks when None.
     """
 
     def __init__(
@@ -212,6 +214,7 @@ class SliceLoss:
         bias_field: StackBiasField | None,
         prior: VolumeTarget | None,
         settings: SliceStageSettings,
+        pixel_weight: NDArray[np.float32] | None = None,
     ) -> None:
         self.settings, self.slice_weight = settings, slice_weight
         self.origin_mm = parameters.origin_mm
@@ -219,7 +222,7 @@ class SliceLoss:
         self.term = ImageTerm.of(
             slices.planes,
             slices.value,
-            slices.mask.astype(np.float32),
+            slices.mask.astype(np.float32) if pixel_weight is None else pixel_weight,
             basis=bias_field.basis if bias_field else None,
             with_pose=self.unknowns.with_pose,
             cutoff_sigma=settings.cutoff_sigma,
@@ -293,4 +296,4 @@ def prior_strength(settings: SliceStageSettings, fraction: float, residual: floa
     annealed = settings.distillation.at(fraction)
     if settings.prior_error <= 0 or not settings.distillation.start > 0:
         return annealed
-    return max(annealed, min(residual / settings.prior_error, MAX_PRIOR_STRENGTH))
+    return max(annealed, min(residual / settings.prior_error, 1.0))  # at most that of a measured pixel

@@ -16,6 +16,7 @@ from g3r.acquisition.foreground import foreground
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
+from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.slice_stage import SliceFit
@@ -53,6 +54,7 @@ class StageResults:
         registration: poses of their slices.
         prior: the prior volume and what it was made of.
         intensity: intensity of 1 in the fit.
+        held_out: what held-out slices chose; None where they were not asked.
         cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
             volume less well than that volume does.
         fit: of the fit to the slices; None before it.
@@ -64,6 +66,7 @@ class StageResults:
     prior: PriorVolume
     intensity: float
     cloud: PriorCloud | None
+    held_out: HeldOutChoice | None
     fit: SliceFit | None
     prior_record: dict[str, Any] | None
     pose_record: dict[str, Any] | None
@@ -89,7 +92,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     with run.clock(Stage.VOLUME):
         mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
-        volume = _volume(found, support, density, grid, settings)
+        left_to_prior = _left_to_prior(density, _prior_weight(found, settings))
+        volume = _volume(found, support, left_to_prior, grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
         unseen_part = UnseenPart.of(
             unseen,
@@ -117,7 +121,6 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                     cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
-                left_to_prior = _left_to_prior(density)
                 prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share)
                 prior_share = prior_share.astype(np.float32)
                 release_memory()
@@ -195,19 +198,27 @@ def _no_fit(found: StageResults) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 
 
-def _left_to_prior(density: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Weight [I, J, K] of the prior in the written volume: 1 where no slice looked, next to nothing where one did.
+def _prior_weight(found: StageResults, settings: ReconstructionSettings) -> float:
+    """Least weight of V_prior in the volume: as held-out slices have it, else as set; 0 without a prior."""
+    if not settings.use_prior:
+        return 0.0
+    chosen = found.held_out.prior_weight if found.held_out else None
+    return settings.prior_weight if chosen is None else chosen
 
-    Nothing holds Gaussians there but what they have to explain elsewhere.
+
+def _left_to_prior(density: NDArray[np.float32], least: float) -> NDArray[np.float32]:
+    """Weight [I, J, K] of the prior in the written volume: 1 where no slice looked, `least` where slices are dense.
+
+    Nothing holds Gaussians that no slice sees but what they have to explain elsewhere.
     """
     weight = np.exp(-UNSEEN_POWER * density)
-    return np.where(weight < LEAST_WEIGHT, 0, weight).astype(np.float32)
+    return np.where(weight < LEAST_WEIGHT, 0, weight).clip(least, 1).astype(np.float32)
 
 
 def _volume(
     found: StageResults,
     support: NDArray[np.bool_],
-    density: NDArray[np.float32],
+    left_to_prior: NDArray[np.float32],
     grid: VolumeGrid,
     settings: ReconstructionSettings,
 ) -> NDArray[np.float32]:
@@ -217,7 +228,7 @@ def _volume(
         return prior * support
     pixels = render(found.fit.cloud, volume_planes(grid), cutoff_sigma=settings.slice_stage.cutoff_sigma).numpy()
     fitted = volume_from_pixels(pixels, grid)
-    volume = (fitted + _left_to_prior(density) * (prior - fitted)) * support
+    volume = (fitted + left_to_prior * (prior - fitted)) * support
     if not np.isfinite(volume).all():
         raise NumericalError("the volume holds values that are not finite; lower the step sizes")
     return volume
@@ -249,7 +260,9 @@ def _record(
         stacks=stack_records(found.stacks, found.registration, qualities, fit.weight),
         registration=RegistrationRecord.of(found.registration, qualities),
         bias_field=fit.bias_field,
+        common_bias_rms=found.prior.volumes.field_rms,
         n_gaussians=len(fit.cloud),
+        held_out=found.held_out,
         gaussians=gaussians | {"n_final": len(fit.cloud)},
         n_rollbacks=n_rollbacks,
         inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks), gaussians),

@@ -17,6 +17,7 @@ from g3r._version import __version__
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
+from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
@@ -148,6 +149,9 @@ class RunRecord:
         prior, pose_network: the networks' own records; None where one was not used.
         registration: None where the file is only a configuration.
         bias_field: coefficients of each stack's bias field; empty where it was not estimated.
+        common_bias_rms: root mean square over the brain of the logarithm of the bias field that stacks share, which
+            was divided out; 0 where it was not estimated.
+        held_out: what held-out slices chose; None where they were not asked.
         gaussians: how their number came about.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
@@ -169,7 +173,9 @@ class RunRecord:
     stacks: list[StackRecord]
     registration: RegistrationRecord | None = None
     bias_field: list[list[float]] = field(default_factory=list)
+    common_bias_rms: float = 0.0
     n_gaussians: int = 0
+    held_out: HeldOutChoice | None = None
     gaussians: dict[str, Any] = field(default_factory=dict)
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)
@@ -272,9 +278,11 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: 
     if len(slices) == 1:
         found.append(InactiveTerm("gain of the slice", "a single slice: amplitudes explain its gain as well"))
     if single:
-        found.append(InactiveTerm("bias field", "a single stack cannot separate it from anatomy"))
+        found.append(InactiveTerm("bias field of each stack", "with a single stack it is the common one"))
     elif not stage.optimise_bias_field:
-        found.append(InactiveTerm("bias field", "switched off in the settings"))
+        found.append(InactiveTerm("bias field of each stack", "switched off in the settings"))
+    if not settings.common_bias_field:
+        found.append(InactiveTerm("common bias field", "switched off in the settings"))
     if not stage.optimise_poses:
         reason = "a single stack without a prior to hold it drifts" if single else "switched off in the settings"
         found.append(InactiveTerm("poses in the fit", reason))

@@ -99,11 +99,15 @@ def estimate_memory(
         begin, per_voxel = NETWORK_AT_ONCE if at_once else NETWORK
         network = begin + per_voxel * seen + MAPS_PER_VOXEL * voxels
         stages[Stage.PRIOR] = volumes + max(network, TEMPLATE_FIT_PER_VOXEL * voxels)
+    fit = projections + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels
+    rim = COARSE_PER_PIXEL * n_pixels + 4 * (RIM_VOLUMES + buffers) * voxels
     stages |= {
         Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
-        Stage.FIT_TO_SLICES: volumes + cloud + projections + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels,
+        Stage.FIT_TO_SLICES: volumes + cloud + max(fit, rim),
         Stage.VOLUME: outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
+    if settings.held_out is not None:
+        stages[Stage.HELD_OUT] = stages[Stage.FIT_TO_SLICES]
     if settings.use_prior:
         stages[Stage.PRIOR_SHARE] = outputs + projections + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages[Stage.UNCERTAINTY] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
@@ -114,7 +118,7 @@ def estimate_memory(
 # Bytes, measured; see the module's docstring.
 # What the compiler holds in a run that finds no kernel compiled counts as a library: 40 MB, by the peaks of a small
 # run with NUMBA_CACHE_DIR at an empty folder and again at the same one.
-LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 150_000_000, 110_000_000
+LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 190_000_000, 150_000_000
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 REGISTRATION_PER_PIXEL = 150
@@ -123,7 +127,7 @@ NETWORK, NETWORK_AT_ONCE = (60_000_000, 130), (20_000_000, 100)  # to begin with
 # Share, template and outline, all six maps padded, and the two results; the template on the whole grid.
 MAPS_PER_VOXEL, TEMPLATE_FIT_PER_VOXEL = 44, 115
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
-TARGET_PER_VOXEL, FIT_PER_PIXEL = 12, 60
+TARGET_PER_VOXEL, FIT_PER_PIXEL, RIM_VOLUMES = 12, 60, 8
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
 SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
 

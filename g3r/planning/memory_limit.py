@@ -21,7 +21,7 @@ from g3r.run.machine import available_bytes, held_bytes
 logger = logging.getLogger(__name__)
 
 MIN_PROJECTION_BYTES = 20_000_000
-STAGES_WITH_PROJECTIONS = (Stage.FIT_TO_PRIOR, Stage.FIT_TO_SLICES, Stage.PRIOR_SHARE)
+STAGES_WITH_PROJECTIONS = (Stage.FIT_TO_PRIOR, Stage.HELD_OUT, Stage.FIT_TO_SLICES, Stage.PRIOR_SHARE)
 PLANNED_HALO_VOXELS = 48
 PLANNED_TILES = (128, 96, 64, 48, 32, 16)
 """Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""

@@ -8,8 +8,10 @@ from typing import Any
 
 from g3r.errors import InputError
 from g3r.fitting.adaptive_stage import AdaptiveSettings
+from g3r.fitting.held_out_slices import HeldOutSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
+from g3r.fitting.slice_targets import SliceModel
 from g3r.prior.inference import DEFAULT_TILING
 from g3r.registration import RegistrationSettings
 
@@ -29,13 +31,18 @@ class ReconstructionSettings:
             whole lattice of that spacing.
         registration: poses from the slices.
         prior_stage: stage 1.
+        slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
+        held_out: how held-out slices are asked for the width of the profile and the weight of the prior; None takes
+            those of `slice_model` and `prior_weight`.
+        prior_weight: least weight of V_prior in the volume.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
+        common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         seed: of every random choice.
     """
@@ -45,7 +52,10 @@ class ReconstructionSettings:
     adaptive: AdaptiveSettings | None = ADAPTIVE
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
+    slice_model: SliceModel = field(default_factory=SliceModel)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
+    held_out: HeldOutSettings | None = None
+    prior_weight: float = 0.2
     prior_views: int = 4
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
@@ -53,6 +63,7 @@ class ReconstructionSettings:
     share_probes: int = 2
     use_prior: bool = True
     distillation: bool = True
+    common_bias_field: bool = True
     fill_unseen: bool = True
     seed: int = 0
 
@@ -81,7 +92,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
     "fast": replace(
         _BALANCED,
-        gaussian_spacing_pixels=2.5,
+        gaussian_spacing_pixels=2.0,
         adaptive=None,
         prior_views=1,
         registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
@@ -93,6 +104,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         _BALANCED,
         gaussian_spacing_pixels=1.96,
         adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
+        held_out=HeldOutSettings(),
         prior_views=8,
         registration=replace(_BALANCED.registration, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=60),

@@ -16,6 +16,7 @@ class Stage(StrEnum):
     PRIOR = "prior"
     SLICES_TO_PRIOR = "slices to prior"
     FIT_TO_PRIOR = "fit to prior"
+    HELD_OUT = "held-out slices"
     FIT_TO_SLICES = "fit to slices"
     VOLUME = "volume"
     PRIOR_SHARE = "prior share"
@@ -23,7 +24,7 @@ class Stage(StrEnum):
     WRITING = "writing"
 
 
-_SPAWN_KEY = {Stage.FIT_TO_PRIOR: 2, Stage.FIT_TO_SLICES: 3, Stage.PRIOR_SHARE: 4}
+_SPAWN_KEY = {Stage.FIT_TO_PRIOR: 2, Stage.FIT_TO_SLICES: 3, Stage.PRIOR_SHARE: 4, Stage.HELD_OUT: 5}
 
 
 def stage_rng(seed: int, stage: Stage) -> np.random.Generator:

@@ -176,6 +176,7 @@ class TimeBudget:
             settings,
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
             adaptive=preset.adaptive,
+            held_out=None,  # three fits whose seconds nobody has timed
             share_probes=probes,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),

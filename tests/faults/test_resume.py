@@ -17,8 +17,8 @@ import torch
 from g3r.errors import InputError
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
+from g3r.output.stored_records import STORED_RECORDS
 from g3r.planning.stages import Stage, stage_rng
-from g3r.reconstruct import STORED_RECORDS
 from g3r.run.context import RunContext
 from g3r.run.output_folder import OutputFolder
 from g3r.run.stage_file import UnreadableStage, as_stored, read_stage, write_stage

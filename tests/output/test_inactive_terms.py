@@ -44,7 +44,7 @@ def test_two_stacks_of_slices_determine_everything() -> None:
 
 def test_a_single_slice_has_neither_gain_nor_bias_field() -> None:
     found = terms(slices_of([0]))
-    assert set(found) == {"gain of the slice", "bias field"}
+    assert set(found) == {"gain of the slice", "bias field of each stack"}
     assert "amplitudes" in found["gain of the slice"]
 
 
@@ -54,7 +54,7 @@ def test_settings_and_a_missing_prior_are_named() -> None:
         base, use_prior=False, slice_stage=replace(base.slice_stage, optimise_poses=False, optimise_bias_field=False)
     )
     found = terms(slices_of([0, 1]), still)
-    assert set(found) == {"bias field", "poses in the fit", "distance to the prior"}
+    assert set(found) == {"bias field of each stack", "poses in the fit", "distance to the prior"}
     assert "drifts" in terms(slices_of([0, 0]), still)["poses in the fit"]
     assert "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
 

@@ -1,0 +1,55 @@
+"""The slices as the fit sees them: their profile, and their rim without what lies beside the brain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.surroundings import without_surroundings
+from g3r.fitting.initial_volumes import PriorVolume
+
+
+@dataclass(frozen=True, kw_only=True)
+class SliceModel:
+    """How a slice follows from the volume.
+
+    Args:
+        through_plane, in_plane: width of the profile over the nominal one (`psf_variance_mm2`).
+        surroundings: whether what lies beside the brain is taken out of the pixels of its rim.
+    """
+
+    through_plane: float = 0.9
+    in_plane: float = 0.9
+    surroundings: bool = True
+
+    def of_width(self, width: float | None) -> SliceModel:
+        """The same with both widths as given; unchanged for None."""
+        return self if width is None else replace(self, through_plane=width, in_plane=width)
+
+
+@dataclass(frozen=True)
+class SliceTarget:
+    """What the fit is made to: the slices, and the weight [P] of each pixel."""
+
+    slices: Slices
+    pixel_weight: NDArray[np.float32]
+
+
+def slice_target(prior: PriorVolume, weight: NDArray[np.float64], model: SliceModel) -> SliceTarget:
+    """The posed slices under a slice model.
+
+    Args:
+        prior: with the slices and the support of the volume.
+        weight: [K] slice weights.
+        model: of the slices.
+    """
+    slices = prior.volumes.slices
+    factor = np.array([model.in_plane, model.in_plane, model.through_plane])
+    slices = replace(slices, planes=replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * factor**2))
+    if not model.surroundings:
+        return SliceTarget(slices, slices.mask.astype(np.float32))
+    slices, share = without_surroundings(slices, prior.support, prior.volumes.grid, prior.gain, weight)
+    return SliceTarget(slices, slices.mask * share)
