@@ -9,7 +9,8 @@ import pytest
 from g3r.bench.record import machine
 from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget
-from studies.tradeoff import convergence, gaussian_count, memory, peer_phantom, time_budgets
+from g3r.planning.presets import PRESETS, changed
+from studies.tradeoff import convergence, gaussian_count, memory, peer_phantom, slice_model, time_budgets
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
 
 
@@ -46,6 +47,19 @@ def test_budgets_mark_what_is_late_or_worse_and_nothing_else() -> None:
     assert "24.1 (!)" in lines[1]
     assert "29.80 (!)" in lines[2]
     assert "1,234" in lines[0]
+
+
+def test_each_part_of_the_slice_model_is_left_out_once_and_all_of_them_together() -> None:
+    parts = [set(changes) for changes in slice_model.WITHOUT.values()]
+    assert set().union(*parts) == set(slice_model.VARIANTS[slice_model.NONE])
+    assert sum(len(part) for part in parts) == len(slice_model.VARIANTS[slice_model.NONE])
+    for changes in slice_model.VARIANTS.values():
+        assert (changed(PRESETS["balanced"], changes) == PRESETS["balanced"]) == (not changes)
+    scores = {name: {"psnr_db": 30.0 - n, "ssim": 0.9} for n, name in enumerate(slice_model.VARIANTS)}
+    row = {"n_stacks": 3, "scores": scores, "prior": {name: scores[name] for name in ("as shipped", "none of these")}}
+    text = slice_model.tables({"preset": "balanced", "weights": "w", "rows": {"one": row}})["slice-model"]
+    assert "| one | 3 | 30.00 | 29.00 | 28.00 | 27.00 | 26.00 | 25.00 | 0.900 / 0.900 | 30.00 / 25.00 |" in text
+    assert slice_model.line("one", row).startswith("one: as shipped 30.00, without common bias field 29.00")
 
 
 def test_memory_is_judged_by_statements_and_limits() -> None:
