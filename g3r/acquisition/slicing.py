@@ -13,15 +13,12 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry.grid import bounding_box
 
-BEYOND_MASK_MM = 2.5
-"""How far around the bounding box of a mask pixels are kept: they tell what lies beside the brain."""
-
 MIN_SLICE_PIXELS = 12
 """Slices with fewer masked pixels carry no pose and little image; they are skipped and named in run.json."""
 
 
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
-    """Cut stacks into slices, each cropped to the bounding box of its mask with a margin.
+    """Cut stacks into slices, each cropped to the bounding box of its mask.
 
     Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels are skipped.
 
@@ -39,12 +36,11 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
         left, _, right = np.linalg.svd(frame)
         frame = left @ right
-        margin = np.ceil(BEYOND_MASK_MM / stack.spacing_mm[:2]).astype(int)
         used = np.flatnonzero(stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS)
         n_beyond = _slices_beyond(stack, used)
         for k in used:
             inside = stack.mask[:, :, k]
-            box = bounding_box(inside, margin)
+            box = bounding_box(inside)
             middle = [(axis.start + axis.stop - 1) / 2 for axis in box] + [k]
             rotation.append(frame)
             center.append(stack.grid.world(middle))

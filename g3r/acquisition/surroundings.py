@@ -42,7 +42,7 @@ def without_surroundings(
     and counts with the weight s, so that its noise counts as before.
 
     Args:
-        slices: K slices in place, with pixels beyond their masks.
+        slices: K slices in place, with the unmasked pixels of their boxes.
         brain: [I, J, K] where the volume is fitted.
         grid: of the brain.
         gain: [K] intensity factors.

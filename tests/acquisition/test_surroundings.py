@@ -47,9 +47,11 @@ def test_an_even_brain_is_even_up_to_its_rim_whatever_lies_beside_it(outside: fl
     found, share = corrected(slices)
     # pixels that are mostly brain; the rest are blown-up differences
     good = slices.mask & (share > 0.6)
-    before = np.abs(slices.value[good] - 1).max()
-    assert np.abs(found.value[good] - 1).max() < 0.4 * before + 1e-3
-    assert np.abs(found.value[good] - 1).mean() < 0.02 * max(abs(outside - 1), 0.05)
+    before, after = (np.abs(one.value[good] - 1) for one in (slices, found))
+    # where a mask touches its box, no pixel says what is outside, and nothing changes
+    assert after.mean() < 0.35 * before.mean() + 1e-3
+    assert np.quantile(after, 0.95) < 0.4 * np.quantile(before, 0.95) + 1e-3
+    assert after.max() < before.max() + 1e-3
     deep = slices.mask & (share == 1)
     np.testing.assert_allclose(found.value[deep], slices.value[deep])
     assert deep.sum() > 0.5 * slices.mask.sum()

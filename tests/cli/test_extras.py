@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-HIDDEN = {"g3r.cli.evaluate": ("SimpleITK", "evaluate"), "g3r.cli.pretrain": ("lightning", "train")}
+HIDDEN = {"g3r.cli.evaluate": ("skimage", "evaluate"), "g3r.cli.pretrain": ("lightning", "train")}
 
 
 @pytest.mark.parametrize("command", HIDDEN)
