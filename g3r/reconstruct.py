@@ -14,6 +14,7 @@ from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
+from g3r.checkpoints.device import on_device
 from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
@@ -55,12 +56,12 @@ class GaussianReconstructor:
         checkpoint: prior written by g3r-export, or the name of a set of weights that ships with the package
             ("cc0"); the usual set when None.
         settings: see `ReconstructionSettings`, or the name of a preset.
-        pose_checkpoint: pose network and atlas template, written by g3r-export, or the name of a set; when None
-            those of the set that `checkpoint` names, else the usual ones.
+        pose_checkpoint: pose network and atlas template; when None those of the set that `checkpoint` names.
+        device: of the networks, see `on_device`.
         observer: sees the cloud during the fit to the slices.
 
     Raises:
-        InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm.
+        InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm, no GPU.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class GaussianReconstructor:
         settings: ReconstructionSettings | str = "balanced",
         *,
         pose_checkpoint: str | os.PathLike[str] | WeightsFile | None = None,
+        device: str = "auto",
         observer: FitObserver | None = None,
     ) -> None:
         self.settings = preset(settings) if isinstance(settings, str) else settings
@@ -77,8 +79,9 @@ class GaussianReconstructor:
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
         self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
-        needs_pose_model = self.settings.registration.template or self.settings.registration.network
-        self.pose_model = PoseModel.load(pose_checkpoint or set_of(checkpoint)) if needs_pose_model else None
+        search, found = self.settings.registration, pose_checkpoint or set_of(checkpoint)
+        self.pose_model = PoseModel.load(found) if search.template or search.network else None
+        self.device = on_device(device, self.prior, self.pose_model)
 
     def reconstruct(
         self,
@@ -96,7 +99,7 @@ class GaussianReconstructor:
                 found here when None. Slices of a single stack still move to the prior volume afterwards.
             plan: settings and deadlines; the reconstructor's settings without a deadline when None.
             run: stage store, stop request and progress. A stop request during the fit gives the volume so far
-                (`record.partial`); before it, and without one, `KeyboardInterrupt` passes through.
+                (`record.partial`); else `KeyboardInterrupt` passes through.
 
         Raises:
             InputError: stacks that cannot be used, or a registration of other slices.
@@ -180,8 +183,7 @@ class GaussianReconstructor:
     def _volumes_of(
         self, slices: Slices, gain: NDArray[np.float64], poses: Registration, common_bias_field: bool
     ) -> InitialVolumes:
-        placed = placed_template(self.prior, poses.orientation)
-        box_mm = placed.box_mm() if placed else None
+        box_mm = placed.box_mm() if (placed := placed_template(self.prior, poses.orientation)) else None
         voxel_mm = self.prior.voxel_mm if self.prior else self.settings.resolution_mm
         return InitialVolumes.of(slices, gain, poses.weight, voxel_mm, box_mm, common_bias_field=common_bias_field)
 
@@ -225,8 +227,7 @@ class GaussianReconstructor:
 
         def fit() -> PriorCloud:
             n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
-            deadline = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels)
-            settings = plan.settings
+            deadline, settings = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels), plan.settings
             return fit_to_prior(
                 prior,
                 spacing_mm=gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),

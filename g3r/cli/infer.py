@@ -112,6 +112,7 @@ def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
         task.settings,
         task.inputs.named(),
         threads=task.n_threads,
+        device=task.reconstructor.device,
         thickness=[stack.thickness_mm for stack in task.stacks],
         memory=options.max_memory,
     )
@@ -129,6 +130,7 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
         preset=None if options.time_budget or options.config else options.preset,
         seed=task.settings.seed,
         threads=task.n_threads,
+        device=task.reconstructor.device,
         space="standard" if task.settings.registration.standard_orientation else "scanner",
     )
     record = replace(

@@ -68,6 +68,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    devices = ("auto", "cpu", "cuda")
+    parser.add_argument("--device", choices=devices, default="auto", help="of the networks (default: a GPU if found)")
     parser.add_argument("--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused")
     parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
     parser.add_argument(

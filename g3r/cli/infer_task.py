@@ -90,7 +90,9 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
     command = earlier.command if earlier else None
     n_threads = use_threads(options.threads or (command.threads if command else None))
     settings = earlier.settings if earlier else _settings(options)
-    reconstructor = GaussianReconstructor(networks.get("prior"), settings, pose_checkpoint=networks.get("pose"))
+    reconstructor = GaussianReconstructor(
+        networks.get("prior"), settings, pose_checkpoint=networks.get("pose"), device=options.device
+    )
     inputs = _inputs(options, reconstructor)
     memory = plan_for_stacks(
         stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None

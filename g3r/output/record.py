@@ -99,6 +99,7 @@ class CommandRecord:
     seed: int
     threads: int
     space: str
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +150,7 @@ class RunRecord:
         prior, pose_network: the networks' own records; None where one was not used.
         registration: None where the file is only a configuration.
         bias_field: coefficients of each stack's bias field; empty where it was not estimated.
-        common_bias_rms: root mean square over the brain of the logarithm of the bias field that stacks share, which
-            was divided out; 0 where it was not estimated.
+        common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
         held_out: what held-out slices chose; None where they were not asked.
         gaussians: how their number came about.
         n_rollbacks: times that a fit went back to its best state.

@@ -68,7 +68,7 @@ class PoseModel(TrainedModel):
     @cached_property
     def template(self) -> AtlasTemplate:
         """The network's atlas template; the predicted poses are in its frame."""
-        volume = self.network.template.permute(3, 0, 1, 2).numpy()
+        volume = self.network.template.permute(3, 0, 1, 2).cpu().numpy()
         return AtlasTemplate(volume, self.network.config.template_grid.affine, np.array(self.weeks))
 
     def predict(self, slices: Slices) -> RigidPose:
@@ -83,4 +83,6 @@ class PoseModel(TrainedModel):
         """
         config = self.network.config
         images = slice_images(slices, config.pixel_mm, config.image_size)
-        return poses_of(self.network, slice_batch([images])) @ images.frame_in_slice.inverse()
+        device = self.network.template.device
+        batch = {name: value.to(device) for name, value in slice_batch([images]).items()}
+        return poses_of(self.network, batch) @ images.frame_in_slice.inverse()

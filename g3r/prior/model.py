@@ -75,7 +75,7 @@ class Prior(TrainedModel):
     def template(self) -> AtlasTemplate:
         """The atlas template that was fitted to the subjects of the training."""
         config = self.network.config
-        return AtlasTemplate(self.network.template.numpy(), config.template_grid.affine, np.array(self.weeks))
+        return AtlasTemplate(self.network.template.cpu().numpy(), config.template_grid.affine, np.array(self.weeks))
 
     def in_words(self) -> str:
         """Voxel size and gate."""
