@@ -21,7 +21,7 @@ from g3r.cli.infer_task import check_files
 from g3r.errors import InputError
 from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
 from g3r.gaussians import GaussianCloud
-from g3r.output.files import OUTPUT_NAMES, SLICE_COLUMNS
+from g3r.output.files import FULL_WEIGHT, OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from tests.faults.small_case import WHOLE
@@ -99,7 +99,7 @@ def test_the_slice_table_is_complete_and_its_poses_are_good(subject: Path, recon
         assert 0 < float(row["weight"]) <= 1
         assert 0.3 < float(row["gain"]) < 3
         assert -1 <= float(row["ncc"]) <= 1
-        assert (row["reason"] != "-") == (float(row["weight"]) < 0.5)
+        assert (row["reason"] != "-") == (float(row["weight"]) < FULL_WEIGHT)
     points = slice_points(files(subject, "mask"))
     error = target_registration_error(
         points, read_poses(subject / "poses.tsv"), read_poses(reconstructed / "slices.tsv")

@@ -213,7 +213,7 @@ USAGE = [
     ["--resolution", "fine"],
     ["--preset", "best"],
     ["--space", "outer"],
-    ["--device", "cpu"],
+    ["--device", "tpu"],
     ["--time-budget", "0"],
     ["--time-budget", "inf"],
     ["--max-memory", "lots"],
