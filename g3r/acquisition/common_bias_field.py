@@ -18,7 +18,7 @@ from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
 
 WORKING_VOXEL_MM = 2.4
-"""N4 sees voxels of about this size: a coil's field is smooth, and this takes half a second."""
+"""N4 sees voxels of about this size: a coil's field is smooth."""
 
 CONTROL_POINTS = 4
 """Of the cubic B-spline along each axis, of which four are the fewest: about a quadratic over the head."""
@@ -51,7 +51,7 @@ def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], gri
     coarse = tuple(slice(n // 2, None, n) for n in step)
     if usable[coarse].sum() < MIN_VOXELS or np.ptp(volume[usable]) == 0:
         return field
-    box = tuple(slice(a.start, a.stop) for a in bounding_box(usable))
+    box = bounding_box(usable)
     if min(a.stop - a.start for a in box) < CONTROL_POINTS * max(step):
         return field
     image = sitk.GetImageFromArray(np.ascontiguousarray(volume[box].T, np.float32))

@@ -138,11 +138,12 @@ def ask_held_out_slices(
     part = cloud.take(torch.from_numpy((mean_mm > low - SLAB_MARGIN_MM) & (mean_mm < high + SLAB_MARGIN_MM)))
     place = slices.planes.pixel_world_mm()[:, axis]
     in_slab = (place > low) & (place < high)
-    some = _with_mask(prior, slices.mask & in_slab)
     short = replace(stage, n_steps=settings.n_steps, optimise_poses=False)
 
     def predict(width: float) -> Prediction | None:
-        sliced = slice_target(some, weight, replace(model, through_plane=width, in_plane=width))
+        whole = slice_target(prior, weight, model.of_width(width))
+        seen = replace(whole.slices, mask=slices.mask & in_slab)
+        sliced = SliceTarget(seen, whole.pixel_weight * in_slab)
         return _predict(part, sliced, prior.gain, weight, held, target, short, rng)
 
     found: dict[float, Prediction] = {}
@@ -194,12 +195,6 @@ def _target(prior: PriorVolume, axis: int, low: float, high: float) -> VolumeTar
     grid = prior.volumes.grid
     world = grid.world(np.moveaxis(np.indices(grid.shape), 0, -1))[..., axis]
     return distillation_target(replace(prior, support=prior.support & (world > low) & (world < high)))
-
-
-def _with_mask(prior: PriorVolume, mask: NDArray[np.bool_]) -> PriorVolume:
-    """The same with fewer masked pixels; those left out of the mask do not count as surroundings."""
-    slices = replace(prior.volumes.slices, mask=mask)
-    return replace(prior, volumes=replace(prior.volumes, slices=slices))
 
 
 def _predict(
