@@ -231,7 +231,6 @@ class GaussianReconstructor:
             return fit_to_prior(
                 prior,
                 spacing_mm=gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),
-                adaptive=settings.adaptive,
                 stage=settings.prior_stage,
                 rng=stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
                 progress=run.report(Stage.FIT_TO_PRIOR),

@@ -128,8 +128,14 @@ def fit_prior(
         The fitted cloud, and the image loss of each step.
     """
     every_second = target.take(np.arange(0, len(target.planes), 2))
-    cloud = solve_amplitudes_on(
-        cloud, every_second, settings.amplitude_iterations, settings.cutoff_sigma, settings.projection_bytes
+    cloud = solve_amplitudes(
+        cloud,
+        every_second.planes,
+        every_second.value,
+        every_second.weight,
+        n_iterations=settings.amplitude_iterations,
+        cutoff_sigma=settings.cutoff_sigma,
+        projection_bytes=settings.projection_bytes,
     )
     parameters = FitParameters(cloud, LearningRates())
     whole = ImageTerm.of(target.planes, target.value, target.weight, cutoff_sigma=settings.cutoff_sigma)
@@ -149,30 +155,3 @@ def fit_prior(
     progress(settings.n_steps, settings.n_steps)
     guard.finish()
     return parameters.cloud(), history
-
-
-def solve_amplitudes_on(
-    cloud: GaussianCloud,
-    target: VolumeTarget,
-    n_iterations: int,
-    cutoff_sigma: float = CUTOFF_SIGMA,
-    projection_bytes: int = MAX_PROJECTION_BYTES,
-) -> GaussianCloud:
-    """The cloud with amplitudes by least squares on the planes of a volume; see `solve_amplitudes`.
-
-    Args:
-        cloud: shapes, and the amplitudes to start from.
-        target: the volume.
-        n_iterations: largest number of conjugate-gradient steps.
-        cutoff_sigma: where a Gaussian ends.
-        projection_bytes: memory for projections.
-    """
-    return solve_amplitudes(
-        cloud,
-        target.planes,
-        target.value,
-        target.weight,
-        n_iterations=n_iterations,
-        cutoff_sigma=cutoff_sigma,
-        projection_bytes=projection_bytes,
-    )

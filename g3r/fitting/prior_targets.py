@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from g3r.acquisition.coarse_volume import confidence
-from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings, VolumeTarget, fit_prior
 from g3r.gaussians.seeding import seed_cloud
@@ -21,7 +20,6 @@ def fit_to_prior(
     prior: PriorVolume,
     *,
     spacing_mm: float,
-    adaptive: AdaptiveSettings | None,
     stage: PriorStageSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
@@ -31,32 +29,17 @@ def fit_to_prior(
 
     Args:
         prior: V_prior on its grid.
-        spacing_mm: finest distance of Gaussians.
-        adaptive: as many Gaussians as an error bound asks for; None takes the whole lattice of the spacing.
+        spacing_mm: of the lattice of Gaussians.
         stage: how the fit runs.
         rng: draws the planes of each step.
         progress: called with (steps done, steps in all).
         deadline: when the fit has to end.
     """
-    volumes, values = prior.volumes, prior.values
-    if adaptive is not None:
-        cloud, found = fit_adaptive(
-            values,
-            prior.support,
-            volumes.grid,
-            finest_spacing_mm=spacing_mm,
-            settings=adaptive,
-            stage=stage,
-            rng=rng,
-            progress=progress,
-            deadline=deadline,
-        )
-        counts = {"seeding": "error bound", "finest_spacing_mm": spacing_mm, **found.record()}
-        return PriorCloud(cloud, found.loss, counts)
-    cloud = seed_cloud(values, prior.support, volumes.grid, spacing_mm)
+    grid = prior.volumes.grid
+    seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm)
+    target = VolumeTarget.of(prior.values, prior.support.astype(np.float32), grid)
+    cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline)
     counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-    target = VolumeTarget.of(values, prior.support.astype(np.float32), volumes.grid)
-    cloud, history = fit_prior(cloud, target, stage, rng, progress=progress, deadline=deadline)
     return PriorCloud(cloud, history, counts)
 
 

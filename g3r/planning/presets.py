@@ -7,16 +7,12 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from g3r.errors import InputError
-from g3r.fitting.adaptive_stage import AdaptiveSettings
 from g3r.fitting.held_out_slices import HeldOutSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
 from g3r.prior.inference import DEFAULT_TILING
 from g3r.registration import RegistrationSettings
-
-ADAPTIVE = AdaptiveSettings(bound=0.03, start=2.2, n_rounds=4, round_steps=8, last_steps=15)
-"""About the seconds of the whole lattice with 30 steps, half its Gaussians (docs/tradeoff.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,10 +21,8 @@ class ReconstructionSettings:
 
     Args:
         resolution_mm: voxel size of the volume.
-        gaussian_spacing_pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers
-            (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        adaptive: how the number of Gaussians is found, the spacing above being the finest; None takes the
-            whole lattice of that spacing.
+        gaussian_spacing_pixels: cell edge per Gaussian of the lattice, in units of the cube root of what one pixel
+            covers (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
         registration: poses from the slices.
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
@@ -48,8 +42,7 @@ class ReconstructionSettings:
     """
 
     resolution_mm: float = 0.8
-    gaussian_spacing_pixels: float = 2.14
-    adaptive: AdaptiveSettings | None = ADAPTIVE
+    gaussian_spacing_pixels: float = 2.0
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_model: SliceModel = field(default_factory=SliceModel)
@@ -74,7 +67,6 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
-        adaptive=None,
         prior_views=1,
         share_probes=1,
         registration=replace(
@@ -92,8 +84,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
     "fast": replace(
         _BALANCED,
-        gaussian_spacing_pixels=2.0,
-        adaptive=None,
+        gaussian_spacing_pixels=2.14,
         prior_views=1,
         registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
@@ -102,12 +93,11 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "balanced": _BALANCED,
     "accurate": replace(
         _BALANCED,
-        gaussian_spacing_pixels=1.96,
-        adaptive=replace(ADAPTIVE, round_steps=15, last_steps=30),
+        gaussian_spacing_pixels=1.75,
         held_out=HeldOutSettings(),
         prior_views=8,
         registration=replace(_BALANCED.registration, n_rounds=20),
-        prior_stage=replace(_BALANCED.prior_stage, n_steps=60),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=40),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=160),
     ),
 }

@@ -175,7 +175,6 @@ class TimeBudget:
         self.settings = replace(
             settings,
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
-            adaptive=preset.adaptive,
             held_out=None,  # three fits whose seconds nobody has timed
             share_probes=probes,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
@@ -194,22 +193,15 @@ def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: f
     """Seconds of both stages with the settings of a preset.
 
     Args:
-        preset: whose spacing, rounds and steps.
-        step_s: seconds of a step of the slice stage on a lattice.
-        spacing_probed: of that lattice.
+        preset: whose spacing and steps.
+        step_s: seconds of a step of the slice stage.
+        spacing_probed: of the lattice that was timed.
     """
     number = (spacing_probed / preset.gaussian_spacing_pixels) ** 3
     step = step_s * number**COST_EXPONENT
-    adaptive = preset.adaptive
-    if adaptive is None:
-        first = PRIOR_STEP * (preset.prior_stage.n_steps + preset.prior_stage.amplitude_iterations)
-    else:
-        rounds = adaptive.n_rounds + 1
-        last = preset.prior_stage.n_steps if adaptive.last_steps is None else adaptive.last_steps
-        first = PRIOR_STEP * (adaptive.n_rounds * adaptive.round_steps + last)
-        first += AMPLITUDE_STEP * rounds * adaptive.amplitude_iterations
-    stage = preset.slice_stage
-    return step * (first + AMPLITUDE_STEP * stage.amplitude_iterations + stage.n_steps)
+    first, second = preset.prior_stage, preset.slice_stage
+    in_first = PRIOR_STEP * (first.n_steps + first.amplitude_iterations)
+    return step * (in_first + AMPLITUDE_STEP * second.amplitude_iterations + second.n_steps)
 
 
 PRIOR_STEP, AMPLITUDE_STEP = 0.35, 0.8

@@ -24,15 +24,13 @@ STEPS = (10, 20, 40, 80, 160, 320)
 
 NEAR_DB = 0.1
 
-_LATTICE = {"adaptive": None}
 _NO_AMPLITUDES = {"prior_stage.amplitude_iterations": 0, "slice_stage.amplitude_iterations": 0}
 _UNFITTED = {"use_prior": False, "prior_stage.n_steps": 0}
 
 WAYS: dict[str, Mapping[str, Any]] = {
-    "Adam from the seeds": {**_LATTICE, **_NO_AMPLITUDES, **_UNFITTED},
-    "amplitudes by least squares first": {**_LATTICE, **_UNFITTED},
-    "started at the prior": _LATTICE,
-    "few Gaussians first (as shipped)": {},
+    "Adam from the seeds": {**_NO_AMPLITUDES, **_UNFITTED},
+    "amplitudes by least squares first": _UNFITTED,
+    "started at the prior (as shipped)": {},
 }
 """Changes of the settings, one more thing at a time; the first is what a fit without any of them is."""
 

@@ -40,9 +40,7 @@ def start(width: float) -> tuple[PriorVolume, GaussianCloud]:
 def cloud_of_prior(prior: PriorVolume) -> GaussianCloud:
     rng = np.random.default_rng(0)
     stage = PriorStageSettings(n_steps=10)
-    found = fit_to_prior(
-        prior, spacing_mm=2.0, adaptive=None, stage=stage, rng=rng, progress=lambda *_: None, deadline=None
-    )
+    found = fit_to_prior(prior, spacing_mm=2.0, stage=stage, rng=rng, progress=lambda *_: None, deadline=None)
     return found.cloud
 
 

@@ -108,4 +108,6 @@ def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
     assert result.record.time_budget is not None
     assert result.record.time_budget.fit == "accurate"
     assert len(result.record.loss["fit to slices"]) == PRESETS["accurate"].slice_stage.n_steps
-    assert result.record.settings.adaptive is not None
+    accurate = PRESETS["accurate"]
+    assert result.record.settings.gaussian_spacing_pixels == accurate.gaussian_spacing_pixels
+    assert len(result.record.loss["fit to prior"]) == accurate.prior_stage.n_steps

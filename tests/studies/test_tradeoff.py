@@ -1,4 +1,4 @@
-"""Studies of the trade-off: steps read off a curve, marks in tables, few Gaussians for a ball, a small phantom."""
+"""Studies of the trade-off: steps read off a curve, marks in tables, a small phantom."""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from g3r.bench.record import machine
-from g3r.fitting.adaptive_stage import AdaptiveSettings, fit_adaptive
-from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget
 from g3r.planning.presets import PRESETS, changed
-from studies.tradeoff import convergence, gaussian_count, memory, peer_phantom, slice_model, time_budgets
+from studies.tradeoff import convergence, memory, peer_phantom, slice_model, time_budgets
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
 
 
@@ -26,14 +24,14 @@ def test_a_curve_that_is_there_from_the_start_or_never() -> None:
 def test_convergence_measures_every_way_against_the_best_of_all() -> None:
     rows = {}
     for way in WAYS:
-        low = 0.0 if way == "few Gaussians first (as shipped)" else 3.0
+        low = 0.0 if way == "started at the prior (as shipped)" else 3.0
         for k, n in enumerate(STEPS):
             row = {"case": "one", "way": way, "steps": n, "psnr_db": 20.0 + k - low, "n_gaussians": 7}
             rows[f"{way} {n}"] = row | {"cpu_s": float(n)}
     text = convergence.tables({"preset": "balanced", "rows": rows})["convergence"]
     assert text.count("never") == len(WAYS) - 1
     assert (
-        "| one | few Gaussians first (as shipped) | 7 | 20.00 | 21.00 | 22.00 | 23.00 | 24.00 | 25.00 | 299 |" in text
+        "| one | started at the prior (as shipped) | 7 | 20.00 | 21.00 | 22.00 | 23.00 | 24.00 | 25.00 | 299 |" in text
     )
 
 
@@ -80,37 +78,6 @@ def test_memory_is_judged_by_statements_and_limits() -> None:
     assert memory.keeps_its_word(record)
     for broken in ({"a": stated | {"measured_bytes": 1.3e9}}, {"b": {"limited": [limit | {"measured_bytes": 2e9}]}}):
         assert not memory.keeps_its_word(record | {"rows": record["rows"] | broken})
-
-
-def test_a_lattice_is_read_between_its_points_alone() -> None:
-    rows = [{"psnr_db": 20.0, "n": 100}, {"psnr_db": 30.0, "n": 10_000}]
-    assert gaussian_count.uniform_number(rows, 25.0) == pytest.approx(1000)
-    assert gaussian_count.uniform_number(rows, 31.0) is None
-    case = {"adaptive": [{"bound": 0.1, "psnr_db": 25.0, "n": 500, **dict.fromkeys(DONE, 1)}], "uniform": rows}
-    record = {"rows": {"ball": case, "atlas": {"skipped": "no test data"}}}
-    text = gaussian_count.tables(record)["gaussian-count"]
-    assert "| ball | 0.1 | 25.0 | 500 | 1000 | 50 % | 1 + 1 - 1 - 1 |" in text
-    assert "atlas: left out, no test data" in text
-
-
-DONE = ("n_seeded", "n_added", "n_dropped", "n_merged")
-
-
-def test_a_ball_needs_few() -> None:
-    """On voxels of 1.6 mm, to be quick: under 500 Gaussians, where a lattice of twice as many is worse."""
-    volume, mask, grid = gaussian_count.ball(1.6)
-    stage = PriorStageSettings(n_steps=15, scale_weight=0.0)
-    settings = AdaptiveSettings(bound=0.1, start=4.0, round_steps=25, last_steps=25)
-    cloud, done = fit_adaptive(
-        volume, mask, grid, finest_spacing_mm=4.0, settings=settings, stage=stage, rng=np.random.default_rng(1)
-    )
-    target = VolumeTarget.of(volume, mask.astype(np.float32), grid)
-    assert len(cloud) < gaussian_count.BALL_MOST
-    psnr = gaussian_count.psnr_db(cloud, target)
-    assert psnr > 27.5  # 28.8 with one thread; sums of gradients depend on their number
-    uniform = gaussian_count.lattice_cloud((volume, mask, grid), 7.0, done.steps, 24, 1)
-    assert len(uniform) > 1.6 * len(cloud)
-    assert psnr > gaussian_count.psnr_db(uniform, target)
 
 
 def test_the_small_phantom_has_the_size_of_the_other_methods(
