@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +51,11 @@ class PriorStageSettings:
 
 @dataclass(frozen=True)
 class PriorCloud:
-    """The cloud that the fit to the prior gives, the loss of each step, and how its Gaussians came about."""
+    """The cloud that the fit to the prior gives, the loss of each step, and the spacing of the seeds."""
 
     cloud: GaussianCloud
     history: list[float]
-    counts: dict[str, Any]
+    spacing_mm: float
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,7 @@ def fit_to_prior(
     seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm)
     target = VolumeTarget.of(prior.values, prior.support.astype(np.float32), grid)
     cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline)
-    counts = {"seeding": "lattice", "finest_spacing_mm": spacing_mm, "n_seeded": len(cloud)}
-    return PriorCloud(cloud, history, counts)
+    return PriorCloud(cloud, history, spacing_mm)
 
 
 def distillation_target(prior: PriorVolume) -> VolumeTarget:

@@ -243,7 +243,6 @@ def _record(
     uncertainty: dict[str, Any] | None,
 ) -> RunRecord:
     settings, slices = plan.settings, found.prior.volumes.slices
-    gaussians = found.cloud.counts if found.cloud else {}
     n_rollbacks = sum("rollback" in entry for entry in fit.history)
     if n_rollbacks:
         run.warnings.append(
@@ -263,9 +262,9 @@ def _record(
         common_bias_rms=found.prior.volumes.field_rms,
         n_gaussians=len(fit.cloud),
         held_out=found.held_out,
-        gaussians=gaussians | {"n_final": len(fit.cloud)},
+        gaussian_spacing_mm=found.cloud.spacing_mm if found.cloud else None,
         n_rollbacks=n_rollbacks,
-        inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks), gaussians),
+        inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks)),
         loss={Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [], Stage.FIT_TO_SLICES: list(fit.history)},
         uncertainty=uncertainty,
         seconds=run.clock.seconds,

@@ -152,7 +152,7 @@ class RunRecord:
         bias_field: coefficients of each stack's bias field; empty where it was not estimated.
         common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
         held_out: what held-out slices chose; None where they were not asked.
-        gaussians: how their number came about.
+        gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
         unseen: the part of the brain that no slice saw.
@@ -176,7 +176,7 @@ class RunRecord:
     common_bias_rms: float = 0.0
     n_gaussians: int = 0
     held_out: HeldOutChoice | None = None
-    gaussians: dict[str, Any] = field(default_factory=dict)
+    gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)
     loss: dict[str, list[Any]] = field(default_factory=dict)
@@ -265,13 +265,12 @@ def stack_records(
     ]
 
 
-def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: dict[str, Any]) -> list[InactiveTerm]:
+def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[InactiveTerm]:
     """Which terms of the model are absent, each with the reason: what the data cannot determine.
 
     Args:
         slices: that were fitted.
         settings: as they were used for these slices.
-        gaussians: how the number of Gaussians came about.
     """
     stage, found = settings.slice_stage, []
     single = len(np.unique(slices.stack_id)) == 1
@@ -290,11 +289,4 @@ def inactive_terms(slices: Slices, settings: ReconstructionSettings, gaussians: 
         found.append(InactiveTerm("distance to the prior", "no prior was asked for"))
     elif not settings.distillation:
         found.append(InactiveTerm("distance to the prior", "distillation is switched off in the settings"))
-    if gaussians.get("bound") is not None:
-        share, spacing_mm = 1 - gaussians["share_over_bound"], gaussians["finest_spacing_mm"]
-        reason = (
-            f"the Gaussians are within {gaussians['bound']:g} (local root mean square) of the prior volume for "
-            f"{100 * share:.1f} % of the head, or {spacing_mm:.2f} mm apart, as close as pixels resolve"
-        )
-        found.append(InactiveTerm("finer Gaussians", reason))
     return found

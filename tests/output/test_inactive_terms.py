@@ -32,10 +32,8 @@ def slices_of(stacks: list[int]) -> Slices:
     )
 
 
-def terms(
-    slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"], counts: dict[str, float] | None = None
-) -> dict[str, str]:
-    return {one.term: one.reason for one in inactive_terms(slices, settings, counts or {})}
+def terms(slices: Slices, settings: ReconstructionSettings = PRESETS["balanced"]) -> dict[str, str]:
+    return {one.term: one.reason for one in inactive_terms(slices, settings)}
 
 
 def test_two_stacks_of_slices_determine_everything() -> None:
@@ -57,10 +55,3 @@ def test_settings_and_a_missing_prior_are_named() -> None:
     assert set(found) == {"bias field of each stack", "poses in the fit", "distance to the prior"}
     assert "drifts" in terms(slices_of([0, 0]), still)["poses in the fit"]
     assert "distillation" in terms(slices_of([0, 1]), replace(base, distillation=False))["distance to the prior"]
-
-
-def test_the_bound_says_why_there_are_no_more_gaussians() -> None:
-    counts = {"bound": 0.03, "share_over_bound": 0.05, "finest_spacing_mm": 2.4}
-    reason = terms(slices_of([0, 1]), counts=counts)["finer Gaussians"]
-    assert "0.03" in reason
-    assert "95.0 %" in reason
