@@ -11,13 +11,22 @@ FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 IN_PLANE_FWHM_PIXELS = 1.2
 """In-plane FWHM in pixels, of a single-shot sequence (Kuklisova-Murgasova et al., MedIA 2012)."""
 
+THICKNESS_RANGE_MM = (0.1, 20.0)
+"""Allowed slice thickness."""
 
-def psf_variance_mm2(spacing_mm: ArrayLike, thickness_mm: ArrayLike) -> NDArray[np.float64]:
+IN_PLANE_FWHM_RANGE_PIXELS = (0.1, 20.0)
+"""Allowed in-plane FWHM."""
+
+
+def psf_variance_mm2(
+    spacing_mm: ArrayLike, thickness_mm: ArrayLike, in_plane_fwhm_pixels: ArrayLike = IN_PLANE_FWHM_PIXELS
+) -> NDArray[np.float64]:
     """Variances of the Gaussian PSF along the slice's own axes (x, y in plane, z through it).
 
     Args:
         spacing_mm: [..., 2] in-plane pixel spacing.
         thickness_mm: [...] slice thickness (not the distance of slices: there are gaps).
+        in_plane_fwhm_pixels: one number, or [..., 2] of each axis, see `phase_fwhm_pixels`.
 
     Returns:
         [..., 3] in mm^2.
@@ -27,5 +36,19 @@ def psf_variance_mm2(spacing_mm: ArrayLike, thickness_mm: ArrayLike) -> NDArray[
     """
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     thickness = np.asarray(thickness_mm, dtype=np.float64)
-    fwhm_mm = np.concatenate([IN_PLANE_FWHM_PIXELS * spacing, thickness[..., None]], axis=-1)
+    fwhm_pixels = np.asarray(in_plane_fwhm_pixels, dtype=np.float64)
+    fwhm_mm = np.concatenate([fwhm_pixels * spacing, thickness[..., None]], axis=-1)
     return (fwhm_mm / FWHM_PER_SIGMA) ** 2
+
+
+def phase_fwhm_pixels(phase_resolution: float) -> float:
+    """In-plane FWHM in pixels along the phase-encoding axis: 1.2 / p.
+
+    With pixels of d mm, k-space is filled up to p / (2 d) along this axis and zero beyond. So a point becomes
+    sin(pi p x / d) / (pi p x / d). Its main lobe is half as high at x = 0.603 d / p: its FWHM is 1.207 d / p. For
+    p = 1 these are the nominal 1.2 pixels, and the Gaussian of the same FWHM grows with 1 / p as the lobe does.
+
+    Args:
+        phase_resolution: p, the share of k-space that was filled, above 0 and up to 1.
+    """
+    return IN_PLANE_FWHM_PIXELS / phase_resolution

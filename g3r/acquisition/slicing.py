@@ -46,7 +46,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             center.append(stack.grid.world(middle))
             spacing.append(stack.spacing_mm[:2])
             shape.append(inside[box].shape)
-            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm))
+            psf.append(psf_variance_mm2(stack.spacing_mm[:2], stack.thickness_mm, stack.in_plane_fwhm_pixels))
             values.append(stack.image[:, :, k][box].ravel())
             masks.append(inside[box].ravel())
             stack_id.append(number)

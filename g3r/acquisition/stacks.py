@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import load_mask, load_volume
+from g3r.acquisition.psf import IN_PLANE_FWHM_RANGE_PIXELS, THICKNESS_RANGE_MM
+from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
@@ -20,8 +22,6 @@ logger = logging.getLogger(__name__)
 
 ORTHOGONALITY_TOLERANCE = 1e-3
 """Largest cosine between two axes of a stack; headers of scanners keep about 1e-5."""
-
-THICKNESS_RANGE_MM = (0.1, 20.0)
 
 SPACING_RANGE_MM = (0.05, 50.0)
 """Allowed spacing of pixels and slices; headers in metres or micrometres are outside."""
@@ -46,11 +46,13 @@ class Stack:
         affine: [4, 4] float64, RAS+ mm from index; may be left-handed or oblique.
         thickness_mm: thickness of a slice; the slice spacing is in the affine and may differ.
         name: for messages.
+        in_plane_fwhm_pixels: of the PSF along the first and the second axis of the image.
+        origin: where the PSF comes from, for the record.
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
             that are not finite, not positive or all the same inside the mask, a thickness outside 0.1-20 mm,
-            a voxel size that cannot be in mm.
+            an in-plane FWHM outside 0.1-20 pixels, a voxel size that cannot be in mm.
     """
 
     image: NDArray[np.float32]
@@ -58,6 +60,8 @@ class Stack:
     affine: NDArray[np.float64]
     thickness_mm: float
     name: str = "stack"
+    in_plane_fwhm_pixels: tuple[float, float] = NOMINAL_FWHM_PIXELS
+    origin: ProfileOrigin = NOT_SAID
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image, dtype=np.float32)
@@ -89,6 +93,13 @@ class Stack:
                 f"{self.name}: slice thickness {self.thickness_mm:g} mm; expected {low:g} to {high:g} mm, "
                 "pass --thickness"
             )
+        low, high = IN_PLANE_FWHM_RANGE_PIXELS
+        widths = tuple(float(width) for width in self.in_plane_fwhm_pixels)
+        if len(widths) != 2 or not all(low <= width <= high for width in widths):
+            raise InputError(
+                f"{self.name}: in-plane FWHM of {widths} pixels; expected two numbers from {low:g} to {high:g}, "
+                "for the two axes of a slice"
+            )
         if not mask.any():
             raise InputError(f"{self.name}: mask is empty; expected the brain to be marked")
         inside = image[mask]
@@ -112,6 +123,7 @@ class Stack:
         object.__setattr__(self, "mask", mask)
         object.__setattr__(self, "affine", affine)
         object.__setattr__(self, "thickness_mm", float(self.thickness_mm))
+        object.__setattr__(self, "in_plane_fwhm_pixels", widths)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.image.shape))
@@ -129,9 +141,12 @@ class Stack:
 
 
 def load_stack(
-    path: str | os.PathLike[str], mask_path: str | os.PathLike[str] | None = None, thickness_mm: float | None = None
+    path: str | os.PathLike[str],
+    mask_path: str | os.PathLike[str] | None = None,
+    thickness_mm: float | None = None,
+    profile: SliceProfile | None = None,
 ) -> Stack:
-    """Read a stack and its mask.
+    """Read a stack and its mask, and its JSON sidecar where there is one.
 
     The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third; image, mask
     and affine are permuted together so that it becomes the last. A slice keeps its number.
@@ -139,11 +154,13 @@ def load_stack(
     Args:
         path: of the NIfTI image.
         mask_path: of the brain mask; without one every positive voxel counts.
-        thickness_mm: of the slices; without one the slice spacing is taken, and a line is logged, because a
-            header does not show gaps.
+        thickness_mm: of the slices; without one that of the sidecar is taken, or else the slice spacing, with a
+            warning, because a header does not show gaps.
+        profile: of a run that is to be repeated, in place of the sidecar's.
 
     Raises:
-        InputError: what `load_volume`, `load_mask` and `Stack` refuse.
+        InputError: what `load_volume`, `load_mask`, `read_sidecar` and `Stack` refuse, or a sidecar that is about
+            slices at another distance.
     """
     volume = load_volume(path)
     for remark in volume.remarks:
@@ -162,15 +179,15 @@ def load_stack(
     order = [axis for axis in range(3) if axis != through] + [through]
     affine = volume.affine.copy()
     affine[:3, :3] = affine[:3, order]
-    if thickness_mm is None:
-        thickness_mm = float(spacing[through])
-        logger.info("%s: thickness taken as the distance of slices, %.2f mm", volume.name, thickness_mm)
+    profile = find_slice_profile(path, spacing, through, thickness_mm, profile)
     stack = Stack(
         image=np.ascontiguousarray(volume.data.transpose(order)),
         mask=np.ascontiguousarray(mask.transpose(order)),
         affine=affine,
-        thickness_mm=thickness_mm,
+        thickness_mm=profile.thickness_mm,
         name=volume.name,
+        in_plane_fwhm_pixels=profile.in_plane_fwhm_pixels,
+        origin=profile.origin,
     )
     if stack.thickness_mm < stack.spacing_mm[:2].min():
         logger.warning(
@@ -186,6 +203,7 @@ def load_stacks(
     paths: Sequence[str | os.PathLike[str]],
     mask_paths: Sequence[str | os.PathLike[str] | None] | None = None,
     thickness_mm: Sequence[float | None] | None = None,
+    profiles: Sequence[SliceProfile | None] | None = None,
 ) -> list[Stack]:
     """Read the stacks of one head, see `load_stack`.
 
@@ -193,16 +211,18 @@ def load_stacks(
         paths: of the NIfTI images.
         mask_paths: one for each stack, or none.
         thickness_mm: one for each stack, or none.
+        profiles: one for each stack, or none.
 
     Raises:
         InputError: a stack that cannot be used, the same image twice, or stacks too far apart.
-        ValueError: another number of masks or thicknesses than of stacks.
+        ValueError: another number of masks, thicknesses or profiles than of stacks.
     """
     masks = mask_paths or [None] * len(paths)
     thickness = thickness_mm or [None] * len(paths)
+    known = profiles or [None] * len(paths)
     stacks: list[Stack] = []
-    for path, mask, own_mm in zip(paths, masks, thickness, strict=True):
-        stack = load_stack(path, mask, own_mm)
+    for path, mask, own_mm, profile in zip(paths, masks, thickness, known, strict=True):
+        stack = load_stack(path, mask, own_mm, profile)
         for other, other_path in zip(stacks, paths, strict=False):
             _check_pair(stack, other, Path(path), Path(other_path))
         stacks.append(stack)

@@ -114,6 +114,7 @@ def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
         threads=task.n_threads,
         device=task.reconstructor.device,
         thickness=[stack.thickness_mm for stack in task.stacks],
+        in_plane_fwhm_pixels=[stack.in_plane_fwhm_pixels for stack in task.stacks],
         memory=options.max_memory,
     )
     return StageStore(folder, made_of, STORED_RECORDS, resume=options.resume)
@@ -187,7 +188,7 @@ def _dry_run(task: Task, folder: Path) -> int:
         spacing = " x ".join(f"{x:.2f}" for x in stack.spacing_mm)
         print(
             f"{stack.name}: {'x'.join(map(str, stack.image.shape))} voxels of {spacing} mm, "
-            f"thickness {stack.thickness_mm:g} mm, {int(stack.mask.sum())} masked"
+            f"thickness {stack.thickness_mm:g} mm ({stack.origin.thickness_from}), {int(stack.mask.sum())} masked"
         )
     print(task.memory.estimate.line())
     for change in task.memory.changes:

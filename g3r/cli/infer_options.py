@@ -28,7 +28,8 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         type=float,
         metavar="MM",
-        help="slice thickness, one for all or one per stack (default: the distance of slices)",
+        help="slice thickness, one for all or one per stack (default: what the JSON sidecar beside each stack says, or "
+        "else the distance of slices)",
     )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
     parser.add_argument(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,6 +60,7 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     Raises:
         InputError: a file that is missing or cannot be used, or a folder that must not be written.
     """
+    from g3r.acquisition.sidecar import sidecar_path
     from g3r.checkpoints.shipped import set_of, weights_path
     from g3r.checkpoints.weights_file import read_weights
     from g3r.output.files import OUTPUT_NAMES
@@ -66,7 +68,8 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
 
     sources = {"prior": options.ckpt, "pose": options.pose_ckpt or set_of(options.ckpt)}
     networks = {kind: weights_path(source, kind) for kind, source in sources.items() if source}
-    inputs = [*options.stacks, *(options.masks or ()), *networks.values()]
+    sidecars = [path for path in map(sidecar_path, options.stacks) if os.path.isfile(path)]
+    inputs = [*options.stacks, *sidecars, *(options.masks or ()), *networks.values()]
     check_output_folder(folder, OUTPUT_NAMES, replace=replaces, inputs=inputs)
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
@@ -127,10 +130,12 @@ def _earlier(options: argparse.Namespace) -> RunRecord | None:
 def _load(options: argparse.Namespace, earlier: RunRecord | None) -> list[Stack]:
     from g3r.acquisition.stacks import load_stacks
 
-    thickness = options.thickness or ([stack.thickness_mm for stack in earlier.stacks] if earlier else None)
+    thickness = options.thickness
     if thickness and len(thickness) == 1:
         thickness = thickness * len(options.stacks)
-    return load_stacks(options.stacks, options.masks, thickness)
+    repeats = earlier is not None and len(earlier.stacks) == len(options.stacks)
+    profiles = [stack.profile() for stack in earlier.stacks] if earlier and repeats else None
+    return load_stacks(options.stacks, options.masks, thickness, profiles)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:

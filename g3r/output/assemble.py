@@ -23,8 +23,9 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
-from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms, stack_records
+from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
+from g3r.output.stack_record import stack_records
 from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng

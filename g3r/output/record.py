@@ -15,34 +15,20 @@ import numpy as np
 
 from g3r._version import __version__
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
+from g3r.output.stack_record import StackRecord
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
 from g3r.registration import Registration
-from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality, registration_reliable, registration_summary
+from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
 from g3r.run.provenance import FileHash
 from g3r.uncertainty.unseen import UnseenPart
 
 MAX_RECORD_BYTES = 50_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class StackRecord:
-    """One stack: its geometry and how its slices were registered; fields are None where it had no slices."""
-
-    name: str
-    thickness_mm: float
-    spacing_mm: list[float] = field(default_factory=list)
-    n_slices: int = 0
-    quality: StackQuality | None = None
-    interleave: int | None = None
-    n_segments: int | None = None
-    n_downweighted_slices: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,34 +221,6 @@ class RunRecord:
             raise InputError(
                 f"{path}: is not a run.json of this version of g3r ({error}); pass one that g3r-infer wrote"
             ) from None
-
-
-def stack_records(
-    stacks: Sequence[Stack], registration: Registration, qualities: Sequence[StackQuality], weight: np.ndarray
-) -> list[StackRecord]:
-    """One record for each stack that was given.
-
-    Args:
-        stacks: in the order of their numbers in the slices.
-        registration: has an entry for each stack that has slices, which not every given one need have.
-        qualities: one per stack.
-        weight: [K] slice weights at the end of the fit.
-    """
-    stack_id = registration.slices.stack_id
-    place = {int(stack): k for k, stack in enumerate(np.unique(stack_id))}
-    return [
-        StackRecord(
-            name=stack.name,
-            thickness_mm=stack.thickness_mm,
-            spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
-            n_slices=int((stack_id == n).sum()),
-            quality=qualities[n],
-            interleave=registration.interleave[place[n]] if n in place else None,
-            n_segments=registration.n_segments[place[n]] if n in place else None,
-            n_downweighted_slices=int((weight[stack_id == n] < DOWNWEIGHTED_BELOW).sum()),
-        )
-        for n, stack in enumerate(stacks)
-    ]
 
 
 def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[InactiveTerm]:

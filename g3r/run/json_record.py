@@ -5,7 +5,7 @@ from __future__ import annotations
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def from_plain(kind: type[Record], value: Any, name: str = "record") -> Record:
     """A value of some type from its JSON.
 
     Args:
-        kind: a dataclass, list, tuple, dict, union with None, plain type or `Any`.
+        kind: a dataclass, list, tuple, dict, union with None, `Literal` of strings, plain type or `Any`.
         value: what `json.loads` gave.
         name: of the value, for errors.
 
@@ -53,6 +53,10 @@ def _built(kind: Any, value: Any, name: str) -> Any:
         return value
     if origin in (Union, types.UnionType):
         return _one_of(arguments, value, name)
+    if origin is Literal:
+        if value not in arguments:
+            raise ValueError(f"{name} is {value!r:.40}; expected {' or '.join(map(repr, arguments))}")
+        return value
     if is_dataclass(kind):
         return _dataclass(kind, value, name)
     if origin is list or origin is tuple:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from g3r.cli.infer import main as infer
-from g3r.output.record import CommandRecord, Inputs, RunRecord, StackRecord
+from g3r.output.record import CommandRecord, Inputs, RunRecord
+from g3r.output.stack_record import StackRecord
 from g3r.planning.presets import PRESETS
 from g3r.run.provenance import FileHash
 from tests.phantoms import simulate_small_subject

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ class Outer:
     on: bool
     inner: Inner
     maybe: Inner | None = None
+    side: Literal["left", "right"] | None = None
     pair: tuple[float, ...] = ()
     rows: list[Inner] = field(default_factory=list)
     by_name: dict[str, list[float]] = field(default_factory=dict)
@@ -34,6 +35,7 @@ ONE = Outer(
     n=3,
     on=True,
     inner=Inner(name="a", size_mm=0.1),
+    side="left",
     pair=(1.0, 2.5),
     rows=[Inner(name="b", size_mm=1e-300)],
     by_name={"x": [1 / 3]},
@@ -57,6 +59,8 @@ def test_numbers_of_numpy_become_plain_ones() -> None:
         ({"n": 1.5}, "record.n is 1.5; expected int"),
         ({"on": 1}, "record.on is 1; expected bool"),
         ({"inner": None}, "record.inner is None; expected dict"),
+        ({"side": "up"}, "record.side is 'up'; expected 'left' or 'right'"),
+        ({"side": ["left"]}, r"record.side is \[.left.\]; expected .left. or .right."),
         ({"inner": {"name": "a"}}, "record.inner: size_mm missing or unknown"),
         ({"rows": [{"name": "a", "size_mm": 1, "more": 2}]}, r"record.rows\[0\]: more missing or unknown"),
         ({"by_name": {"x": ["y"]}}, r"record.by_name.x\[0\] is 'y'; expected float"),

@@ -1,0 +1,180 @@
+"""What the PSF of a stack is made of, and who says so: an option, the sidecar, or the header's spacing."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from g3r.acquisition.psf import IN_PLANE_FWHM_PIXELS, phase_fwhm_pixels
+from g3r.acquisition.sidecar import AXES, Axis, Sidecar, read_sidecar, sidecar_path
+from g3r.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+LENGTHS_AGREE = 0.02
+"""Largest relative difference of two lengths that mean the same: sidecars round to a hundredth of a mm or so."""
+
+NOMINAL_FWHM_PIXELS = (IN_PLANE_FWHM_PIXELS, IN_PLANE_FWHM_PIXELS)
+
+ThicknessSource = Literal["option", "sidecar", "spacing"]
+"""Who gave the thickness: the user, the scanner, or nobody, so that it is the distance of slices."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileOrigin:
+    """Where the PSF of a stack comes from.
+
+    Attributes:
+        thickness_from: who gave the thickness.
+        phase_resolution: share of k-space that was filled along the phase-encoding axis; None: not known.
+        phase_axis: the phase-encoding axis of the image file; None: not known.
+    """
+
+    thickness_from: ThicknessSource = "option"
+    phase_resolution: float | None = None
+    phase_axis: Axis | None = None
+
+
+NOT_SAID = ProfileOrigin()
+"""Of a stack that was made with its thickness, and of which no scanner says anything."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SliceProfile:
+    """What the PSF of a stack follows from.
+
+    Attributes:
+        thickness_mm: of a slice.
+        in_plane_fwhm_pixels: along the two axes of the slices' images.
+        origin: who says so.
+    """
+
+    thickness_mm: float
+    in_plane_fwhm_pixels: tuple[float, float] = NOMINAL_FWHM_PIXELS
+    origin: ProfileOrigin = NOT_SAID
+
+    def line(self) -> str:
+        """For the terminal."""
+        text = f"thickness {self.thickness_mm:.4g} mm ({self.origin.thickness_from})"
+        p, axis = self.origin.phase_resolution, self.origin.phase_axis
+        if self.in_plane_fwhm_pixels != NOMINAL_FWHM_PIXELS:
+            text += ", in-plane FWHM {:.3g} x {:.3g} pixels".format(*self.in_plane_fwhm_pixels)
+        if p is not None and p < 1:
+            text += f", phase resolution {p:g} " + (f"along {axis}" if axis else "of an unknown axis, not used")
+        return text
+
+
+def find_slice_profile(
+    path: str | os.PathLike[str],
+    spacing_mm: ArrayLike,
+    slice_axis: int,
+    thickness_mm: float | None = None,
+    earlier: SliceProfile | None = None,
+) -> SliceProfile:
+    """The profile of a stack's slices; a line about it is logged.
+
+    Args:
+        path: of the image; its sidecar is beside it.
+        spacing_mm: [3] along the axes of the file.
+        slice_axis: the axis of the file, 0 to 2, along which slices are counted.
+        thickness_mm: as the user gives it. It wins over everything else.
+        earlier: of the run that is to be repeated, in place of the sidecar's.
+
+    Raises:
+        InputError: a sidecar that cannot be used, or that is about other slices than the image's.
+    """
+    name = Path(path).name
+    if earlier is None:
+        distance_mm = float(np.asarray(spacing_mm)[slice_axis])
+        sidecar = read_sidecar(sidecar_path(path))
+        if sidecar is not None:
+            _check_distance(sidecar, distance_mm, name)
+        profile = _profile(*_thickness(sidecar, distance_mm, thickness_mm, name), sidecar, slice_axis)
+    elif thickness_mm is None:
+        profile = earlier
+    else:
+        profile = replace(earlier, thickness_mm=thickness_mm, origin=replace(earlier.origin, thickness_from="option"))
+    logger.info("%s: %s", name, profile.line())
+    if profile.origin.thickness_from == "spacing":
+        logger.warning(
+            "%s: slice thickness taken as the distance of slices, %.2f mm, which is too much where there are gaps; "
+            "pass --thickness, or put the scanner's %s beside the image",
+            name,
+            profile.thickness_mm,
+            sidecar_path(path).name,
+        )
+    return profile
+
+
+def _check_distance(sidecar: Sidecar, distance_mm: float, name: str) -> None:
+    """Raise `InputError` for a sidecar whose slices are not as far apart as the image's."""
+    said_mm = sidecar.spacing_mm
+    if said_mm is not None and not _agree(said_mm, distance_mm):
+        raise InputError(
+            f"{sidecar.name}: SpacingBetweenSlices is {said_mm:g} mm; expected the {distance_mm:.4g} mm between slices "
+            f"of {name} by its header, pass the image that the file is of, or remove the file"
+        )
+
+
+def _thickness(
+    sidecar: Sidecar | None, distance_mm: float, given_mm: float | None, name: str
+) -> tuple[float, ThicknessSource]:
+    """Thickness and who gave it.
+
+    Args:
+        sidecar: None without.
+        distance_mm: between slices by the header.
+        given_mm: by the user.
+        name: of the image, for messages.
+    """
+    said_mm = None if sidecar is None else sidecar.thickness_mm
+    if given_mm is not None:
+        if sidecar is not None and said_mm is not None and not _agree(given_mm, said_mm):
+            logger.warning(
+                "%s: thickness %g mm is taken as given; the scanner says %g mm (%s)",
+                name,
+                given_mm,
+                said_mm,
+                sidecar.name,
+            )
+        return given_mm, "option"
+    return (distance_mm, "spacing") if said_mm is None else (said_mm, "sidecar")
+
+
+def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | None, slice_axis: int) -> SliceProfile:
+    """The profile, wider along the phase-encoding axis where the sidecar knows it.
+
+    Args:
+        thickness_mm: of a slice.
+        source: of the thickness.
+        sidecar: None without.
+        slice_axis: of the file.
+    """
+    if sidecar is None:
+        return SliceProfile(thickness_mm=thickness_mm, origin=ProfileOrigin(thickness_from=source))
+    axis = sidecar.phase_axis_of(slice_axis)
+    if axis is not None and AXES.index(axis) == slice_axis:
+        # slices that are excited one by one are encoded in their plane: the file is not as it was, or axes were changed
+        if sidecar.phase_resolution is not None:
+            logger.warning("%s: phase encoding along %s, which counts the slices; it is not used", sidecar.name, axis)
+        axis = None
+    fwhm = list(NOMINAL_FWHM_PIXELS)
+    if axis is not None and sidecar.phase_resolution is not None:
+        in_plane = [letter for n, letter in enumerate(AXES) if n != slice_axis]
+        fwhm[in_plane.index(axis)] = phase_fwhm_pixels(sidecar.phase_resolution)
+    return SliceProfile(
+        thickness_mm=thickness_mm,
+        in_plane_fwhm_pixels=(fwhm[0], fwhm[1]),
+        origin=ProfileOrigin(thickness_from=source, phase_resolution=sidecar.phase_resolution, phase_axis=axis),
+    )
+
+
+def _agree(one_mm: float, other_mm: float) -> bool:
+    """Whether two lengths are the same; what is no length (a thickness of 0) agrees with nothing."""
+    return abs(one_mm - other_mm) <= LENGTHS_AGREE * abs(other_mm)

@@ -1,0 +1,90 @@
+"""The part of run.json that each stack has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from g3r.acquisition.sidecar import Axis
+from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile, ThicknessSource
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.registration import Registration
+from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackRecord:
+    """One stack: its geometry, its PSF, and how its slices were registered.
+
+    Attributes:
+        name: of its file.
+        thickness_mm, thickness_from: thickness of a slice, and who gave it: the option, the sidecar, or nobody, so
+            that it is the distance of slices ("spacing").
+        in_plane_fwhm_pixels: of the PSF along the two axes of a slice.
+        phase_resolution, phase_axis: what the in-plane width follows from; None where the scanner does not say it.
+        spacing_mm: of pixels and slices.
+        quality, interleave, n_segments: None where the stack had no slices.
+    """
+
+    name: str
+    thickness_mm: float
+    thickness_from: ThicknessSource = "option"
+    in_plane_fwhm_pixels: tuple[float, ...] = NOMINAL_FWHM_PIXELS
+    phase_resolution: float | None = None
+    phase_axis: Axis | None = None
+    spacing_mm: list[float] = field(default_factory=list)
+    n_slices: int = 0
+    quality: StackQuality | None = None
+    interleave: int | None = None
+    n_segments: int | None = None
+    n_downweighted_slices: int = 0
+
+    def profile(self) -> SliceProfile:
+        """The PSF, to take the same one again.
+
+        Raises:
+            InputError: the record was changed and has not two in-plane widths.
+        """
+        if len(self.in_plane_fwhm_pixels) != 2:
+            raise InputError(f"{self.name}: has {len(self.in_plane_fwhm_pixels)} in-plane widths; expected 2")
+        first, second = self.in_plane_fwhm_pixels
+        return SliceProfile(
+            thickness_mm=self.thickness_mm,
+            in_plane_fwhm_pixels=(first, second),
+            origin=ProfileOrigin(
+                thickness_from=self.thickness_from, phase_resolution=self.phase_resolution, phase_axis=self.phase_axis
+            ),
+        )
+
+
+def stack_records(
+    stacks: Sequence[Stack], registration: Registration, qualities: Sequence[StackQuality], weight: np.ndarray
+) -> list[StackRecord]:
+    """One record for each stack that was given.
+
+    Args:
+        stacks: in the order of their numbers in the slices.
+        registration: has an entry for each stack that has slices, which not every given one need have.
+        qualities: one per stack.
+        weight: [K] slice weights at the end of the fit.
+    """
+    stack_id = registration.slices.stack_id
+    place = {int(stack): k for k, stack in enumerate(np.unique(stack_id))}
+    return [
+        StackRecord(
+            name=stack.name,
+            thickness_mm=stack.thickness_mm,
+            in_plane_fwhm_pixels=stack.in_plane_fwhm_pixels,
+            **vars(stack.origin),
+            spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
+            n_slices=int((stack_id == n).sum()),
+            quality=qualities[n],
+            interleave=registration.interleave[place[n]] if n in place else None,
+            n_segments=registration.n_segments[place[n]] if n in place else None,
+            n_downweighted_slices=int((weight[stack_id == n] < DOWNWEIGHTED_BELOW).sum()),
+        )
+        for n, stack in enumerate(stacks)
+    ]
