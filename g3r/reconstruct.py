@@ -5,10 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-
-import numpy as np
-from numpy.typing import NDArray
 
 from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Slices
@@ -20,33 +16,25 @@ from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
+from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, RoundFit, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
-from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
 from g3r.fitting.slice_targets import slice_target
+from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
 from g3r.output.assemble import StageResults, assemble
 from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, preset
 from g3r.planning.stages import Stage, stage_rng
 from g3r.pose_network.model import PoseModel
-from g3r.prior.inference import Tiling
 from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_search import template_fits
-from g3r.registration.prior_registration import register_to_prior
-from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
-
-NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
-    None: "slices of the single stack stay where the atlas template or the header has them",
-    True: "slices of the single stack were registered to the prior volume",
-    False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
-}
 
 
 class GaussianReconstructor:
@@ -82,6 +70,11 @@ class GaussianReconstructor:
         search, found = self.settings.registration, pose_checkpoint or set_of(checkpoint)
         self.pose_model = PoseModel.load(found) if search.template or search.network else None
         self.device = on_device(device, self.prior, self.pose_model)
+        self.subject_prior = SubjectPrior(
+            network=self.prior,
+            voxel_mm=self.prior.voxel_mm if self.prior else self.settings.resolution_mm,
+            common_bias_field=self.settings.common_bias_field,
+        )
 
     def reconstruct(
         self,
@@ -111,6 +104,7 @@ class GaussianReconstructor:
         poses = self._poses(slices, registration, plan, run)
         volumes = self._volumes(poses, run)
         prior = self._prior(volumes, poses, plan, run)
+        prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
         held_out = self._held_out(cloud, prior, poses, plan, run)
         fit = self._fit_to_slices(cloud, prior, poses, held_out, plan, run)
@@ -118,6 +112,7 @@ class GaussianReconstructor:
             stacks=stacks,
             registration=poses,
             prior=prior,
+            rounds=rounds,
             intensity=intensity * prior.scale,
             cloud=cloud,
             held_out=held_out,
@@ -177,53 +172,61 @@ class GaussianReconstructor:
 
     def _volumes(self, poses: Registration, run: RunContext) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
-        wanted = self.settings.common_bias_field
-        return run.stage(Stage.COARSE, lambda: self._volumes_of(poses.slices, poses.gain, poses, wanted))
-
-    def _volumes_of(
-        self, slices: Slices, gain: NDArray[np.float64], poses: Registration, common_bias_field: bool
-    ) -> InitialVolumes:
-        box_mm = placed.box_mm() if (placed := placed_template(self.prior, poses.orientation)) else None
-        voxel_mm = self.prior.voxel_mm if self.prior else self.settings.resolution_mm
-        return InitialVolumes.of(slices, gain, poses.weight, voxel_mm, box_mm, common_bias_field=common_bias_field)
+        return run.stage(Stage.COARSE, lambda: self.subject_prior.volumes(poses))
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         run.report(Stage.PRIOR)(0, 1)
-        prior = run.stage(Stage.PRIOR, lambda: self._prior_volume(volumes, poses, plan.settings))
+        n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
+        views = 1 if plan.settings.pose_rounds.replace_prior(n_stacks) else plan.settings.prior_views
+        prior = run.stage(Stage.PRIOR, lambda: self.subject_prior.of(volumes, poses, views, tiling))
         run.report(Stage.PRIOR)(1, 1)
-        if volumes.slices.n_stacks > 1:
+        if n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
-            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: self._slices_to_prior(prior, poses, plan.settings))
+            moved = self.subject_prior.with_slices_moved
+            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: moved(prior, poses, views, tiling))
         run.notes.append(NOTE_ON_SINGLE[prior.accepted])
         return prior
 
-    def _prior_volume(
-        self, volumes: InitialVolumes, poses: Registration, settings: ReconstructionSettings
-    ) -> PriorVolume:
-        tiling = Tiling(settings.prior_whole_voxels, settings.prior_tile_voxels, settings.prior_halo_voxels)
-        placed = placed_template(self.prior, poses.orientation)
-        found = prior_volume(volumes, poses.gain, self.prior, placed, n_views=settings.prior_views, tiling=tiling)
-        release_memory()  # the most that is ever freed at a time
-        return found
+    def _rounds(
+        self, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
+    ) -> tuple[PriorVolume, Registration, PoseRounds | None]:
+        """Prior volume and poses after rounds of both; as they are where none is due, or where a stop was requested."""
+        settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
+        n_rounds = settings.pose_rounds.n_rounds(prior)
+        if not n_rounds:
+            return prior, poses, None
 
-    def _slices_to_prior(
-        self, prior: PriorVolume, poses: Registration, settings: ReconstructionSettings
-    ) -> PriorVolume:
-        """The slices registered to the prior volume, and the prior volume that they give there."""
-        before = prior.volumes
-        slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
-        if not accepted:
-            return replace(prior, gain=gain, accepted=False)
-        volumes = replace(self._volumes_of(slices, gain, poses, False), field_rms=before.field_rms)
-        after = self._prior_volume(volumes, poses, settings)
-        return replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
+        def prior_of(moved: Registration, last: bool) -> PriorVolume:
+            return self.subject_prior.again(moved, prior, settings.prior_views if last else 1, settings.tiling)
+
+        def refine() -> RefinedPoses:
+            return refine_in_rounds(
+                poses,
+                prior,
+                n_rounds,
+                prior_of=prior_of,
+                fit=RoundFit(
+                    settings=settings.pose_rounds,
+                    prior_stage=settings.prior_stage,
+                    slice_stage=settings.slice_stage,
+                    slice_model=settings.slice_model,
+                    distillation=settings.use_prior and settings.distillation,
+                ),
+                rng=stage_rng(settings.seed, Stage.POSE_ROUNDS),
+                progress=run.report(Stage.POSE_ROUNDS),
+            )
+
+        found = run.droppable_stage(Stage.POSE_ROUNDS, refine)
+        return (prior, poses, None) if found is None else (found.prior, found.registration, found.record)
 
     def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud | None:
-        """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None where a stop was requested."""
+        """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None if stopped, or without a fit."""
         volumes, coarse_s = prior.volumes, run.clock.seconds[Stage.COARSE]
+        if run.stopped_at is not None or not plan.settings.fit:
+            return None
 
         def fit() -> PriorCloud:
             n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)

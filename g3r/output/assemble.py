@@ -18,6 +18,7 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
@@ -55,6 +56,7 @@ class StageResults:
         registration: poses of their slices.
         prior: the prior volume and what it was made of.
         intensity: intensity of 1 in the fit.
+        rounds: what rounds of poses and volume did; None where there was none.
         held_out: what held-out slices chose; None where they were not asked.
         cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
             volume less well than that volume does.
@@ -65,6 +67,7 @@ class StageResults:
     stacks: Sequence[Stack]
     registration: Registration
     prior: PriorVolume
+    rounds: PoseRounds | None
     intensity: float
     cloud: PriorCloud | None
     held_out: HeldOutChoice | None
@@ -262,6 +265,7 @@ def _record(
         bias_field=fit.bias_field,
         common_bias_rms=found.prior.volumes.field_rms,
         n_gaussians=len(fit.cloud),
+        pose_rounds=found.rounds,
         held_out=found.held_out,
         gaussian_spacing_mm=found.cloud.spacing_mm if found.cloud else None,
         n_rollbacks=n_rollbacks,

@@ -17,6 +17,7 @@ from g3r._version import __version__
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
+from g3r.fitting.pose_rounds import PoseRounds
 from g3r.output.stack_record import StackRecord
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
@@ -137,6 +138,7 @@ class RunRecord:
         registration: None where the file is only a configuration.
         bias_field: coefficients of each stack's bias field; empty where it was not estimated.
         common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
+        pose_rounds: what rounds of poses and volume did; None where there was none.
         held_out: what held-out slices chose; None where they were not asked.
         gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
@@ -161,6 +163,7 @@ class RunRecord:
     bias_field: list[list[float]] = field(default_factory=list)
     common_bias_rms: float = 0.0
     n_gaussians: int = 0
+    pose_rounds: PoseRounds | None = None
     held_out: HeldOutChoice | None = None
     gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0

@@ -108,6 +108,10 @@ def estimate_memory(
     }
     if settings.held_out is not None:
         stages[Stage.HELD_OUT] = stages[Stage.FIT_TO_SLICES]
+    if settings.pose_rounds.at_most(1).two_stacks:
+        # the volumes before a round are kept until those after it are made
+        inner = max(stages[Stage.COARSE], stages[Stage.FIT_TO_SLICES], stages.get(Stage.PRIOR, 0))
+        stages[Stage.POSE_ROUNDS] = inner + VOLUMES_PER_VOXEL * voxels
     if settings.use_prior:
         stages[Stage.PRIOR_SHARE] = outputs + projections + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages[Stage.UNCERTAINTY] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output

@@ -18,6 +18,7 @@ class BudgetRecord:
         seconds: that were given.
         registration, fit: names of the presets that registration and the fit follow.
         prior_views: views of the prior.
+        pose_rounds: most rounds of poses and volume.
         step_s: measured seconds of one optimiser step.
         n_gaussians_timed: Gaussians in that step.
         reserve_s: seconds kept for what follows the fit.
@@ -28,6 +29,7 @@ class BudgetRecord:
     seconds: float
     registration: str | None = None
     prior_views: int | None = None
+    pose_rounds: int | None = None
     fit: str | None = None
     step_s: float | None = None
     n_gaussians_timed: int | None = None
@@ -45,7 +47,7 @@ class Plan(Protocol):
         """Decide how registration searches; returns when it has to end."""
 
     def for_prior(self, coarse_s: float) -> None:
-        """Decide the number of views; `coarse_s` is what V_coarse and V_sharp took."""
+        """Decide the numbers of views and of rounds of poses; `coarse_s` is what V_coarse and V_sharp took."""
 
     def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline | None:
         """Decide Gaussians and steps of both stages of the fit.

@@ -8,10 +8,11 @@ from typing import Any
 
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutSettings
+from g3r.fitting.pose_rounds import PoseRoundSettings
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
-from g3r.prior.inference import DEFAULT_TILING
+from g3r.prior.inference import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings
 
 
@@ -24,6 +25,7 @@ class ReconstructionSettings:
         gaussian_spacing_pixels: cell edge per Gaussian of the lattice, in units of the cube root of what one pixel
             covers (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
         registration: poses from the slices.
+        pose_rounds: poses from the slices and V_prior, in turn with the volume.
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
@@ -37,6 +39,7 @@ class ReconstructionSettings:
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         common_bias_field: divide out the bias field that stacks share (N4).
+        fit: False shows V_prior in its own poses.
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         seed: of every random choice.
     """
@@ -44,6 +47,7 @@ class ReconstructionSettings:
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.0
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    pose_rounds: PoseRoundSettings = field(default_factory=PoseRoundSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_model: SliceModel = field(default_factory=SliceModel)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
@@ -57,8 +61,14 @@ class ReconstructionSettings:
     use_prior: bool = True
     distillation: bool = True
     common_bias_field: bool = True
+    fit: bool = True
     fill_unseen: bool = True
     seed: int = 0
+
+    @property
+    def tiling(self) -> Tiling:
+        """When and how the prior network works in tiles."""
+        return Tiling(self.prior_whole_voxels, self.prior_tile_voxels, self.prior_halo_voxels)
 
 
 _BALANCED = ReconstructionSettings()
@@ -67,6 +77,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
+        pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
         prior_views=1,
         share_probes=1,
         registration=replace(
@@ -85,15 +96,19 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "fast": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.14,
+        pose_rounds=PoseRoundSettings(two_stacks=1, more_stacks=0),
         prior_views=1,
         registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),
-    "balanced": _BALANCED,
+    "balanced": replace(
+        _BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)
+    ),
     "accurate": replace(
         _BALANCED,
         gaussian_spacing_pixels=1.75,
+        pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=2),
         held_out=HeldOutSettings(),
         prior_views=8,
         registration=replace(_BALANCED.registration, n_rounds=20),

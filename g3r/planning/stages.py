@@ -15,6 +15,7 @@ class Stage(StrEnum):
     COARSE = "coarse volume"
     PRIOR = "prior"
     SLICES_TO_PRIOR = "slices to prior"
+    POSE_ROUNDS = "poses in rounds"
     FIT_TO_PRIOR = "fit to prior"
     HELD_OUT = "held-out slices"
     FIT_TO_SLICES = "fit to slices"
@@ -24,7 +25,13 @@ class Stage(StrEnum):
     WRITING = "writing"
 
 
-_SPAWN_KEY = {Stage.FIT_TO_PRIOR: 2, Stage.FIT_TO_SLICES: 3, Stage.PRIOR_SHARE: 4, Stage.HELD_OUT: 5}
+_SPAWN_KEY = {
+    Stage.FIT_TO_PRIOR: 2,
+    Stage.FIT_TO_SLICES: 3,
+    Stage.PRIOR_SHARE: 4,
+    Stage.HELD_OUT: 5,
+    Stage.POSE_ROUNDS: 6,
+}
 
 
 def stage_rng(seed: int, stage: Stage) -> np.random.Generator:

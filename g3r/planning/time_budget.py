@@ -46,6 +46,12 @@ COARSE_PER_VIEW = 1.2
 VIEWS_SHARE = 0.2
 """Largest share of the remaining time that views of the prior beyond the first may take."""
 
+ROUND_OVER_COARSE = 4.0
+"""Seconds of a round of poses and volume, without the views of the prior, over those of V_coarse and V_sharp."""
+
+ROUNDS_SHARE = 0.3
+"""Largest share of the remaining time that these rounds may take."""
+
 COARSE_AT_END = 0.9
 """Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
 output of as many voxels; the picture and the files take another `WRITING_S`."""
@@ -116,7 +122,7 @@ class TimeBudget:
         return self.deadline.part(REGISTRATION_SHARE)
 
     def for_prior(self, coarse_s: float) -> None:
-        """Take as many views of the prior as fit, at most those of `accurate`.
+        """Take as many views of the prior and rounds of poses as fit, at most those of `accurate`.
 
         Args:
             coarse_s: what V_coarse and V_sharp took.
@@ -124,8 +130,11 @@ class TimeBudget:
         view_s = COARSE_PER_VIEW * coarse_s
         views = int(VIEWS_SHARE * max(0.0, self.deadline.remaining_s) / view_s) if view_s > 0 else 1
         views = min(max(1, views), PRESETS["accurate"].prior_views)
-        self.settings = replace(self.settings, prior_views=views)
-        self.choices["prior_views"] = views
+        round_s = ROUND_OVER_COARSE * coarse_s + view_s * views
+        rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
+        pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
+        self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
+        self.choices |= {"prior_views": views, "pose_rounds": pose_rounds.two_stacks}
 
     def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline:
         """Take the most careful preset whose Gaussians and steps fit, with the deadline of the first stage.

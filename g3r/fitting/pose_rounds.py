@@ -1,0 +1,213 @@
+"""Poses and volume in rounds: slices registered to the fitted volume, and the volume made anew from them.
+
+Registration works on a least-squares volume that repeats the errors of its poses. The Gaussians are held to V_prior,
+which has learned what heads look like, and slices move with them: two stacks, which check each other only where they
+cross, come nearer to the truth with every round. A round is kept where stacks predict each other at least as well.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
+from g3r.acquisition.robust import robust_width, slice_weights
+from g3r.fitting.initial_volumes import PriorVolume, gaussian_spacing_mm
+from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings
+from g3r.fitting.prior_targets import distillation_target, fit_to_prior
+from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
+from g3r.fitting.slice_targets import SliceModel, slice_target
+from g3r.gaussians import render
+from g3r.registration import Registration
+from g3r.registration.held_out import fine_held_out_correlations
+from g3r.registration.normal_equations import SliceModel as SamplingModel
+from g3r.registration.slice_registration import register_slices, try_neighbours
+
+logger = logging.getLogger(__name__)
+
+SPACING_PIXELS = 2.2
+"""Of the Gaussians of a round."""
+
+MAX_PIXELS = 200_000
+"""At most about so many pixels in a Gauss-Newton step."""
+
+MAX_LOSS = 0.002
+"""A round whose mean held-out correlation is lower than before by more than this is undone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseRoundSettings:
+    """How often poses and volume are found in turn.
+
+    Args:
+        single_stack: rounds with one stack, whose slices gained by moving to the prior; no other stack checks them.
+        two_stacks: with two stacks.
+        more_stacks: with three or more, whose poses are nearer to the truth from the start.
+        prior_steps, slice_steps: of both stages of the fit in a round.
+        newton_steps: Gauss-Newton steps of all slices against the fitted volume.
+    """
+
+    single_stack: int = 1
+    two_stacks: int = 2
+    more_stacks: int = 1
+    prior_steps: int = 12
+    slice_steps: int = 60
+    newton_steps: int = 4
+
+    def n_rounds(self, prior: PriorVolume) -> int:
+        """Most rounds for a subject."""
+        n_stacks = prior.volumes.slices.n_stacks
+        if n_stacks == 1:
+            return self.single_stack if prior.accepted else 0
+        return self._of_several(n_stacks)
+
+    def replace_prior(self, n_stacks: int) -> bool:
+        """Whether the first V_prior of several stacks will be replaced in any case."""
+        return n_stacks > 1 and self._of_several(n_stacks) > 0
+
+    def at_most(self, n_rounds: int) -> PoseRoundSettings:
+        """The same with no more rounds than given."""
+        counts = {name: min(getattr(self, name), n_rounds) for name in ("single_stack", "two_stacks", "more_stacks")}
+        return replace(self, **counts)
+
+    def _of_several(self, n_stacks: int) -> int:
+        return self.two_stacks if n_stacks == 2 else self.more_stacks
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseRounds:
+    """What the rounds did, for the record.
+
+    Attributes:
+        n_kept: rounds that were kept.
+        held_out: mean correlation of each stack with a volume of the others, before the first round and after each, the
+            undone one included; empty for a single stack.
+        n_moved: slices that took the motion of a neighbour, in each round.
+    """
+
+    n_kept: int
+    held_out: list[float]
+    n_moved: list[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinedPoses:
+    """Poses after all rounds, the prior volume that was made of them, and what the rounds did."""
+
+    registration: Registration
+    prior: PriorVolume
+    record: PoseRounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundFit:
+    """The short fit of a round.
+
+    Args:
+        settings: its number of steps.
+        prior_stage, slice_stage: the whole fit, of which it is a short one.
+        slice_model: of the slices.
+        distillation: whether it is held to V_prior.
+    """
+
+    settings: PoseRoundSettings
+    prior_stage: PriorStageSettings
+    slice_stage: SliceStageSettings
+    slice_model: SliceModel
+    distillation: bool = True
+
+    def run(self, prior: PriorVolume, weight: NDArray[np.float64], rng: np.random.Generator) -> SliceFit:
+        """Gaussians and poses of a few steps.
+
+        Args:
+            prior: with the posed slices.
+            weight: [K] slice weights.
+            rng: draws what the fits draw.
+        """
+        spacing_mm = gaussian_spacing_mm(prior.volumes.slices, SPACING_PIXELS)
+        stage = replace(self.prior_stage, n_steps=self.settings.prior_steps)
+        cloud = fit_to_prior(prior, spacing_mm=spacing_mm, stage=stage, rng=rng, progress=NO_PROGRESS, deadline=None)
+        target = slice_target(prior, weight, self.slice_model)
+        return fit_slices(
+            cloud.cloud,
+            target.slices,
+            gain=prior.gain,
+            weight=weight,
+            prior=distillation_target(prior) if self.distillation else None,
+            settings=replace(self.slice_stage, n_steps=self.settings.slice_steps),
+            rng=rng,
+            pixel_weight=target.pixel_weight,
+        )
+
+
+def refine_in_rounds(
+    registration: Registration,
+    prior: PriorVolume,
+    n_rounds: int,
+    *,
+    prior_of: Callable[[Registration, bool], PriorVolume],
+    fit: RoundFit,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = NO_PROGRESS,
+) -> RefinedPoses:
+    """Poses and prior volume after up to `n_rounds` rounds; ends at the first one that does not help.
+
+    Args:
+        registration: poses from the slices alone.
+        prior: the prior volume made of them.
+        n_rounds: at most.
+        prior_of: makes the prior volume of poses; told whether it is the last one, which is worth more time.
+        fit: of each round.
+        rng: draws what the fits draw.
+        progress: called with (rounds done, rounds in all).
+    """
+    checked = prior.volumes.slices.n_stacks > 1
+    held_out = [_mean_held_out(registration)] if checked else []
+    n_kept, n_moved = 0, list[int]()
+    for number in range(n_rounds):
+        progress(number, n_rounds)
+        moved, neighbours = _registered_to_fit(
+            registration, prior, fit.run(prior, registration.weight, rng), fit.settings.newton_steps
+        )
+        n_moved.append(neighbours)
+        if checked:
+            held_out.append(_mean_held_out(moved))
+            logger.info("poses, round %d: held-out correlation %.4f, before %.4f", number + 1, *held_out[:-3:-1])
+            if held_out[-1] < held_out[-2] - MAX_LOSS:
+                prior = prior_of(registration, True)
+                break
+        registration, prior = moved, prior_of(moved, number == n_rounds - 1)
+        n_kept += 1
+    progress(n_rounds, n_rounds)
+    record = PoseRounds(n_kept=n_kept, held_out=[round(value, 4) for value in held_out], n_moved=n_moved)
+    return RefinedPoses(registration=registration, prior=prior, record=record)
+
+
+def _mean_held_out(registration: Registration) -> float:
+    return float(np.mean(fine_held_out_correlations(registration.slices, registration.gain)))
+
+
+def _registered_to_fit(
+    registration: Registration, prior: PriorVolume, fit: SliceFit, n_steps: int
+) -> tuple[Registration, int]:
+    """Slices registered to the fitted volume from the poses of the fit, and how many took those of a neighbour."""
+    grid = prior.volumes.grid
+    volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * prior.support
+    slices: Slices = prior.volumes.slices.with_pose(fit.slices.planes.pose)
+    model = SamplingModel(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
+    gain: NDArray[np.float64] = fit.gain
+    width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
+    slices, n_moved = try_neighbours(model, slices, gain, width=width)
+    slices, gain, at_end = register_slices(model, slices, gain, n_steps=n_steps, width=width)
+    moved = replace(
+        registration,
+        slices=registration.slices.with_pose(slices.planes.pose),
+        gain=gain,
+        weight=slice_weights(at_end.loss),
+        ncc=at_end.ncc,
+    )
+    return moved, n_moved

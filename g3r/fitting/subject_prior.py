@@ -1,0 +1,91 @@
+"""From posed slices to V_prior of a subject: the volumes that slices give by themselves, and what the network adds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.fitting.prior_volume import placed_template, prior_volume
+from g3r.prior.inference import Tiling
+from g3r.prior.model import Prior
+from g3r.registration import Registration
+from g3r.registration.prior_registration import register_to_prior
+from g3r.run.allocator import release_memory
+
+NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
+    None: "slices of the single stack stay where the atlas template or the header has them",
+    True: "slices of the single stack were registered to the prior volume",
+    False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubjectPrior:
+    """Makes the volumes of a subject from its slices, as often as these move.
+
+    Args:
+        network: None takes V_sharp, smoothly continued, for V_prior.
+        voxel_mm: of the volumes.
+        common_bias_field: whether the bias field that stacks share is divided out.
+    """
+
+    network: Prior | None
+    voxel_mm: float
+    common_bias_field: bool = True
+
+    def volumes(self, poses: Registration) -> InitialVolumes:
+        """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
+        return self._volumes(poses.slices, poses.gain, poses, self.common_bias_field)
+
+    def of(self, volumes: InitialVolumes, poses: Registration, n_views: int, tiling: Tiling) -> PriorVolume:
+        """V_prior (Eq. 7).
+
+        Args:
+            volumes: that `volumes` gave.
+            poses: of their slices.
+            n_views: see `estimate_prior`.
+            tiling: see `estimate_prior`.
+        """
+        placed = placed_template(self.network, poses.orientation)
+        found = prior_volume(volumes, poses.gain, self.network, placed, n_views=n_views, tiling=tiling)
+        release_memory()  # the most that is ever freed at a time
+        return found
+
+    def again(self, poses: Registration, before: PriorVolume, n_views: int, tiling: Tiling) -> PriorVolume:
+        """V_prior of other poses.
+
+        Args:
+            poses: with gains and weights that belong to them.
+            before: the V_prior that it replaces.
+            n_views: see `estimate_prior`.
+            tiling: see `estimate_prior`.
+        """
+        return replace(self.of(self.volumes(poses), poses, n_views, tiling), accepted=before.accepted)
+
+    def with_slices_moved(self, prior: PriorVolume, poses: Registration, n_views: int, tiling: Tiling) -> PriorVolume:
+        """The slices of a single stack registered to the prior volume, and the prior volume that they give there.
+
+        Args:
+            prior: of the stack; its own slices come back where they do not fit it better after moving.
+            poses: that it was made with.
+            n_views: see `estimate_prior`.
+            tiling: see `estimate_prior`.
+        """
+        before = prior.volumes
+        slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
+        if not accepted:
+            return replace(prior, gain=gain, accepted=False)
+        volumes = replace(self._volumes(slices, gain, poses, False), field_rms=before.field_rms)
+        after = self.of(volumes, poses, n_views, tiling)
+        return replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
+
+    def _volumes(
+        self, slices: Slices, gain: NDArray[np.float64], poses: Registration, common_bias_field: bool
+    ) -> InitialVolumes:
+        placed = placed_template(self.network, poses.orientation)
+        box_mm = placed.box_mm() if placed else None
+        return InitialVolumes.of(slices, gain, poses.weight, self.voxel_mm, box_mm, common_bias_field=common_bias_field)
