@@ -14,7 +14,7 @@ import numpy as np
 
 from data_synth.atlas import TruthVolume, cropped, find_subjects, load_subject
 from data_synth.export import save_simulation
-from data_synth.simulator import orthogonal_settings, simulate_stacks
+from data_synth.simulator import StackSettings, orthogonal_settings, simulate_stacks
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase, load_case
 
@@ -63,6 +63,33 @@ class SubjectSpec:
     def __post_init__(self) -> None:
         if not self.name:
             object.__setattr__(self, "name", f"{self.motion}-{self.seed}-{self.volume.rsplit('/', 1)[-1]}")
+
+    def acquisition(self, n_stacks: int) -> list[StackSettings]:
+        """How its stacks are taken."""
+        return orthogonal_settings(n_stacks, self.motion, bias=self.bias)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizedSubject(SubjectSpec):
+    """A subject whose stacks are of a size of their own.
+
+    Args:
+        pixel_mm: in-plane spacing.
+        thickness_mm: of a slice.
+        gap_mm: between slices.
+    """
+
+    pixel_mm: float
+    thickness_mm: float
+    gap_mm: float = 0.0
+
+    def acquisition(self, n_stacks: int) -> list[StackSettings]:
+        """How its stacks are taken."""
+        usual = super().acquisition(n_stacks)
+        return [
+            replace(one, resolution_mm=self.pixel_mm, thickness_mm=self.thickness_mm, gap_mm=self.gap_mm)
+            for one in usual
+        ]
 
 
 def data_folder(part: str) -> Path:
@@ -134,7 +161,7 @@ def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
     chosen = find_subjects(atlas, include=[spec.volume])
     rng = np.random.default_rng(spec.seed)
     truth = stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), spec, rng)
-    settings = orthogonal_settings(3, spec.motion, bias=spec.bias)
+    settings = spec.acquisition(3)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}
     save_simulation(folder, truth, stacks, {"spec": record, **extra})

@@ -53,7 +53,7 @@ class ReconstructionSettings:
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     held_out: HeldOutSettings | None = None
     prior_weight: float = 0.2
-    prior_views: int = 4
+    prior_views: int = 2
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
     prior_halo_voxels: int = DEFAULT_TILING.halo_voxels
@@ -102,9 +102,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
     ),
-    "balanced": replace(
-        _BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)
-    ),
+    "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(
         _BALANCED,
         gaussian_spacing_pixels=1.75,
