@@ -53,7 +53,7 @@ class SliceStageSettings:
         rates: step sizes.
     """
 
-    n_steps: int = 100
+    n_steps: int = 80
     amplitude_iterations: int = 6
     scale_weight: float = 0.02
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.2, 0.02))

@@ -45,7 +45,7 @@ class ReconstructionSettings:
     """
 
     resolution_mm: float = 0.8
-    gaussian_spacing_pixels: float = 2.0
+    gaussian_spacing_pixels: float = 2.14
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     pose_rounds: PoseRoundSettings = field(default_factory=PoseRoundSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
@@ -95,23 +95,19 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
     "fast": replace(
         _BALANCED,
-        gaussian_spacing_pixels=2.14,
         pose_rounds=PoseRoundSettings(two_stacks=1, more_stacks=0),
         prior_views=1,
         registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=90),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=70),
     ),
     "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(
         _BALANCED,
-        gaussian_spacing_pixels=1.75,
-        pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=2),
+        pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=3),
         held_out=HeldOutSettings(),
         prior_views=8,
-        registration=replace(_BALANCED.registration, n_rounds=20),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=40),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=160),
     ),
 }
 """Settings by name, from quick to careful."""
