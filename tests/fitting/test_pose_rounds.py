@@ -1,0 +1,128 @@
+"""Rounds of poses and volume bring slices nearer to the truth, and are undone where stacks predict each other worse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting import pose_rounds
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.fitting.pose_rounds import PoseRoundSettings, RefinedPoses, RoundFit, refine_in_rounds
+from g3r.fitting.prior_stage import PriorStageSettings
+from g3r.fitting.prior_volume import prior_volume
+from g3r.fitting.slice_stage import SliceStageSettings
+from g3r.fitting.slice_targets import SliceModel
+from g3r.geometry import RigidPose
+from g3r.prior.inference import DEFAULT_TILING
+from g3r.registration import Registration
+from g3r.registration.held_out import fine_held_out_correlations
+from tests.fitting.scene import make_slices
+
+ERROR_MM = 0.6
+"""Standard deviation per axis of how far slices start from where they belong."""
+
+
+def registration_of(slices: Slices) -> Registration:
+    n = len(slices)
+    return Registration(
+        slices=slices,
+        gain=np.ones(n),
+        weight=np.ones(n),
+        ncc=np.ones(n),
+        held_out=[0.9, 0.9, 0.9],
+        initialisation="headers",
+        initialisations={},
+        interleave=[None] * 3,
+        n_segments=[1] * 3,
+        orientation=None,
+    )
+
+
+def moved_away(slices: Slices) -> Slices:
+    rng = np.random.default_rng(1)
+    shift = RigidPose(np.tile(np.eye(3), (len(slices), 1, 1)), rng.normal(0, ERROR_MM, (len(slices), 3)))
+    return slices.with_pose(shift @ slices.planes.pose)
+
+
+class PriorMaker:
+    """V_sharp of the slices as they are, and what was asked for."""
+
+    def __init__(self) -> None:
+        self.last: list[bool] = []
+
+    def __call__(self, poses: Registration, last: bool) -> PriorVolume:
+        self.last.append(last)
+        volumes = InitialVolumes.of(poses.slices, poses.gain, poses.weight, 1.0, common_bias_field=False)
+        return prior_volume(volumes, poses.gain, None, None, n_views=1, tiling=DEFAULT_TILING)
+
+
+def run(start: Registration, n_rounds: int) -> tuple[RefinedPoses, PriorMaker]:
+    maker = PriorMaker()
+    found = refine_in_rounds(
+        start,
+        maker(start, False),
+        n_rounds,
+        prior_of=maker,
+        fit=RoundFit(
+            settings=PoseRoundSettings(prior_steps=8, slice_steps=30),
+            prior_stage=PriorStageSettings(),
+            slice_stage=SliceStageSettings(prior_error=0.0),
+            slice_model=SliceModel(surroundings=False),
+            distillation=False,
+        ),
+        rng=np.random.default_rng(0),
+    )
+    maker.last.pop(0)
+    return found, maker
+
+
+def error_mm(slices: Slices, true: Slices) -> float:
+    """Median distance of slices from where they belong, after their common shift."""
+    away = slices.planes.center_mm - true.planes.center_mm
+    return float(np.median(np.linalg.norm(away - away.mean(0), axis=1)))
+
+
+def test_slices_come_nearer_to_the_truth_round_by_round() -> None:
+    true = make_slices()
+    start = registration_of(moved_away(true))
+    found, maker = run(start, 2)
+    assert found.record.n_kept == 2
+    assert maker.last == [False, True]
+    assert found.record.held_out == sorted(found.record.held_out)
+    assert error_mm(found.registration.slices, true) < 0.5 * error_mm(start.slices, true)
+    assert found.prior.volumes.slices.planes.center_mm == pytest.approx(found.registration.slices.planes.center_mm)
+
+
+def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    falling = iter([0.9, 0.9 - 2 * pose_rounds.MAX_LOSS, 0.95])
+    monkeypatch.setattr(pose_rounds, "fine_held_out_correlations", lambda slices, gain: [next(falling)])
+    start = registration_of(moved_away(make_slices()))
+    found, maker = run(start, 3)
+    assert found.record.n_kept == 0
+    assert len(found.record.held_out) == 2
+    assert found.registration is start
+    assert maker.last == [True]  # the first V_prior was a quick one
+
+
+def test_a_single_stack_has_rounds_only_where_its_slices_moved_to_the_prior() -> None:
+    settings = PoseRoundSettings(single_stack=1, two_stacks=2, more_stacks=3)
+    slices = make_slices()
+    for n_stacks, accepted, expected in ((1, True, 1), (1, False, 0), (1, None, 0), (2, None, 2), (3, None, 3)):
+        some = registration_of(slices.take(slices.stack_id < n_stacks))
+        assert settings.n_rounds(replace(PriorMaker()(some, False), accepted=accepted)) == expected
+    assert settings.at_most(1) == PoseRoundSettings(single_stack=1, two_stacks=1, more_stacks=1)
+    assert [settings.replace_prior(n) for n in (1, 2, 3)] == [False, True, True]
+    assert not settings.at_most(0).replace_prior(2)
+
+
+def test_held_out_correlation_tells_poses_half_a_millimetre_apart() -> None:
+    true = make_slices()
+    ones = np.ones(len(true))
+    right, wrong = (fine_held_out_correlations(slices, ones) for slices in (true, moved_away(true)))
+    assert np.mean(right) > np.mean(wrong) + 0.01
+    dark = np.where(true.stack_id == 1, 0.5, 1.0)
+    darker = replace(true, value=(true.value * dark[true.planes.plane_id()]).astype(np.float32))
+    assert fine_held_out_correlations(darker, dark) == pytest.approx(right, abs=1e-5)
