@@ -16,7 +16,7 @@ from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
-from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, RoundFit, refine_in_rounds
+from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
@@ -208,13 +208,7 @@ class GaussianReconstructor:
                 prior,
                 n_rounds,
                 prior_of=prior_of,
-                fit=RoundFit(
-                    settings=settings.pose_rounds,
-                    prior_stage=settings.prior_stage,
-                    slice_stage=settings.slice_stage,
-                    slice_model=settings.slice_model,
-                    distillation=settings.use_prior and settings.distillation,
-                ),
+                fit=settings.round_fit,
                 rng=stage_rng(settings.seed, Stage.POSE_ROUNDS),
                 progress=run.report(Stage.POSE_ROUNDS),
             )

@@ -8,7 +8,7 @@ from typing import Any
 
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutSettings
-from g3r.fitting.pose_rounds import PoseRoundSettings
+from g3r.fitting.pose_rounds import PoseRoundSettings, RoundFit
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
@@ -69,6 +69,17 @@ class ReconstructionSettings:
     def tiling(self) -> Tiling:
         """When and how the prior network works in tiles."""
         return Tiling(self.prior_whole_voxels, self.prior_tile_voxels, self.prior_halo_voxels)
+
+    @property
+    def round_fit(self) -> RoundFit:
+        """The fit in a round of poses and volume."""
+        return RoundFit(
+            settings=self.pose_rounds,
+            prior_stage=self.prior_stage,
+            slice_stage=self.slice_stage,
+            slice_model=self.slice_model,
+            distillation=self.use_prior and self.distillation,
+        )
 
 
 _BALANCED = ReconstructionSettings()
