@@ -217,9 +217,9 @@ class GaussianReconstructor:
         return (prior, poses, None) if found is None else (found.prior, found.registration, found.record)
 
     def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud | None:
-        """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None if stopped, or without a fit."""
+        """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None if stopped."""
         volumes, coarse_s = prior.volumes, run.clock.seconds[Stage.COARSE]
-        if run.stopped_at is not None or not plan.settings.fit:
+        if run.stopped_at is not None:
             return None
 
         def fit() -> PriorCloud:

@@ -39,7 +39,6 @@ class ReconstructionSettings:
         use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         common_bias_field: divide out the bias field that stacks share (N4).
-        fit: False shows V_prior in its own poses.
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         seed: of every random choice.
     """
@@ -61,7 +60,6 @@ class ReconstructionSettings:
     use_prior: bool = True
     distillation: bool = True
     common_bias_field: bool = True
-    fit: bool = True
     fill_unseen: bool = True
     seed: int = 0
 

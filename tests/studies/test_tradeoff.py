@@ -8,8 +8,9 @@ import pytest
 
 from g3r.bench.record import machine
 from g3r.planning.presets import PRESETS, changed
-from studies.tradeoff import convergence, memory, peer_phantom, slice_model, time_budgets
+from studies.tradeoff import convergence, memory, peer_phantom, presets, slice_model, time_budgets
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
+from studies.tradeoff.presets_figure import draw_presets
 
 
 def test_steps_are_interpolated_on_their_logarithm() -> None:
@@ -89,3 +90,45 @@ def test_the_small_phantom_has_the_size_of_the_other_methods(
     truth = peer_phantom.small_head(1)
     extent_mm = (np.ptp(np.argwhere(truth.mask), axis=0) + 1) * peer_phantom.VOXEL_MM
     assert extent_mm.max() == pytest.approx(peer_phantom.LENGTH_MM, abs=2)
+
+
+def preset_row(subject: str, n_stacks: int, preset: str, psnr_db: float) -> dict[str, Any]:
+    scores = {"volume": psnr_db, "V_prior": psnr_db - 1, "V_coarse": psnr_db - 2}
+    return {
+        "subject": subject,
+        "pixel_mm": 1.0,
+        "thickness_mm": 2.5,
+        "n_stacks": n_stacks,
+        "preset": preset,
+        "seconds": 10.0,
+        "tre_mm": 0.1,
+        "scores": {name: {"psnr_db": value, "ssim": 0.9} for name, value in scores.items()},
+        "pose_rounds": 1,
+    }
+
+
+def test_presets_are_compared_on_the_same_subjects_alone(tmp_path: Path) -> None:
+    first, second, third = (spec.name for spec in presets.SUBJECTS[:3])
+    given = [(first, "fast", 30.0), (second, "fast", 31.0), (third, "fast", 20.0)]
+    given += [(first, "balanced", 31.0), (second, "balanced", 30.5), (first, "accurate", 31.5)]
+    rows = {f"{name}, 3, {preset}": preset_row(name, 3, preset, db) for name, preset, db in given}
+    rows["two"] = preset_row(first, 2, "balanced", 28.0)
+    found = presets.tables({"weights": "w", "rows": rows})
+    assert (
+        "| mean gain over the quicker one |  |  |  | +0.25 (least -0.50) |  | +0.50 (least +0.50) |" in found["presets"]
+    )
+    assert f"| {first} | 2 | 28.00 | 27.00 | 26.00 | +1.00 | 0.10 | 1 |" in found["fewer-stacks"]
+    draw_presets(rows, presets.TRADE, tmp_path / "trade.png")
+    assert (tmp_path / "trade.png").stat().st_size > 10_000
+
+
+def test_subjects_of_the_presets_differ_in_size_and_are_not_those_that_were_trained_on() -> None:
+    assert len({spec.name for spec in presets.SUBJECTS}) == 8
+    assert len({(spec.pixel_mm, spec.thickness_mm) for spec in presets.SUBJECTS}) == 4
+    for volume in presets.HEADS:
+        assert {spec.motion for spec in presets.SUBJECTS if spec.volume == volume} == set(presets.MOTIONS)
+        assert len({spec.pixel_mm for spec in presets.SUBJECTS if spec.volume == volume}) == 2
+    first, *_ = presets.SUBJECTS
+    for stack in first.acquisition(3):
+        assert (stack.resolution_mm, stack.thickness_mm, stack.gap_mm) == (0.7, 3.0, 0.0)
+    assert len([task.key for task in presets.tasks(presets.STUDY.parser().parse_args([]))]) == 40
