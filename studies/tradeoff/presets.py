@@ -121,13 +121,13 @@ def trade_table(rows: Mapping[str, Row]) -> str:
         cells: dict[str, Any] = {"name": spec.name, "size": f"{spec.pixel_mm:g} x {spec.thickness_mm:g}"}
         for preset, of_preset in found.items():
             if row := of_preset.get(spec.name):
-                cells |= {preset: f"{psnr_db(row):.2f}", f"{preset} s": f"{row['seconds']:.0f}"}
+                cells |= {preset: f"{psnr_db(row):.2f}", f"{preset} s": f"{row['cpu_seconds']:.0f}"}
                 cells |= {f"{preset} poses": f"{row['tre_mm']:.2f}"}
         lines.append(cells)
     lines.append({"name": "mean gain over the quicker one"} | _gains(found))
     columns: dict[str, Cell] = {"subject": "{name}", "pixel x slice, mm": "{size}"}
     for preset in TRADE:
-        columns |= {f"`{preset}`, dB": f"{{{preset}}}", "s" + " " * TRADE.index(preset): f"{{{preset} s}}"}
+        columns |= {f"`{preset}`, dB": f"{{{preset}}}", "CPU s" + " " * TRADE.index(preset): f"{{{preset} s}}"}
     columns |= {f"poses, mm, `{preset}`": f"{{{preset} poses}}" for preset in TRADE}
     return table(lines, columns)
 
@@ -166,7 +166,7 @@ def fewer_table(rows: Mapping[str, Row]) -> str:
 
 def tables(record: Record) -> dict[str, str]:
     """Both tables, and what they were measured on."""
-    made = f"Weights {record['weights']}; seconds of the reconstruction without start and files."
+    made = f"Weights {record['weights']}; CPU seconds of the reconstruction without start and files."
     return {
         "presets": f"{made}\n\n{trade_table(record['rows'])}",
         "fewer-stacks": f"dB, preset `{FEWER_STACKS}`.\n\n{fewer_table(record['rows'])}",

@@ -1,4 +1,4 @@
-"""A figure of the trade: PSNR against seconds, a curve for every subject."""
+"""A figure of the trade: PSNR against CPU seconds, a curve for every subject."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ def draw_presets(rows: Mapping[str, Mapping[str, Any]], presets: Sequence[str], 
         own = sorted((row for row in three if row["subject"] == name), key=lambda row: presets.index(row["preset"]))
         label = f"{name.split('-', 2)[-1]}, {own[0]['pixel_mm']:g} x {own[0]['thickness_mm']:g} mm"
         db = [row["scores"]["volume"]["psnr_db"] for row in own]
-        axes.plot([row["seconds"] for row in own], db, marker="o", markersize=4, label=label)
+        axes.plot([row["cpu_seconds"] for row in own], db, marker="o", markersize=4, label=label)
     axes.set_xscale("log")
-    axes.set_xlabel("seconds of the reconstruction, two cores")
+    axes.set_xlabel("CPU seconds of the reconstruction")
     axes.set_ylabel("PSNR, dB")
-    axes.set_title(f"{len(dict.fromkeys(r['subject'] for r in three))} subjects: {', '.join(presets)}", fontsize=9)
+    shown = [name for name in presets if any(row["preset"] == name for row in three)]
+    axes.set_title(f"three stacks: {', '.join(shown)}", fontsize=9)
     axes.legend(fontsize=6, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes.grid(alpha=0.3)
     save_figure(figure, path)

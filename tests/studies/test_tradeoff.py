@@ -101,6 +101,7 @@ def preset_row(subject: str, n_stacks: int, preset: str, psnr_db: float) -> dict
         "n_stacks": n_stacks,
         "preset": preset,
         "seconds": 10.0,
+        "cpu_seconds": 10.0,
         "tre_mm": 0.1,
         "scores": {name: {"psnr_db": value, "ssim": 0.9} for name, value in scores.items()},
         "pose_rounds": 1,
