@@ -19,7 +19,7 @@ from g3r.run.allocator import release_memory
 NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
     None: "slices of the single stack stay where the atlas template or the header has them",
     True: "slices of the single stack were registered to the prior volume",
-    False: "slices of the single stack stay in line up to the fit: the prior gave no reason to move",
+    False: "slices of the single stack stay in line at first: the prior gave no reason to move",
 }
 
 
