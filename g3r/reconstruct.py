@@ -179,7 +179,9 @@ class GaussianReconstructor:
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         run.report(Stage.PRIOR)(0, 1)
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
-        views = 1 if plan.settings.pose_rounds.replace_prior(n_stacks) else plan.settings.prior_views
+        # V_prior of several stacks is made anew after each round, the last time with all views
+        is_replaced = n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) > 0
+        views = 1 if is_replaced else plan.settings.prior_views
         prior = run.stage(Stage.PRIOR, lambda: self.subject_prior.of(volumes, poses, views, tiling))
         run.report(Stage.PRIOR)(1, 1)
         if n_stacks > 1:
@@ -195,7 +197,7 @@ class GaussianReconstructor:
     ) -> tuple[PriorVolume, Registration, PoseRounds | None]:
         """Prior volume and poses after rounds of both; as they are where none is due, or where a stop was requested."""
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
-        n_rounds = settings.pose_rounds.n_rounds(prior)
+        n_rounds = settings.pose_rounds.n_rounds(prior.volumes.slices.n_stacks)
         if not n_rounds:
             return prior, poses, None
 

@@ -44,8 +44,7 @@ class PoseRoundSettings:
     """How often poses and volume are found in turn.
 
     Args:
-        single_stack: rounds with one stack whose slices were compared with the prior; no other stack checks them. Data
-            without motion drift by 0.1 mm and the volume gains all the same.
+        single_stack: rounds with one stack, which nothing but the prior holds in place.
         two_stacks: with two stacks.
         more_stacks: with three or more, whose poses are nearer to the truth from the start.
         prior_steps, slice_steps: of both stages of the fit in a round.
@@ -59,24 +58,14 @@ class PoseRoundSettings:
     slice_steps: int = 60
     newton_steps: int = 4
 
-    def n_rounds(self, prior: PriorVolume) -> int:
-        """Most rounds for a subject."""
-        n_stacks = prior.volumes.slices.n_stacks
-        if n_stacks == 1:
-            return 0 if prior.accepted is None else self.single_stack
-        return self._of_several(n_stacks)
-
-    def replace_prior(self, n_stacks: int) -> bool:
-        """Whether the first V_prior of several stacks will be replaced in any case."""
-        return n_stacks > 1 and self._of_several(n_stacks) > 0
+    def n_rounds(self, n_stacks: int) -> int:
+        """Most rounds with a number of stacks."""
+        return (self.single_stack, self.two_stacks, self.more_stacks)[min(n_stacks, 3) - 1]
 
     def at_most(self, n_rounds: int) -> PoseRoundSettings:
         """The same with no more rounds than given."""
         counts = {name: min(getattr(self, name), n_rounds) for name in ("single_stack", "two_stacks", "more_stacks")}
         return replace(self, **counts)
-
-    def _of_several(self, n_stacks: int) -> int:
-        return self.two_stacks if n_stacks == 2 else self.more_stacks
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -108,7 +108,7 @@ def estimate_memory(
     }
     if settings.held_out is not None:
         stages[Stage.HELD_OUT] = stages[Stage.FIT_TO_SLICES]
-    if settings.pose_rounds.at_most(1).two_stacks:
+    if settings.pose_rounds.n_rounds(slices.n_stacks):
         # the volumes before a round are kept until those after it are made
         inner = max(stages[Stage.COARSE], stages[Stage.FIT_TO_SLICES], stages.get(Stage.PRIOR, 0))
         stages[Stage.POSE_ROUNDS] = inner + VOLUMES_PER_VOXEL * voxels

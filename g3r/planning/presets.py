@@ -144,7 +144,11 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
     if n_stacks == 1:
         # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
         held = settings.use_prior and settings.distillation and settings.registration.segments
-        return replace(settings, slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held))
+        return replace(
+            settings,
+            pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
+            slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
+        )
     # several stacks check each other: the schedule alone decides how hard the prior pulls
     return replace(settings, slice_stage=replace(stage, prior_error=0.0))
 

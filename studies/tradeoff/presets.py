@@ -121,6 +121,7 @@ def trade_table(rows: Mapping[str, Row]) -> str:
         cells: dict[str, Any] = {"name": spec.name, "size": f"{spec.pixel_mm:g} x {spec.thickness_mm:g}"}
         for preset, of_preset in found.items():
             if row := of_preset.get(spec.name):
+                cells["prior"] = f"{psnr_db(row, 'V_prior'):.2f}"  # of the most careful one
                 cells |= {preset: f"{psnr_db(row):.2f}", f"{preset} s": f"{row['cpu_seconds']:.0f}"}
                 cells |= {f"{preset} poses": f"{row['tre_mm']:.2f}"}
         lines.append(cells)
@@ -128,6 +129,7 @@ def trade_table(rows: Mapping[str, Row]) -> str:
     columns: dict[str, Cell] = {"subject": "{name}", "pixel x slice, mm": "{size}"}
     for preset in TRADE:
         columns |= {f"`{preset}`, dB": f"{{{preset}}}", "CPU s" + " " * TRADE.index(preset): f"{{{preset} s}}"}
+    columns["V_prior of the last"] = "{prior}"
     columns |= {f"poses, mm, `{preset}`": f"{{{preset} poses}}" for preset in TRADE}
     return table(lines, columns)
 

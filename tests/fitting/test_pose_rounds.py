@@ -16,6 +16,7 @@ from g3r.fitting.prior_volume import prior_volume
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
 from g3r.geometry import RigidPose
+from g3r.planning.presets import PRESETS, adapted
 from g3r.prior.inference import DEFAULT_TILING
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
@@ -107,15 +108,15 @@ def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: p
     assert maker.last == [True]  # the first V_prior was a quick one
 
 
-def test_a_single_stack_has_rounds_only_where_a_prior_holds_it() -> None:
-    settings = PoseRoundSettings(single_stack=1, two_stacks=2, more_stacks=3)
-    slices = make_slices()
-    for n_stacks, accepted, expected in ((1, True, 1), (1, False, 1), (1, None, 0), (2, None, 2), (3, None, 3)):
-        some = registration_of(slices.take(slices.stack_id < n_stacks))
-        assert settings.n_rounds(replace(PriorMaker()(some, False), accepted=accepted)) == expected
-    assert settings.at_most(1) == PoseRoundSettings(single_stack=1, two_stacks=1, more_stacks=1)
-    assert [settings.replace_prior(n) for n in (1, 2, 3)] == [False, True, True]
-    assert not settings.at_most(0).replace_prior(2)
+def test_rounds_follow_the_number_of_stacks_and_a_single_one_has_them_only_where_the_prior_holds_it() -> None:
+    rounds = PoseRoundSettings(single_stack=1, two_stacks=2, more_stacks=3)
+    assert [rounds.n_rounds(n) for n in (1, 2, 3, 12)] == [1, 2, 3, 3]
+    assert rounds.at_most(1) == PoseRoundSettings(single_stack=1, two_stacks=1, more_stacks=1)
+    settings = replace(PRESETS["balanced"], pose_rounds=rounds)
+    for free in (replace(settings, use_prior=False), replace(settings, distillation=False)):
+        assert adapted(free, 1).pose_rounds.n_rounds(1) == 0
+        assert adapted(free, 2).pose_rounds.n_rounds(2) == 2
+    assert adapted(settings, 1).pose_rounds.n_rounds(1) == 1
 
 
 def test_held_out_correlation_tells_poses_half_a_millimetre_apart() -> None:
