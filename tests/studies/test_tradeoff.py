@@ -8,7 +8,7 @@ import pytest
 
 from g3r.bench.record import machine
 from g3r.planning.presets import PRESETS, changed
-from studies.tradeoff import convergence, memory, peer_phantom, presets, slice_model, time_budgets
+from studies.tradeoff import convergence, memory, peer_phantom, pose_rounds, presets, slice_model, time_budgets
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
 from studies.tradeoff.presets_figure import draw_presets
 
@@ -133,3 +133,12 @@ def test_subjects_of_the_presets_differ_in_size_and_are_not_those_that_were_trai
     for stack in first.acquisition(3):
         assert (stack.resolution_mm, stack.thickness_mm, stack.gap_mm) == (0.7, 3.0, 0.0)
     assert len([task.key for task in presets.tasks(presets.STUDY.parser().parse_args([]))]) == 40
+
+
+def test_rounds_are_shown_side_by_side() -> None:
+    by_round = {str(n): {"psnr_db": 30.0 + n, "ssim": 0.9} for n in pose_rounds.ROUNDS}
+    row = {"case": "one", "n_stacks": 2, "volume": by_round, "prior": by_round, "kept": {"0": 0, "1": 1, "2": 1}}
+    row["poses_mm"] = {"0": 0.3, "1": 0.2, "2": 0.1}
+    text = pose_rounds.tables({"preset": "balanced", "weights": "w", "rows": {"one, 2": row}})["pose-rounds"]
+    assert "| one | 2 | 30.00 | 31.00 | 32.00 | 30.00 | 31.00 | 32.00 | 0.30 | 0.20 | 0.10 | 1 |" in text
+    assert pose_rounds.line("one, 2", row) == "one, 2: 0 rounds 30.00, 1 rounds 31.00, 2 rounds 32.00"
