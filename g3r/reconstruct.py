@@ -15,7 +15,7 @@ from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
-from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, gaussian_spacing_mm, with_pixels_of
+from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
@@ -229,7 +229,7 @@ class GaussianReconstructor:
             deadline, settings = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels), plan.settings
             return fit_to_prior(
                 prior,
-                spacing_mm=gaussian_spacing_mm(volumes.slices, settings.gaussian_spacing_pixels),
+                spacing_mm=settings.lattice.mm(volumes.slices),
                 stage=settings.prior_stage,
                 rng=stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
                 progress=run.report(Stage.FIT_TO_PRIOR),

@@ -28,7 +28,10 @@ def sweeps(base: ReconstructionSettings) -> dict[str, dict[str, Mapping[str, Any
     prior_steps, slice_steps = base.prior_stage.n_steps, base.slice_stage.n_steps
     return {
         "Gaussians": {
-            f"spacing x {factor:g}": {"gaussian_spacing_pixels": factor * base.gaussian_spacing_pixels}
+            f"spacing x {factor:g}": {
+                "gaussian_spacing_pixels": factor * base.gaussian_spacing_pixels,
+                "max_gaussian_spacing_mm": factor * base.max_gaussian_spacing_mm,
+            }
             for factor in SPACING_FACTORS
         },
         "iterations": {

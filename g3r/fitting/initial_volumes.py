@@ -161,7 +161,19 @@ def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
     return replace(registration, slices=slices.with_pose(found.planes.pose))
 
 
-def gaussian_spacing_mm(slices: Slices, spacing_pixels: float) -> float:
-    """Cell edge per Gaussian: a number of (typical) pixels, as cubes of equal volume."""
-    covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
-    return spacing_pixels * float(np.median(covered_mm3)) ** (1 / 3)
+@dataclass(frozen=True, kw_only=True)
+class LatticeSpacing:
+    """How far the Gaussians of the lattice are apart.
+
+    Args:
+        pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers.
+        at_most_mm: the same in mm, whatever the pixels: the cortex is as thick in thick slices.
+    """
+
+    pixels: float
+    at_most_mm: float
+
+    def mm(self, slices: Slices) -> float:
+        """Cell edge per Gaussian for slices of a (typical) size of pixel."""
+        covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
+        return min(self.pixels * float(np.median(covered_mm3)) ** (1 / 3), self.at_most_mm)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices, volume_from_pixels, volume_planes
 from g3r.acquisition.robust import robust_width, slice_weights
-from g3r.fitting.initial_volumes import PriorVolume, gaussian_spacing_mm
+from g3r.fitting.initial_volumes import LatticeSpacing, PriorVolume
 from g3r.fitting.prior_stage import NO_PROGRESS, PriorStageSettings
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
 from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
@@ -28,9 +28,6 @@ from g3r.registration.normal_equations import SliceModel as SamplingModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
 
 logger = logging.getLogger(__name__)
-
-SPACING_PIXELS = 2.2
-"""Of the Gaussians of a round."""
 
 MAX_PIXELS = 200_000
 """At most about so many pixels in a Gauss-Newton step."""
@@ -99,12 +96,14 @@ class RoundFit:
 
     Args:
         settings: its number of steps.
+        lattice: how far its Gaussians are apart.
         prior_stage, slice_stage: the whole fit, of which it is a short one.
         slice_model: of the slices.
         distillation: whether it is held to V_prior.
     """
 
     settings: PoseRoundSettings
+    lattice: LatticeSpacing
     prior_stage: PriorStageSettings
     slice_stage: SliceStageSettings
     slice_model: SliceModel
@@ -118,7 +117,7 @@ class RoundFit:
             weight: [K] slice weights.
             rng: draws what the fits draw.
         """
-        spacing_mm = gaussian_spacing_mm(prior.volumes.slices, SPACING_PIXELS)
+        spacing_mm = self.lattice.mm(prior.volumes.slices)
         stage = replace(self.prior_stage, n_steps=self.settings.prior_steps)
         cloud = fit_to_prior(prior, spacing_mm=spacing_mm, stage=stage, rng=rng, progress=NO_PROGRESS, deadline=None)
         target = slice_target(prior, weight, self.slice_model)

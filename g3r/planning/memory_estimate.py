@@ -14,7 +14,7 @@ from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
-from g3r.fitting.initial_volumes import MARGIN_MM, gaussian_spacing_mm
+from g3r.fitting.initial_volumes import MARGIN_MM
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage
@@ -147,7 +147,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
     voxel_mm = prior_voxel_mm if settings.use_prior and prior_voxel_mm else settings.resolution_mm
     grid = grid_around(slices, voxel_mm, MARGIN_MM)
     n_voxels = GRID_SLACK * math.prod(grid.shape)
-    spacing_mm = gaussian_spacing_mm(slices, settings.gaussian_spacing_pixels)
+    spacing_mm = settings.lattice.mm(slices)
     n_gaussians = head_volume_mm3(slices) / spacing_mm**3
     n_stacks = slices.n_stacks
     # how far a Gaussian reaches along a plane's normal, and how many planes of a stack that covers

@@ -8,6 +8,7 @@ from typing import Any
 
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutSettings
+from g3r.fitting.initial_volumes import LatticeSpacing
 from g3r.fitting.pose_rounds import PoseRoundSettings, RoundFit
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
@@ -24,6 +25,7 @@ class ReconstructionSettings:
         resolution_mm: voxel size of the volume.
         gaussian_spacing_pixels: cell edge per Gaussian of the lattice, in units of the cube root of what one pixel
             covers (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
+        max_gaussian_spacing_mm: the same at most, in mm.
         registration: poses from the slices.
         pose_rounds: poses from the slices and V_prior, in turn with the volume.
         prior_stage: stage 1.
@@ -45,6 +47,7 @@ class ReconstructionSettings:
 
     resolution_mm: float = 0.8
     gaussian_spacing_pixels: float = 2.14
+    max_gaussian_spacing_mm: float = 3.0
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     pose_rounds: PoseRoundSettings = field(default_factory=PoseRoundSettings)
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
@@ -64,6 +67,11 @@ class ReconstructionSettings:
     seed: int = 0
 
     @property
+    def lattice(self) -> LatticeSpacing:
+        """How far the Gaussians are apart."""
+        return LatticeSpacing(pixels=self.gaussian_spacing_pixels, at_most_mm=self.max_gaussian_spacing_mm)
+
+    @property
     def tiling(self) -> Tiling:
         """When and how the prior network works in tiles."""
         return Tiling(self.prior_whole_voxels, self.prior_tile_voxels, self.prior_halo_voxels)
@@ -73,6 +81,7 @@ class ReconstructionSettings:
         """The fit in a round of poses and volume."""
         return RoundFit(
             settings=self.pose_rounds,
+            lattice=self.lattice,
             prior_stage=self.prior_stage,
             slice_stage=self.slice_stage,
             slice_model=self.slice_model,
@@ -86,6 +95,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "draft": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
+        max_gaussian_spacing_mm=4.0,
         pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
         prior_views=1,
         share_probes=1,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.initial_volumes import PriorVolume, gaussian_spacing_mm
+from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.seeding import seed_cloud
@@ -152,14 +152,15 @@ class TimeBudget:
             self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
             return self._take("draft", PRESETS["draft"].share_probes, reserve_s)
-        probed = PRESETS["fast"].gaussian_spacing_pixels
-        cloud = seed_cloud(prior.values, prior.support, volumes.grid, gaussian_spacing_mm(volumes.slices, probed))
+        spacing_mm = {name: preset.lattice.mm(volumes.slices) for name, preset in PRESETS.items()}
+        cloud = seed_cloud(prior.values, prior.support, volumes.grid, spacing_mm["fast"])
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
         careful_first = [name for name in reversed(PRESETS) if name != "draft"]
         for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
             left = max(0.0, self.deadline.remaining_s - reserve_s)
-            fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, probed) <= left)
+            number = {name: (spacing_mm["fast"] / mm) ** 3 for name, mm in spacing_mm.items()}
+            fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, number[n]) <= left)
             chosen = next(fitting, "draft")
             if chosen != "draft":
                 break
@@ -184,6 +185,7 @@ class TimeBudget:
         self.settings = replace(
             settings,
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
+            max_gaussian_spacing_mm=preset.max_gaussian_spacing_mm,
             held_out=None,  # three fits whose seconds nobody has timed
             share_probes=probes,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
@@ -198,15 +200,14 @@ class TimeBudget:
         return BudgetRecord(seconds=self.given_s, loops=loops, **self.choices)
 
 
-def fit_seconds(preset: ReconstructionSettings, step_s: float, spacing_probed: float) -> float:
+def fit_seconds(preset: ReconstructionSettings, step_s: float, number: float) -> float:
     """Seconds of both stages with the settings of a preset.
 
     Args:
-        preset: whose spacing and steps.
+        preset: whose steps.
         step_s: seconds of a step of the slice stage.
-        spacing_probed: of the lattice that was timed.
+        number: its Gaussians over those that were timed.
     """
-    number = (spacing_probed / preset.gaussian_spacing_pixels) ** 3
     step = step_s * number**COST_EXPONENT
     first, second = preset.prior_stage, preset.slice_stage
     in_first = PRIOR_STEP * (first.n_steps + first.amplitude_iterations)

@@ -113,9 +113,11 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path) ->
     for path in (subject, reconstructed, Path.home(), Path(sys.prefix)):
         assert str(path) not in text
     assert record["n_gaussians"] == len(GaussianCloud.load(reconstructed / "gaussians.npz"))
-    in_pixels = record["settings"]["gaussian_spacing_pixels"]
+    settings = record["settings"]
     volume_mm3 = np.prod(record["stacks"][0]["spacing_mm"][:2]) * record["stacks"][0]["thickness_mm"]
-    assert record["gaussian_spacing_mm"] == pytest.approx(in_pixels * volume_mm3 ** (1 / 3), rel=1e-5)
+    in_pixels_mm = settings["gaussian_spacing_pixels"] * volume_mm3 ** (1 / 3)
+    spacing_mm = min(in_pixels_mm, settings["max_gaussian_spacing_mm"])
+    assert record["gaussian_spacing_mm"] == pytest.approx(spacing_mm, rel=1e-5)
     assert record["settings"]["resolution_mm"] == 1.5
     assert [stack["name"] for stack in record["stacks"]] == [path.name for path in files(subject, "stack")]
     assert all(seconds >= 0 for seconds in record["seconds"].values())

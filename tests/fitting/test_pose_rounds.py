@@ -9,7 +9,7 @@ import pytest
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting import pose_rounds
-from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.fitting.initial_volumes import InitialVolumes, LatticeSpacing, PriorVolume
 from g3r.fitting.pose_rounds import PoseRoundSettings, RefinedPoses, RoundFit, refine_in_rounds
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.prior_volume import prior_volume
@@ -69,6 +69,7 @@ def run(start: Registration, n_rounds: int) -> tuple[RefinedPoses, PriorMaker]:
         prior_of=maker,
         fit=RoundFit(
             settings=PoseRoundSettings(prior_steps=8, slice_steps=30),
+            lattice=LatticeSpacing(pixels=2.2, at_most_mm=10.0),
             prior_stage=PriorStageSettings(),
             slice_stage=SliceStageSettings(prior_error=0.0),
             slice_model=SliceModel(surroundings=False),

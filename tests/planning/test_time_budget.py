@@ -85,7 +85,9 @@ def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is() -> N
 
 
 def test_presets_cost_more_one_after_the_other() -> None:
-    seconds = [fit_seconds(preset, 0.05, 2.5) for preset in PRESETS.values()]
+    pixels = [preset.gaussian_spacing_pixels for preset in PRESETS.values()]
+    numbers = [(2.5 / spacing) ** 3 for spacing in pixels]
+    seconds = [fit_seconds(preset, 0.05, n) for preset, n in zip(PRESETS.values(), numbers, strict=True)]
     assert seconds == sorted(seconds)
 
 
