@@ -149,8 +149,8 @@ class GaussianReconstructor:
         template = self.pose_model.template if self.pose_model else None
         proposals = {}
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
-        if self.pose_model is not None and settings.network and not spare:
-            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
+        if (model := self.pose_model) is not None and settings.network and not spare:
+            proposals["network"] = lambda: model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
     def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,14 +90,10 @@ class Planes:
         return position
 
     def _plane_and_uv(self, pixel: NDArray[np.integer] | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        if pixel is None:
-            pixel, plane = np.arange(self.n_pixels), self.plane_id()
-        else:
-            plane = np.searchsorted(self.offset, pixel, side="right") - 1
-        row_length = self.shape[plane, 1]
-        row, column = np.divmod(pixel - self.offset[plane], row_length)
-        uv = np.stack([row - (self.shape[plane, 0] - 1) / 2, column - (row_length - 1) / 2], axis=1)
-        return plane, uv * self.spacing_mm[plane]
+        number = np.arange(self.n_pixels) if pixel is None else np.asarray(pixel, np.int64)
+        plane, uv = np.empty(len(number), np.int64), np.empty((len(number), 2))
+        _fill_plane_and_uv(number, self.offset, self.shape, self.spacing_mm, plane, uv)
+        return plane, uv
 
     def take(self, index: Selection) -> Planes:
         """The planes at an index array, a mask or a slice."""
@@ -265,3 +262,18 @@ def volume_from_pixels(pixels: NDArray[np.float32], grid: VolumeGrid) -> NDArray
     """Pixels of `volume_planes(grid)` [P] as a volume [I, J, K]."""
     n_i, n_j, n_k = grid.shape
     return np.ascontiguousarray(pixels.reshape(n_k, n_i, n_j).transpose(1, 2, 0))
+
+
+@numba.njit(cache=True)
+def _fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
+    """Plane and in-plane position of pixels; they mostly come in order, so that the last plane is tried first."""
+    k = 0
+    for p in range(len(number)):
+        pixel = number[p]
+        if not offset[k] <= pixel < offset[k + 1]:
+            k = np.searchsorted(offset, pixel, side="right") - 1
+        row = (pixel - offset[k]) // shape[k, 1]
+        column = pixel - offset[k] - row * shape[k, 1]
+        plane[p] = k
+        uv[p, 0] = (row - (shape[k, 0] - 1) / 2) * spacing[k, 0]
+        uv[p, 1] = (column - (shape[k, 1] - 1) / 2) * spacing[k, 1]

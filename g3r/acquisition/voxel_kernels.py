@@ -22,7 +22,8 @@ def locate(u, v, matrix, origin, shape, outside, cell, fraction):
     """Find the cell of each pixel and where in it the pixel lies.
 
     Args:
-        u, v: [P] in-plane positions (mm).
+        u: [P] in-plane positions along x (mm).
+        v: [P] along y.
         matrix: [3, 3] index from plane.
         origin: [3] index of the plane's centre.
         shape: [3] of the volume, as reals.
@@ -107,7 +108,11 @@ def scatter(pixels, shape, plane, uv, matrix, origin, node_weight, buffers):
     Args:
         pixels: [P].
         shape: [3] of the volume with its margin, as reals.
-        plane, uv, matrix, origin, node_weight: see `gather`.
+        plane: [P] of each pixel.
+        uv: [2, P] in-plane positions (mm).
+        matrix: [K, 3, 3] index from plane.
+        origin: [K, Q, 3] index of each node of the pixel in the middle of the plane.
+        node_weight: [Q].
         buffers: [B, voxels] one flat volume for each thread, changed; what lies outside goes to its first voxel.
     """
     to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)

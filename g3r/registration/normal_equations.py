@@ -101,6 +101,19 @@ class SliceModel:
         )
         return NormalEquations(hessian, gradient, loss, moments)
 
+    def losses(self, planes: Planes, gain: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+        """Mean Cauchy loss [K] of each slice, as `evaluate` has it, without derivatives; 0 for one without pixels.
+
+        Args:
+            planes: the slices' pixel grids in their present poses.
+            gain: [K] intensity factors.
+            width: residual at which the Cauchy loss bends.
+        """
+        loss = np.log1p((self.residuals(planes, gain) / np.float32(width)) ** 2)
+        n_used = np.diff(self.start)
+        total = np.bincount(self.operator.plane, loss, len(n_used))
+        return np.asarray(total / np.maximum(n_used, 1), np.float64)
+
     def residuals(self, planes: Planes, gain: NDArray[np.float64]) -> NDArray[np.float32]:
         """Slice minus model for every used pixel."""
         self.operator.move(planes)
@@ -112,7 +125,7 @@ class SliceModel:
 def _accumulate(
     flat, shape, start, uv, value, matrix, origin, node_mm, node_weight, gain, width, hessian, gradient, loss, moments
 ):
-    """The sums of `NormalEquations`, slice by slice; see `voxel_kernels` for why these are loops over runs of pixels."""
+    """The sums of `NormalEquations`, slice by slice; `voxel_kernels` says why over runs of pixels."""
     to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
     outside = int(shape[0] * shape[1] * shape[2])
     for k in numba.prange(len(start) - 1):

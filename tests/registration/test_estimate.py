@@ -86,7 +86,7 @@ def test_stacks_of_one_or_two_slices(
 
 def test_proposals_are_initialisations_like_the_others(moving: Moving) -> None:
     """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
-    proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
+    proposals = {"oracle": lambda: moving.truth, "astray": lambda: RigidPose.identity(len(moving.slices))}
     settings = replace(OFF, network=True)
     estimate = register(moving.slices, settings, proposals=proposals)
     assert estimate.initialisation == "oracle"
