@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import fill_plane_and_uv
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
@@ -92,7 +92,7 @@ class Planes:
     def _plane_and_uv(self, pixel: NDArray[np.integer] | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         number = np.arange(self.n_pixels) if pixel is None else np.asarray(pixel, np.int64)
         plane, uv = np.empty(len(number), np.int64), np.empty((len(number), 2))
-        _fill_plane_and_uv(number, self.offset, self.shape, self.spacing_mm, plane, uv)
+        fill_plane_and_uv(number, self.offset, self.shape, self.spacing_mm, plane, uv)
         return plane, uv
 
     def take(self, index: Selection) -> Planes:
@@ -262,18 +262,3 @@ def volume_from_pixels(pixels: NDArray[np.float32], grid: VolumeGrid) -> NDArray
     """Pixels of `volume_planes(grid)` [P] as a volume [I, J, K]."""
     n_i, n_j, n_k = grid.shape
     return np.ascontiguousarray(pixels.reshape(n_k, n_i, n_j).transpose(1, 2, 0))
-
-
-@numba.njit(cache=True)
-def _fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
-    """Plane and in-plane position of pixels; they mostly come in order, so that the last plane is tried first."""
-    k = 0
-    for p in range(len(number)):
-        pixel = number[p]
-        if not offset[k] <= pixel < offset[k + 1]:
-            k = np.searchsorted(offset, pixel, side="right") - 1
-        row = (pixel - offset[k]) // shape[k, 1]
-        column = pixel - offset[k] - row * shape[k, 1]
-        plane[p] = k
-        uv[p, 0] = (row - (shape[k, 0] - 1) / 2) * spacing[k, 0]
-        uv[p, 1] = (column - (shape[k, 1] - 1) / 2) * spacing[k, 1]

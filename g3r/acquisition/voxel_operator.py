@@ -1,6 +1,6 @@
 """The voxel forward operator, a slice pixel as a PSF-weighted mean of a volume (G3R Eq. 2), and its exact adjoint.
 
-Both directions take the same trilinear weights (`voxel_kernels`), one gathers and one scatters, so that
+Both directions take the same trilinear weights (`acquisition.kernels`), one gathers and one scatters, so that
 <A x, y> = <x, A^T y> holds to rounding.
 """
 
@@ -13,8 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import gather, scatter
 from g3r.acquisition.planes import Planes
-from g3r.acquisition.voxel_kernels import gather, scatter
 from g3r.geometry import VolumeGrid
 
 MAX_SCATTER_BUFFERS = 4
@@ -85,7 +85,7 @@ class VoxelOperator:
         padded = np.zeros([n + 2 for n in volume.shape], volume.dtype)
         padded[1:-1, 1:-1, 1:-1] = volume
         pixels = np.zeros(self.n_pixels, volume.dtype)
-        gather(padded.ravel(), *self._geometry(volume.dtype), pixels)
+        gather(padded.ravel(), *self._geometry(volume.dtype), pixels)  # type: ignore[call-arg]
         return pixels
 
     def adjoint(self, pixels: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -99,7 +99,7 @@ class VoxelOperator:
         n_buffers = min(numba.get_num_threads(), MAX_SCATTER_BUFFERS)
         padded = [n + 2 for n in self.grid.shape]
         buffers = np.zeros((n_buffers, math.prod(padded)), pixels.dtype)
-        scatter(pixels, *self._geometry(pixels.dtype), buffers)
+        scatter(pixels, *self._geometry(pixels.dtype), buffers)  # type: ignore[call-arg]
         volume = (buffers[0] if n_buffers == 1 else buffers.sum(0)).reshape(padded)
         return np.ascontiguousarray(volume[1:-1, 1:-1, 1:-1])
 

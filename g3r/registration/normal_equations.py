@@ -15,8 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import REORDERED, RUN, locate
 from g3r.acquisition.planes import Planes, Slices
-from g3r.acquisition.voxel_kernels import REORDERED, RUN, locate
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.similarity import correlation
@@ -125,7 +125,7 @@ class SliceModel:
 def _accumulate(
     flat, shape, start, uv, value, matrix, origin, node_mm, node_weight, gain, width, hessian, gradient, loss, moments
 ):
-    """The sums of `NormalEquations`, slice by slice; `voxel_kernels` says why over runs of pixels."""
+    """The sums of `NormalEquations`, slice by slice; `acquisition.kernels` says why over runs of pixels."""
     to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
     outside = int(shape[0] * shape[1] * shape[2])
     for k in numba.prange(len(start) - 1):

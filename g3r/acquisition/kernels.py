@@ -1,4 +1,4 @@
-"""The loops over pixels that read a volume or add to it, written so that they become vector instructions.
+"""The loops over pixels: where they are, and what they read from a volume or add to it, as vector instructions.
 
 Numba looks at every index for whether it is negative, and no loop with such a look or with a branch becomes vector
 code. So a first loop finds the cells and fractions of a run of pixels of one plane, without a branch, and a second one
@@ -15,6 +15,30 @@ RUN = 512
 
 REORDERED = {"reassoc", "contract", "nsz"}
 """Sums in any order and fused multiply-adds; not-a-number stays what it is."""
+
+
+@numba.njit(cache=True)
+def fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
+    """Write plane and in-plane position of pixels; they mostly come in order: the last plane is tried first.
+
+    Args:
+        number: [P] of the pixels among those of all planes.
+        offset: [K + 1] first pixel of each plane, and the total.
+        shape: [K, 2] pixels along x and y.
+        spacing: [K, 2] (mm).
+        plane: [P], written.
+        uv: [P, 2] (mm from the plane's centre), written.
+    """
+    k = 0
+    for p in range(len(number)):
+        pixel = number[p]
+        if not offset[k] <= pixel < offset[k + 1]:
+            k = np.searchsorted(offset, pixel, side="right") - 1
+        row = (pixel - offset[k]) // shape[k, 1]
+        column = pixel - offset[k] - row * shape[k, 1]
+        plane[p] = k
+        uv[p, 0] = (row - (shape[k, 0] - 1) / 2) * spacing[k, 0]
+        uv[p, 1] = (column - (shape[k, 1] - 1) / 2) * spacing[k, 1]
 
 
 @numba.njit(cache=True, fastmath=REORDERED)
