@@ -100,7 +100,7 @@ def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: P
         ["--stacks", "a.nii.gz", "--output", "o", "--threads", "0"],
         ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "0"],
         ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "nan"],
-        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "20", "--preset", "draft"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "20", "--preset", "preview"],
         ["--stacks", "a.nii.gz", "--output", "o", "--ckpt", "p.pt", "--no-prior"],
         ["--stacks", "a.nii.gz", "--output", "o", "--resolution", "fine"],
     ],
@@ -119,7 +119,7 @@ def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
         GaussianReconstructor(tmp_path / "absent.pt")
 
 
-@pytest.mark.parametrize("settings", ["best", replace(PRESETS["draft"], resolution_mm=5.0, use_prior=False)])
+@pytest.mark.parametrize("settings", ["best", replace(PRESETS["preview"], resolution_mm=5.0, use_prior=False)])
 def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str) -> None:
     with pytest.raises(InputError, match="expected"):
         GaussianReconstructor(settings=settings)
