@@ -30,6 +30,7 @@ from g3r.planning.stages import Stage, stage_rng
 from g3r.pose_network.model import PoseModel
 from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
+from g3r.registration.atlas_search import template_fits
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
 
@@ -147,8 +148,9 @@ class GaussianReconstructor:
         settings = settings or self.settings.registration
         template = self.pose_model.template if self.pose_model else None
         proposals = {}
-        if (model := self.pose_model) is not None and settings.network:
-            proposals["network"] = lambda: model.predict(slices) @ slices.header_pose.inverse()
+        spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
+        if self.pose_model is not None and settings.network and not spare:
+            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
     def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:

@@ -92,6 +92,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         registration=replace(
             _BALANCED.registration,
             n_candidates=800,
+            network_as_reserve=True,
             stacks=False,
             attempts=1,
             n_rounds=3,

@@ -26,9 +26,6 @@ ROUNDS = ((10.0, 4.0), (5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 """Random rotations (degrees) and translations (mm) of the whole head, round by round."""
 N_CANDIDATES = 1000
 
-N_ROUNDS_OF_ALL = 2
-"""After so many rounds, only the template that fits best goes on."""
-
 
 @dataclass(frozen=True)
 class Orientation:
@@ -62,11 +59,10 @@ def standard_orientation(
         None where no orientation fits well enough to be called standard.
     """
     present = slices.world_from_header()
-    common = (aligned_to(slices, start, present) @ present.inverse()).take([0])
+    common = aligned_to(slices, start, present) @ present.inverse()
     pixels = SearchPixels.of(slices)
-    near = [(*_moved_to(template, pixels, common, ROUNDS[:N_ROUNDS_OF_ALL], rng), template) for template in templates]
-    _, motion, template = max(near, key=lambda one: one[0])
-    best, motion = _moved_to(template, pixels, motion, ROUNDS[N_ROUNDS_OF_ALL:], rng)
+    found = [(*_moved_to(template, pixels, common.take([0]), rng), template) for template in templates]
+    best, motion, template = max(found, key=lambda one: one[0])
     logger.info("standard orientation: correlation %.2f with the atlas template of %.0f weeks", best, template.weeks)
     if best < MIN_ATLAS_CORRELATION:
         return None
@@ -74,15 +70,11 @@ def standard_orientation(
 
 
 def _moved_to(
-    template: FittedTemplate,
-    pixels: SearchPixels,
-    motion: RigidPose,
-    rounds: Sequence[tuple[float, float]],
-    rng: np.random.Generator,
+    template: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
 ) -> tuple[float, RigidPose]:
-    """Best correlation of all slices with a template after some rounds, and the motion that gives it."""
+    """Best correlation of all slices with a template, and the motion that gives it."""
     agreement = np.zeros(1)
-    for rotation_deg, translation_mm in rounds:
+    for rotation_deg, translation_mm in ROUNDS:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
         agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
         motion = candidate.take([int(agreement.argmax())])

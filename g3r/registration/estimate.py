@@ -16,7 +16,7 @@ from g3r.geometry import RigidPose
 from g3r.registration.atlas_frame import Orientation, centred_on_headers, standard_orientation
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
-from g3r.registration.global_search import GlobalSearch, Proposal, SearchResult, search_single
+from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
 from g3r.registration.overlap import Overlap, overlap_of
@@ -81,7 +81,7 @@ def register(
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     template: AtlasTemplate | None = None,
-    proposals: Mapping[str, Proposal] | None = None,
+    proposals: Mapping[str, RigidPose] | None = None,
     deadline: Deadline | None = None,
 ) -> Registration:
     """Poses of all slices, from their header poses.
@@ -91,8 +91,7 @@ def register(
         settings: which layers run, and how long.
         progress: called with the rounds done and their total.
         template: atlas template; None skips that initialisation.
-        proposals: make motions [K] (world from header) by other means, such as the pose network, by name; called where
-            headers and template do not suffice.
+        proposals: motions [K] (world from header) by other means, such as the pose network, by name.
         deadline: search and rounds are shortened to end by then, if they can.
     """
     given, slices = slices, bias_corrected(slices)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -18,19 +17,11 @@ from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refin
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
-from g3r.registration.thresholds import (
-    IN_PLACE_CORRELATION,
-    MIN_COST_GAIN,
-    MIN_COST_GAIN_SINGLE,
-    RETRY_BELOW_CORRELATION,
-)
+from g3r.registration.thresholds import MIN_COST_GAIN, MIN_COST_GAIN_SINGLE, RETRY_BELOW_CORRELATION
 from g3r.registration.unseen import TemplateFill, with_header_spans
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
-
-Proposal = Callable[[], RigidPose]
-"""Makes motions [K] (world from header) of all slices."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +61,22 @@ class GlobalSearch:
     settings: RegistrationSettings
     template: AtlasTemplate | None
 
-    def run(self, proposals: Mapping[str, Proposal], deadline: Deadline | None = None) -> SearchResult:
+    def run(self, proposals: Mapping[str, RigidPose], deadline: Deadline | None = None) -> SearchResult:
         """Search until every stack is well predicted by the others, or the attempts are used up.
 
         Args:
-            proposals: motions [K] (world from header) by other means, by name; made only where they are needed.
+            proposals: motions [K] (world from header) by other means, by name.
             deadline: no attempt begins after it, and the first one ends by it if it can.
         """
-        sources = dict(proposals) if self.settings.network else {}
+        initialisations = {"headers": RigidPose.identity(len(self.slices))}
+        if self.settings.network:
+            initialisations |= dict(proposals)
         if self.settings.stacks:
-            sources["stacks"] = lambda: register_stacks(self.slices)[0].world_from_header()
-        further = cache(lambda: {name: made() for name, made in sources.items()})
+            initialisations["stacks"] = register_stacks(self.slices)[0].world_from_header()
         best: SearchResult | None = None
         for attempt in range(max(1, self.settings.attempts)):
             rng = np.random.default_rng([self.settings.seed, attempt])
-            found = self._attempt(further, rng, deadline)
+            found = self._attempt(initialisations, rng, deadline)
             if best is None or _score(found).cost < _score(best).cost:
                 best = found
             lowest = min(_score(best).correlations)
@@ -96,31 +88,24 @@ class GlobalSearch:
         return best
 
     def _attempt(
-        self, further: Callable[[], dict[str, RigidPose]], rng: np.random.Generator, deadline: Deadline | None
+        self, initialisations: dict[str, RigidPose], rng: np.random.Generator, deadline: Deadline | None
     ) -> SearchResult:
         slices, samples, placed, fill = self.slices, self.samples, None, None
-        initialisations = {"headers": RigidPose.identity(len(slices))}
         if self.template is not None:
             placed = place_in_atlas(slices, samples, self.template, rng)
             in_atlas = placed.motion(len(slices), samples)
             if any(sample.profile.has_missing for sample in samples):
                 # the template stands for what is missing, so every start has to be in its frame
                 fill = TemplateFill(placed.template.volume, placed.template.grid, placed.template.center_mm)
-                initialisations = {"headers": aligned_to(slices, in_atlas, initialisations["headers"])}
-            initialisations["template"] = in_atlas
+                initialisations = {
+                    name: aligned_to(slices, in_atlas, motion) for name, motion in initialisations.items()
+                }
+            initialisations = {**initialisations, "template": in_atlas}
         name, scores = best_initialisation(slices, samples, initialisations, fill)
-        if min(scores[name].correlations) <= IN_PLACE_CORRELATION and further():
-            # only where it is not certain yet that all stacks are in place
-            others = further()
-            if fill is not None:
-                others = {key: aligned_to(slices, in_atlas, motion) for key, motion in others.items()}
-            initialisations = {**initialisations, **others}
-            scores |= best_initialisation(slices, samples, others, fill)[1]
-            name = min(scores, key=lambda key: scores[key].cost)
         motion, score = initialisations[name], scores[name]
         if self.settings.segments:
-            rest = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
-            segmented, placements = refine_segments(slices, samples, motion, rest, rng, deadline, fill, score)
+            others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
+            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill, score)
             interleave = [placement.segments.interleave for placement in placements]
             segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave, fill)
             after = held_out_score(slices, samples, segmented, fill)

@@ -11,8 +11,9 @@ class RegistrationSettings:
 
     Args:
         template: initialisation by atlas templates; it also gives the standard orientation.
-        network: initialisation by the pose network, where headers and template do not suffice.
-        stacks: the same by stacks registered to each other from many starts.
+        network: initialisation by the pose network.
+        network_as_reserve: ... only where no atlas template is of the subject's size.
+        stacks: initialisation by stacks registered to each other from many starts.
         segments: place motion segments again in the volume of the other stacks.
         n_candidates: random motions tried at once for a stack in the search.
         attempts: at most this many searches with other random numbers while stacks do not predict each other.
@@ -26,6 +27,7 @@ class RegistrationSettings:
 
     template: bool = True
     network: bool = True
+    network_as_reserve: bool = False
     stacks: bool = True
     segments: bool = True
     n_candidates: int = 4000

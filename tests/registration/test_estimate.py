@@ -7,7 +7,6 @@ import pytest
 
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.atlas_template import AtlasTemplate
-from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import centred_on_headers
@@ -87,32 +86,13 @@ def test_stacks_of_one_or_two_slices(
 
 def test_proposals_are_initialisations_like_the_others(moving: Moving) -> None:
     """True poses offered from outside are taken; wrong ones are not, and those of a switched-off network."""
-    proposals = {"oracle": lambda: moving.truth, "astray": lambda: RigidPose.identity(len(moving.slices))}
+    proposals = {"oracle": moving.truth, "astray": RigidPose.identity(len(moving.slices))}
     settings = replace(OFF, network=True)
     estimate = register(moving.slices, settings, proposals=proposals)
     assert estimate.initialisation == "oracle"
     assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 1e-6
     deaf = register(moving.slices, replace(settings, network=False), proposals=proposals)
     assert set(deaf.initialisations) == {"headers"}
-
-
-def test_further_starts_are_made_only_where_a_stack_is_not_in_place(
-    moving: Moving, still: list[SimulatedStack]
-) -> None:
-    asked = []
-
-    def proposal(slices: Slices) -> RigidPose:
-        asked.append(len(slices))
-        return RigidPose.identity(len(slices))
-
-    in_place, _ = as_slices(still)
-    settings = replace(OFF, network=True)
-    estimate = register(in_place, settings, proposals={"spare": lambda: proposal(in_place)})
-    assert set(estimate.initialisations) == {"headers"}
-    assert asked == []
-    estimate = register(moving.slices, settings, proposals={"spare": lambda: proposal(moving.slices)})
-    assert set(estimate.initialisations) == {"headers", "spare"}
-    assert asked == [len(moving.slices)]
 
 
 def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack]) -> None:
