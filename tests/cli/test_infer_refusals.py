@@ -114,6 +114,15 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
     assert "usage: g3r-infer" in capsys.readouterr().err
 
 
+def test_an_unknown_preset_is_refused_with_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    from g3r.cli.infer import main
+
+    with pytest.raises(SystemExit):
+        main(["--stacks", "a.nii.gz", "--output", "o", "--preset", "draft"])
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert all(name in line for name in ("'draft'", *PRESETS))
+
+
 def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent\.pt"):
         GaussianReconstructor(tmp_path / "absent.pt")
