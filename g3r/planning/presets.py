@@ -100,8 +100,8 @@ PRESETS: dict[str, ReconstructionSettings] = {
             finest_voxel_mm=1.6,
             max_pixels=100_000,
         ),
-        prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=40),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=6),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=32),
     ),
     "fast": replace(
         _BALANCED,
