@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import fill_plane_and_uv
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
@@ -89,14 +90,10 @@ class Planes:
         return position
 
     def _plane_and_uv(self, pixel: NDArray[np.integer] | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        if pixel is None:
-            pixel, plane = np.arange(self.n_pixels), self.plane_id()
-        else:
-            plane = np.searchsorted(self.offset, pixel, side="right") - 1
-        row_length = self.shape[plane, 1]
-        row, column = np.divmod(pixel - self.offset[plane], row_length)
-        uv = np.stack([row - (self.shape[plane, 0] - 1) / 2, column - (row_length - 1) / 2], axis=1)
-        return plane, uv * self.spacing_mm[plane]
+        number = np.arange(self.n_pixels) if pixel is None else np.asarray(pixel, np.int64)
+        plane, uv = np.empty(len(number), np.int64), np.empty((len(number), 2))
+        fill_plane_and_uv(number, self.offset, self.shape, self.spacing_mm, plane, uv)
+        return plane, uv
 
     def take(self, index: Selection) -> Planes:
         """The planes at an index array, a mask or a slice."""

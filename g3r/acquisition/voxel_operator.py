@@ -1,17 +1,19 @@
 """The voxel forward operator, a slice pixel as a PSF-weighted mean of a volume (G3R Eq. 2), and its exact adjoint.
 
-Both directions run the same loop over the same trilinear weights, one gathers and one scatters, so that
+Both directions take the same trilinear weights (`acquisition.kernels`), one gathers and one scatters, so that
 <A x, y> = <x, A^T y> holds to rounding.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import gather, scatter
 from g3r.acquisition.planes import Planes
 from g3r.geometry import VolumeGrid
 
@@ -80,17 +82,10 @@ class VoxelOperator:
         """
         if volume.shape != self.grid.shape:
             raise ValueError(f"volume has shape {volume.shape}; the operator's grid is {self.grid.shape}")
+        padded = np.zeros([n + 2 for n in volume.shape], volume.dtype)
+        padded[1:-1, 1:-1, 1:-1] = volume
         pixels = np.zeros(self.n_pixels, volume.dtype)
-        _gather(
-            np.ascontiguousarray(volume),
-            self.plane,
-            self.uv_mm,
-            self.index_from_plane,
-            self.index_center,
-            self.node_index,
-            self.node_weight,
-            pixels,
-        )
+        gather(padded.ravel(), *self._geometry(volume.dtype), pixels)  # type: ignore[call-arg]
         return pixels
 
     def adjoint(self, pixels: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -102,102 +97,16 @@ class VoxelOperator:
         if pixels.shape != (self.n_pixels,):
             raise ValueError(f"pixels have shape {pixels.shape}; expected ({self.n_pixels},)")
         n_buffers = min(numba.get_num_threads(), MAX_SCATTER_BUFFERS)
-        buffers = np.zeros((n_buffers, *self.grid.shape), pixels.dtype)
-        _scatter(
-            pixels,
-            self.plane,
-            self.uv_mm,
-            self.index_from_plane,
-            self.index_center,
-            self.node_index,
-            self.node_weight,
-            buffers,
-        )
-        return buffers[0] if n_buffers == 1 else buffers.sum(0)
+        padded = [n + 2 for n in self.grid.shape]
+        buffers = np.zeros((n_buffers, math.prod(padded)), pixels.dtype)
+        scatter(pixels, *self._geometry(pixels.dtype), buffers)  # type: ignore[call-arg]
+        volume = (buffers[0] if n_buffers == 1 else buffers.sum(0)).reshape(padded)
+        return np.ascontiguousarray(volume[1:-1, 1:-1, 1:-1])
 
-
-@numba.njit(inline="always")
-def _pixel_index(p, plane, uv, index_from_plane, index_center):
-    k = plane[p]
-    u, v = uv[p, 0], uv[p, 1]
-    m = index_from_plane[k]
-    x = index_center[k, 0] + m[0, 0] * u + m[0, 1] * v
-    y = index_center[k, 1] + m[1, 0] * u + m[1, 1] * v
-    z = index_center[k, 2] + m[2, 0] * u + m[2, 1] * v
-    return k, x, y, z
-
-
-@numba.njit(parallel=True, cache=True)
-def _gather(volume, plane, uv, index_from_plane, index_center, node_index, node_weight, pixels):
-    n_i, n_j, n_k = volume.shape
-    for p in numba.prange(len(plane)):
-        k, x0, y0, z0 = _pixel_index(p, plane, uv, index_from_plane, index_center)
-        total = 0.0
-        for q in range(len(node_weight)):
-            x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-            i, j, h = math.floor(x), math.floor(y), math.floor(z)
-            if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
-                continue
-            fx, fy, fz = x - i, y - j, z - h
-            if 0 <= i < n_i - 1 and 0 <= j < n_j - 1 and 0 <= h < n_k - 1:  # nearly all: no cell cut off
-                v00 = volume[i, j, h] * (1.0 - fz) + volume[i, j, h + 1] * fz
-                v01 = volume[i, j + 1, h] * (1.0 - fz) + volume[i, j + 1, h + 1] * fz
-                v10 = volume[i + 1, j, h] * (1.0 - fz) + volume[i + 1, j, h + 1] * fz
-                v11 = volume[i + 1, j + 1, h] * (1.0 - fz) + volume[i + 1, j + 1, h + 1] * fz
-                v0, v1 = v00 * (1.0 - fy) + v01 * fy, v10 * (1.0 - fy) + v11 * fy
-                total += node_weight[q] * (v0 * (1.0 - fx) + v1 * fx)
-                continue
-            for a in range(2):
-                if i + a < 0 or i + a >= n_i:
-                    continue
-                wx = fx if a else 1.0 - fx
-                for b in range(2):
-                    if j + b < 0 or j + b >= n_j:
-                        continue
-                    wxy = wx * (fy if b else 1.0 - fy) * node_weight[q]
-                    if h >= 0:
-                        total += wxy * (1.0 - fz) * volume[i + a, j + b, h]
-                    if h + 1 < n_k:
-                        total += wxy * fz * volume[i + a, j + b, h + 1]
-        pixels[p] = total
-
-
-@numba.njit(parallel=True, cache=True)
-def _scatter(pixels, plane, uv, index_from_plane, index_center, node_index, node_weight, buffers):
-    n_buffers, n_i, n_j, n_k = buffers.shape
-    n = len(plane)
-    for chunk in numba.prange(n_buffers):
-        volume = buffers[chunk]
-        for p in range(chunk * n // n_buffers, (chunk + 1) * n // n_buffers):
-            k, x0, y0, z0 = _pixel_index(p, plane, uv, index_from_plane, index_center)
-            value = pixels[p]
-            for q in range(len(node_weight)):
-                x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-                i, j, h = math.floor(x), math.floor(y), math.floor(z)
-                if i < -1 or j < -1 or h < -1 or i >= n_i or j >= n_j or h >= n_k:
-                    continue
-                fx, fy, fz = x - i, y - j, z - h
-                if 0 <= i < n_i - 1 and 0 <= j < n_j - 1 and 0 <= h < n_k - 1:
-                    w0, w1 = node_weight[q] * value * (1.0 - fx), node_weight[q] * value * fx
-                    w00, w01, w10, w11 = w0 * (1.0 - fy), w0 * fy, w1 * (1.0 - fy), w1 * fy
-                    volume[i, j, h] += w00 * (1.0 - fz)
-                    volume[i, j, h + 1] += w00 * fz
-                    volume[i, j + 1, h] += w01 * (1.0 - fz)
-                    volume[i, j + 1, h + 1] += w01 * fz
-                    volume[i + 1, j, h] += w10 * (1.0 - fz)
-                    volume[i + 1, j, h + 1] += w10 * fz
-                    volume[i + 1, j + 1, h] += w11 * (1.0 - fz)
-                    volume[i + 1, j + 1, h + 1] += w11 * fz
-                    continue
-                for a in range(2):
-                    if i + a < 0 or i + a >= n_i:
-                        continue
-                    wx = fx if a else 1.0 - fx
-                    for b in range(2):
-                        if j + b < 0 or j + b >= n_j:
-                            continue
-                        wxy = wx * (fy if b else 1.0 - fy) * node_weight[q] * value
-                        if h >= 0:
-                            volume[i + a, j + b, h] += wxy * (1.0 - fz)
-                        if h + 1 < n_k:
-                            volume[i + a, j + b, h + 1] += wxy * fz
+    def _geometry(self, dtype: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
+        """Shape of a volume with a margin of one voxel, planes of the pixels, and where they and their nodes lie."""
+        shape = np.array(self.grid.shape) + 2
+        origin = self.index_center[:, None] + self.node_index + 1
+        reals = [self.uv_mm.T, self.index_from_plane, origin, self.node_weight]
+        uv, matrix, origin, weight = (np.ascontiguousarray(one, dtype) for one in reals)
+        return shape.astype(dtype), self.plane, uv, matrix, origin, weight

@@ -65,7 +65,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
         output = Path(scratch) / "result"
         more = [] if options.threads is None else ["--threads", str(threads)]
         _say("once without measuring, so that kernels are compiled and files cached")
-        run_infer([*infer_arguments(cases[0], "draft", output), *more], output)
+        run_infer([*infer_arguments(cases[0], "preview", output), *more], output)
         for case in cases:
             rows: dict[str, Any] = {}
             record["cases"][case.name] = {"n_stacks": len(case.stacks), "presets": rows}

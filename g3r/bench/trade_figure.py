@@ -8,7 +8,7 @@ from typing import Any
 
 from g3r.bench.trade_tables import Point, pareto_front, points_of, sweep_offset
 
-COLOURS = {"draft": "#cc79a7", "fast": "#e69f00", "balanced": "#0072b2", "accurate": "#009e73"}
+COLOURS = {"preview": "#cc79a7", "fast": "#e69f00", "balanced": "#0072b2", "accurate": "#009e73"}
 SWEEP_COLOURS = {"Gaussians": "#7f3c8d", "iterations": "#d55e00", "cut-off": "#56b4e9", "resolution": "#8c6d31"}
 
 MIN_SHOWN_DB = 6.0

@@ -8,10 +8,10 @@ from typing import Any
 
 from g3r.bench.record import machine_line, markdown_table
 
-ALLOWED_SECONDS = {"draft": 15.0, "fast": 30.0, "balanced": 75.0, "accurate": 240.0}
+ALLOWED_SECONDS = {"preview": 15.0, "fast": 30.0, "balanced": 75.0, "accurate": 240.0}
 """Time limit of the whole command by preset, on two cores, for three stacks of a 30-week head."""
 
-ALLOWED_LOSS_DB = {"draft": 4.0, "fast": 1.5, "balanced": 0.5}
+ALLOWED_LOSS_DB = {"preview": 4.0, "fast": 1.5, "balanced": 0.5}
 """Against `accurate` on the same case."""
 
 BEST = "accurate"

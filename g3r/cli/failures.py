@@ -15,7 +15,7 @@ OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start 
 EXTRAS = {"evaluate": ("skimage",), "train": ("lightning", "torchio", "jsonargparse", "tensorboard")}
 """Packages, as they are imported, that only some commands need."""
 
-OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset draft, or crop the stacks"
+OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset preview, or crop the stacks"
 KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
 
 

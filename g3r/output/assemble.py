@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from g3r.acquisition.coverage import UNSEEN_BELOW, UNSEEN_POWER
 from g3r.acquisition.foreground import foreground
@@ -43,6 +44,10 @@ logger = logging.getLogger(__name__)
 
 LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
+
+RIM_MM = 1.6
+"""How far beyond the support V_prior is shown, which is soft there: a brain that ends on whole voxels, where masks end,
+has a fifth of its squared error in that edge."""
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 
@@ -97,7 +102,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
         left_to_prior = _left_to_prior(density, _prior_weight(found, settings))
-        volume = _volume(found, support, left_to_prior, grid, settings)
+        shown = support | (settings.use_prior & _margin(support, RIM_MM, grid))
+        volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
         unseen_part = UnseenPart.of(
             unseen,
@@ -219,9 +225,15 @@ def _left_to_prior(density: NDArray[np.float32], least: float) -> NDArray[np.flo
     return np.where(weight < LEAST_WEIGHT, 0, weight).clip(least, 1).astype(np.float32)
 
 
+def _margin(inside: NDArray[np.bool_], margin_mm: float, grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Voxels [I, J, K] outside a region that are within a distance of it, in whole voxels along the axes."""
+    n_voxels = round(margin_mm / float(grid.spacing_mm.mean()))
+    return binary_dilation(inside, iterations=n_voxels) & ~inside if n_voxels else np.zeros_like(inside)
+
+
 def _volume(
     found: StageResults,
-    support: NDArray[np.bool_],
+    shown: NDArray[np.bool_],
     left_to_prior: NDArray[np.float32],
     grid: VolumeGrid,
     settings: ReconstructionSettings,
@@ -229,10 +241,10 @@ def _volume(
     """The Gaussians on the output grid, and the prior where no slice looked; the prior alone before there are any."""
     prior = on_grid(found.prior.values, found.prior.volumes.grid, grid, outside=0.0)
     if found.fit is None:
-        return prior * support
+        return prior * shown
     pixels = render(found.fit.cloud, volume_planes(grid), cutoff_sigma=settings.slice_stage.cutoff_sigma).numpy()
     fitted = volume_from_pixels(pixels, grid)
-    volume = (fitted + left_to_prior * (prior - fitted)) * support
+    volume = (fitted + left_to_prior * (prior - fitted)) * shown
     if not np.isfinite(volume).all():
         raise NumericalError("the volume holds values that are not finite; lower the step sizes")
     return volume

@@ -92,7 +92,7 @@ class ReconstructionSettings:
 _BALANCED = ReconstructionSettings()
 
 PRESETS: dict[str, ReconstructionSettings] = {
-    "draft": replace(
+    "preview": replace(
         _BALANCED,
         gaussian_spacing_pixels=2.85,
         max_gaussian_spacing_mm=4.0,
@@ -102,16 +102,17 @@ PRESETS: dict[str, ReconstructionSettings] = {
         share_probes=1,
         registration=replace(
             _BALANCED.registration,
-            n_candidates=1200,
+            n_candidates=800,
             network_as_reserve=True,
             stacks=False,
             attempts=1,
-            n_rounds=5,
+            n_rounds=3,
+            steps_per_round=4,
             finest_voxel_mm=1.6,
-            max_pixels=200_000,
+            max_pixels=100_000,
         ),
-        prior_stage=replace(_BALANCED.prior_stage, n_steps=8),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=40),
+        prior_stage=replace(_BALANCED.prior_stage, n_steps=6),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=32),
     ),
     "fast": replace(
         _BALANCED,

@@ -28,7 +28,7 @@ from g3r.run.deadline import Deadline, LoopRecord
 
 logger = logging.getLogger(__name__)
 
-REGISTRATION_FROM_S = {"draft": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
+REGISTRATION_FROM_S = {"preview": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
 """Budget from which on registration searches as in a preset: about the whole command's own seconds on two
 cores, from one preset to the next."""
 
@@ -150,20 +150,20 @@ class TimeBudget:
         if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
             # timing a step would take the time of the steps themselves
             reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)
-            self.choices |= {"fit": "draft", "reserve_s": round(reserve_s, 2)}
+            self.choices |= {"fit": "preview", "reserve_s": round(reserve_s, 2)}
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
-            return self._take("draft", PRESETS["draft"].share_probes, reserve_s)
+            return self._take("preview", PRESETS["preview"].share_probes, reserve_s)
         spacing_mm = {name: preset.lattice.mm(volumes.slices) for name, preset in PRESETS.items()}
         cloud = seed_cloud(prior.values, prior.support, volumes.grid, spacing_mm["fast"])
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
-        careful_first = [name for name in reversed(PRESETS) if name != "draft"]
-        for probes in (PRESETS["accurate"].share_probes, PRESETS["draft"].share_probes):
+        careful_first = [name for name in reversed(PRESETS) if name != "preview"]
+        for probes in (PRESETS["accurate"].share_probes, PRESETS["preview"].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
             left = max(0.0, self.deadline.remaining_s - reserve_s)
             number = {name: (spacing_mm["fast"] / mm) ** 3 for name, mm in spacing_mm.items()}
             fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, number[n]) <= left)
-            chosen = next(fitting, "draft")
-            if chosen != "draft":
+            chosen = next(fitting, "preview")
+            if chosen != "preview":
                 break
         self.choices |= {
             "fit": chosen,

@@ -151,12 +151,14 @@ def _with_rigid_stacks(
     Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
     are not asked: a few slices that went astray lower their correlation, while all others gain.
     """
-    motion, fill = found.motion, found.fill
-    before = held_out_score(slices, samples, motion, fill)
+    motion, fill, before = found.motion, found.fill, found.score
+    assert before is not None
     refined = fitted.slices.world_from_header()
+    after = held_out_score(slices, samples, refined, fill)
+    if not rigid:
+        return fitted, after.correlations
     equal = np.ones(len(slices))
     rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
-    after = held_out_score(slices, samples, refined, fill)
     reverted = [
         sample
         for sample, old, new in zip(samples, before.correlations, after.correlations, strict=True)

@@ -34,6 +34,7 @@ class SearchResult:
         initialisations: held-out correlation of every initialisation, stack by stack.
         placed: the slices in the atlas template; None without one.
         fill: what stands for the parts of the head that stacks lack; None where nothing is missing.
+        score: of these motions; None for a single stack.
     """
 
     motion: RigidPose
@@ -41,6 +42,7 @@ class SearchResult:
     initialisations: dict[str, list[float]]
     placed: AtlasPlacement | None
     fill: TemplateFill | None = None
+    score: HeldOutScore | None = None
 
 
 @dataclass(frozen=True)
@@ -71,23 +73,23 @@ class GlobalSearch:
             initialisations |= dict(proposals)
         if self.settings.stacks:
             initialisations["stacks"] = register_stacks(self.slices)[0].world_from_header()
-        best: tuple[HeldOutScore, SearchResult] | None = None
+        best: SearchResult | None = None
         for attempt in range(max(1, self.settings.attempts)):
             rng = np.random.default_rng([self.settings.seed, attempt])
-            score, found = self._attempt(initialisations, rng, deadline)
-            if best is None or score.cost < best[0].cost:
-                best = score, found
-            lowest = min(best[0].correlations)
+            found = self._attempt(initialisations, rng, deadline)
+            if best is None or _score(found).cost < _score(best).cost:
+                best = found
+            lowest = min(_score(best).correlations)
             finished = lowest >= RETRY_BELOW_CORRELATION or not self.settings.segments
             if finished or (deadline is not None and deadline.has_passed()):
                 break
             logger.info("attempt %d: a stack correlates %.2f with the others", attempt + 1, lowest)
         assert best is not None
-        return best[1]
+        return best
 
     def _attempt(
         self, initialisations: dict[str, RigidPose], rng: np.random.Generator, deadline: Deadline | None
-    ) -> tuple[HeldOutScore, SearchResult]:
+    ) -> SearchResult:
         slices, samples, placed, fill = self.slices, self.samples, None, None
         if self.template is not None:
             placed = place_in_atlas(slices, samples, self.template, rng)
@@ -103,7 +105,7 @@ class GlobalSearch:
         motion, score = initialisations[name], scores[name]
         if self.settings.segments:
             others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
-            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill)
+            segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill, score)
             interleave = [placement.segments.interleave for placement in placements]
             segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave, fill)
             after = held_out_score(slices, samples, segmented, fill)
@@ -112,7 +114,12 @@ class GlobalSearch:
             if after.cost <= score.cost - needed:
                 motion, score = segmented, after
         correlations = {key: value.correlations for key, value in scores.items()}
-        return score, SearchResult(motion, name, correlations, placed, fill)
+        return SearchResult(motion, name, correlations, placed, fill, score)
+
+
+def _score(found: SearchResult) -> HeldOutScore:
+    assert found.score is not None
+    return found.score
 
 
 def search_single(

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels import REORDERED, RUN, locate
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
@@ -63,6 +64,9 @@ class SliceModel:
         self.operator = VoxelOperator(slices.planes, grid, index, (1, 1, psf_points))
         self.value = slices.value[index]
         self.volume = np.ascontiguousarray(volume, dtype=np.float32)
+        n_zeros = grid.shape[1] * grid.shape[2] + grid.shape[2] + 2  # the cell of what lies outside
+        self.flat = np.concatenate([self.volume.ravel(), np.zeros(n_zeros, np.float32)])
+        self.uv_mm = np.ascontiguousarray(self.operator.uv_mm.T)
         self.start = np.searchsorted(self.operator.plane, np.arange(len(slices) + 1))
 
     def evaluate(self, planes: Planes, gain: NDArray[np.float64], width: float) -> NormalEquations:
@@ -79,13 +83,13 @@ class SliceModel:
         loss, moments = np.zeros(n), np.zeros((n, 6))
         op = self.operator
         _accumulate(
-            self.volume,
+            self.flat,
+            np.array(op.grid.shape, np.float64),
             self.start,
-            op.uv_mm,
+            self.uv_mm,
             self.value,
             op.index_from_plane,
-            op.index_center,
-            op.node_index,
+            op.index_center[:, None] + op.node_index,
             op.node_mm,
             op.node_weight,
             gain,
@@ -97,6 +101,19 @@ class SliceModel:
         )
         return NormalEquations(hessian, gradient, loss, moments)
 
+    def losses(self, planes: Planes, gain: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+        """Mean Cauchy loss [K] of each slice, as `evaluate` has it, without derivatives; 0 for one without pixels.
+
+        Args:
+            planes: the slices' pixel grids in their present poses.
+            gain: [K] intensity factors.
+            width: residual at which the Cauchy loss bends.
+        """
+        loss = np.log1p((self.residuals(planes, gain) / np.float32(width)) ** 2)
+        n_used = np.diff(self.start)
+        total = np.bincount(self.operator.plane, loss, len(n_used))
+        return np.asarray(total / np.maximum(n_used, 1), np.float64)
+
     def residuals(self, planes: Planes, gain: NDArray[np.float64]) -> NDArray[np.float32]:
         """Slice minus model for every used pixel."""
         self.operator.move(planes)
@@ -104,82 +121,90 @@ class SliceModel:
         return self.value - model.astype(np.float32)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, cache=True, fastmath=REORDERED)
 def _accumulate(
-    volume,
-    start,
-    uv,
-    value,
-    index_from_plane,
-    index_center,
-    node_index,
-    node_mm,
-    node_weight,
-    gain,
-    width,
-    hessian,
-    gradient,
-    loss,
-    moments,
+    flat, shape, start, uv, value, matrix, origin, node_mm, node_weight, gain, width, hessian, gradient, loss, moments
 ):
-    n_i, n_j, n_k = volume.shape
+    """The sums of `NormalEquations`, slice by slice; `acquisition.kernels` says why over runs of pixels."""
+    to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
+    outside = int(shape[0] * shape[1] * shape[2])
     for k in numba.prange(len(start) - 1):
-        m = index_from_plane[k]
-        jac = np.zeros(N_PARAMETERS)
+        cell, fraction = np.empty(RUN, np.int32), np.empty((3, RUN))
+        jacobian, weighted = np.empty((N_PARAMETERS, RUN)), np.empty(RUN)
+        residual, factor = np.empty(RUN), np.empty(RUN)
+        m = matrix[k]
+        xx, xy, xz = m[0, 0], m[0, 1], m[0, 2]
+        yx, yy, yz = m[1, 0], m[1, 1], m[1, 2]
+        zx, zy, zz = m[2, 0], m[2, 1], m[2, 2]
         total = 0.0
-        for p in range(start[k], start[k + 1]):
-            x0 = index_center[k, 0] + m[0, 0] * uv[p, 0] + m[0, 1] * uv[p, 1]
-            y0 = index_center[k, 1] + m[1, 0] * uv[p, 0] + m[1, 1] * uv[p, 1]
-            z0 = index_center[k, 2] + m[2, 0] * uv[p, 0] + m[2, 1] * uv[p, 1]
-            model = 0.0
-            jac[:] = 0.0
+        for first in range(start[k], start[k + 1], RUN):
+            end = min(first + RUN, start[k + 1])
+            n = end - first
+            at_u, at_v, observed = uv[0, first:end], uv[1, first:end], value[first:end]
+            jacobian[:, :n] = 0.0
+            turn_x, turn_y, turn_z = jacobian[0, :n], jacobian[1, :n], jacobian[2, :n]
+            shift_x, shift_y, shift_z = jacobian[3, :n], jacobian[4, :n], jacobian[5, :n]
+            model = jacobian[6, :n]
             for q in range(len(node_weight)):
-                x, y, z = x0 + node_index[k, q, 0], y0 + node_index[k, q, 1], z0 + node_index[k, q, 2]
-                i, j, h = math.floor(x), math.floor(y), math.floor(z)
-                if i < 0 or j < 0 or h < 0 or i + 1 >= n_i or j + 1 >= n_j or h + 1 >= n_k:
-                    continue
-                fx, fy, fz = x - i, y - j, z - h
-                a000, a001 = volume[i, j, h], volume[i, j, h + 1]
-                a010, a011 = volume[i, j + 1, h], volume[i, j + 1, h + 1]
-                a100, a101 = volume[i + 1, j, h], volume[i + 1, j, h + 1]
-                a110, a111 = volume[i + 1, j + 1, h], volume[i + 1, j + 1, h + 1]
-                b00, b01 = a000 + fz * (a001 - a000), a010 + fz * (a011 - a010)
-                b10, b11 = a100 + fz * (a101 - a100), a110 + fz * (a111 - a110)
-                c0, c1 = b00 + fy * (b01 - b00), b10 + fy * (b11 - b10)
-                gx = c1 - c0
-                gy = (1.0 - fx) * (b01 - b00) + fx * (b11 - b10)
-                gz = (1.0 - fx) * ((1.0 - fy) * (a001 - a000) + fy * (a011 - a010)) + fx * (
-                    (1.0 - fy) * (a101 - a100) + fy * (a111 - a110)
-                )
+                locate(at_u, at_v, m, origin[k, q], shape, outside, cell, fraction)
                 w = node_weight[q]
-                model += w * (c0 + fx * gx)
-                hx = w * (m[0, 0] * gx + m[1, 0] * gy + m[2, 0] * gz)
-                hy = w * (m[0, 1] * gx + m[1, 1] * gy + m[2, 1] * gz)
-                hz = w * (m[0, 2] * gx + m[1, 2] * gy + m[2, 2] * gz)
-                u, v, s = uv[p, 0] + node_mm[k, q, 0], uv[p, 1] + node_mm[k, q, 1], node_mm[k, q, 2]
-                jac[0] += v * hz - s * hy
-                jac[1] += s * hx - u * hz
-                jac[2] += u * hy - v * hx
-                jac[3] += hx
-                jac[4] += hy
-                jac[5] += hz
-            jac[6] = model
-            observed = value[p]
-            residual = observed - gain[k] * model
-            ratio = residual / width
-            factor = 1.0 / (1.0 + ratio * ratio)
-            total += math.log1p(ratio * ratio)
+                node_u, node_v, s = node_mm[k, q, 0], node_mm[k, q, 1], node_mm[k, q, 2]
+                for p in range(n):
+                    c = np.uint64(cell[p])
+                    fx, fy, fz = fraction[0, p], fraction[1, p], fraction[2, p]
+                    a000, a001 = flat[c], flat[c + to_z]
+                    a010, a011 = flat[c + to_y], flat[c + to_y + to_z]
+                    a100, a101 = flat[c + to_x], flat[c + to_x + to_z]
+                    a110, a111 = flat[c + to_x + to_y], flat[c + to_x + to_y + to_z]
+                    b00, b01 = a000 + fz * (a001 - a000), a010 + fz * (a011 - a010)
+                    b10, b11 = a100 + fz * (a101 - a100), a110 + fz * (a111 - a110)
+                    c0, c1 = b00 + fy * (b01 - b00), b10 + fy * (b11 - b10)
+                    gx = c1 - c0
+                    gy = (1.0 - fx) * (b01 - b00) + fx * (b11 - b10)
+                    gz = (1.0 - fx) * ((1.0 - fy) * (a001 - a000) + fy * (a011 - a010)) + fx * (
+                        (1.0 - fy) * (a101 - a100) + fy * (a111 - a110)
+                    )
+                    model[p] += w * (c0 + fx * gx)
+                    hx = w * (xx * gx + yx * gy + zx * gz)
+                    hy = w * (xy * gx + yy * gy + zy * gz)
+                    hz = w * (xz * gx + yz * gy + zz * gz)
+                    u, v = at_u[p] + node_u, at_v[p] + node_v
+                    turn_x[p] += v * hz - s * hy
+                    turn_y[p] += s * hx - u * hz
+                    turn_z[p] += u * hy - v * hx
+                    shift_x[p] += hx
+                    shift_y[p] += hy
+                    shift_z[p] += hz
+            g = gain[k]
+            s_y = s_m = s_yy = s_mm = s_ym = 0.0
+            for p in range(n):
+                y, modelled = np.float64(observed[p]), model[p]
+                residual[p] = y - g * modelled
+                factor[p] = g / (1.0 + (residual[p] / width) ** 2)
+                s_y += y
+                s_m += modelled
+                s_yy += y * y
+                s_mm += modelled * modelled
+                s_ym += y * modelled
+            moments[k, 0] += n
+            moments[k, 1] += s_y
+            moments[k, 2] += s_m
+            moments[k, 3] += s_yy
+            moments[k, 4] += s_mm
+            moments[k, 5] += s_ym
+            for p in range(n):
+                total += math.log1p((residual[p] / width) ** 2)
             for a in range(N_PARAMETERS):
-                da = gain[k] * jac[a]
-                gradient[k, a] += factor * da * residual
-                for b in range(a, N_PARAMETERS):
-                    hessian[k, a, b] += factor * da * gain[k] * jac[b]
-            moments[k, 0] += 1.0
-            moments[k, 1] += observed
-            moments[k, 2] += model
-            moments[k, 3] += observed * observed
-            moments[k, 4] += model * model
-            moments[k, 5] += observed * model
+                own, along = jacobian[a], 0.0
+                for p in range(n):
+                    weighted[p] = factor[p] * own[p]
+                    along += weighted[p] * residual[p]
+                gradient[k, a] += along
+                for b in range(a + 1):
+                    other, both = jacobian[b], 0.0
+                    for p in range(n):
+                        both += weighted[p] * other[p]
+                    hessian[k, b, a] += g * both
         for a in range(N_PARAMETERS):
             for b in range(a):
                 hessian[k, a, b] = hessian[k, b, a]

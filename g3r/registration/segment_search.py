@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import fit_rigid_robust
-from g3r.registration.held_out import HELD_OUT_VOXEL_MM, estimate_interleave, predict, volume_without
+from g3r.registration.held_out import (
+    HELD_OUT_VOXEL_MM,
+    HeldOutScore,
+    estimate_interleave,
+    held_out_score,
+    predict,
+    volume_without,
+)
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.similarity import StackSamples
@@ -66,6 +73,7 @@ def refine_segments(
     rng: np.random.Generator,
     deadline: Deadline | None = None,
     fill: TemplateFill | None = None,
+    known: HeldOutScore | None = None,
 ) -> tuple[RigidPose, list[Placement]]:
     """Place the motion segments of every stack in the volume of the other stacks, round after round.
 
@@ -77,13 +85,21 @@ def refine_segments(
         rng: source of randomness.
         deadline: fewer rounds if they would end after it.
         fill: see `volume_without`.
+        known: the score of the motions to start from; found here when None.
 
     Returns:
         Motions [K], and the last placement of each stack.
     """
     placements: list[Placement] = []
-    for sample in samples:
-        motion = motion.with_rows(sample.rows, _search_orientations(slices, sample, motion, rng, fill))
+    known = known or held_out_score(slices, samples, motion, fill)
+    as_scored = True
+    for sample, prediction in zip(samples, known.prediction, strict=True):
+        if as_scored and prediction.correlation > IN_PLACE_CORRELATION:
+            continue
+        found = _search_orientations(slices, sample, motion, rng, fill)
+        as_scored = as_scored and found is None
+        if found is not None:
+            motion = motion.with_rows(sample.rows, found)
     for number, done in timed_steps(len(ROUNDS), deadline, least=MIN_ROUNDS):
         rotation_deg, translation_mm, voxel_mm = ROUNDS[int(round(done * len(ROUNDS), 9))]
         placements = []
@@ -109,8 +125,8 @@ def refine_segments(
 
 def _search_orientations(
     slices: Slices, sample: StackSamples, motion: RigidPose, rng: np.random.Generator, fill: TemplateFill | None
-) -> RigidPose:
-    """Motions [K] of one stack: the present ones, or better ones from an exhaustive search.
+) -> RigidPose | None:
+    """Better motions [K] of one stack than the present ones, from an exhaustive search; None if there are none.
 
     A stack that starts upside down cannot come back by small steps.
     """
@@ -120,11 +136,11 @@ def _search_orientations(
     target = others.planes.pixel_world_mm(others.pixel_index).mean(0)
     if fill is not None:  # the others' pixels may lie at one side of the head
         target = fill.center_mm
-    best = motion.take(sample.rows)
-    present = predict(sample, best, volume, grid, estimate_interleave(sample, best))
+    own = motion.take(sample.rows)
+    present = predict(sample, own, volume, grid, estimate_interleave(sample, own))
     if present.correlation > IN_PLACE_CORRELATION:
-        return best
-    cost = present.cost
+        return None
+    best, cost = None, present.cost
     for base in stack_orientations(sample, target, volume, grid):
         found = place_around(sample, base, target, volume, grid)
         for rotation_deg, translation_mm in WIDE_REFINEMENT:

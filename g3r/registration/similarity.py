@@ -80,10 +80,26 @@ class SearchPixels:
         """
         index_from_world = np.linalg.inv(grid.affine)
         linear = index_from_world[:3, :3] @ motion.rotation
-        translation = motion.translation_mm @ index_from_world[:3, :3].T + index_from_world[:3, 3]
-        out = np.zeros((len(motion), len(self), 6))
-        volume = np.ascontiguousarray(volume, np.float32)
-        _moments(volume, self.point_mm, self.value, self.start, linear, translation, out)
+        middle = self.point_mm.mean(0)  # near it, single precision is enough
+        translation = motion.translation_mm @ index_from_world[:3, :3].T + index_from_world[:3, 3] + linear @ middle
+        point = np.ascontiguousarray((self.point_mm - middle).T, np.float32)
+        n_cell = grid.shape[1] * grid.shape[2] + grid.shape[2] + 2
+        flat = np.concatenate([volume.ravel().astype(np.float32), np.zeros(n_cell, np.float32)])
+        out = np.empty((len(motion), len(self), 6))
+        value = self.value.astype(np.float64)
+        out[..., 0] = np.diff(self.start)
+        out[..., 1] = np.add.reduceat(value, self.start[:-1])
+        out[..., 3] = np.add.reduceat(value**2, self.start[:-1])
+        _sums(
+            flat,
+            np.array(grid.shape),
+            point,
+            self.value,
+            self.start,
+            linear.astype(np.float32),
+            translation.astype(np.float32),
+            out,
+        )
         return out
 
 
@@ -185,35 +201,54 @@ def mean_square_residual(moments: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
-def _moments(volume, point, value, start, linear, translation, out):
-    n_i, n_j, n_k = volume.shape
+def _sums(flat, shape, point, value, start, linear, translation, out):
+    """The sums m, mm and ym of `SearchPixels.moments`.
+
+    The volume is flat, followed by zeros in which points outside it lie: without a branch, and with indices that
+    cannot be negative (for which numba would look), both loops over the pixels become vector code.
+    """
+    zero = np.float32(0)
+    last_i, last_j, last_k = np.float32(shape[0] - 1), np.float32(shape[1] - 1), np.float32(shape[2] - 1)
+    stride_i, stride_j = np.int32(shape[1] * shape[2]), np.int32(shape[2])
+    outside = np.int32(shape[0] * shape[1] * shape[2])
+    to_i, to_j, to_k = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
+    longest = (start[1:] - start[:-1]).max()
     for j in numba.prange(len(linear)):
-        a, b = linear[j], translation[j]
+        # as scalars: LLVM cannot know that nothing writes to the arrays inside the loops
+        a_xx, a_xy, a_xz = linear[j, 0, 0], linear[j, 0, 1], linear[j, 0, 2]
+        a_yx, a_yy, a_yz = linear[j, 1, 0], linear[j, 1, 1], linear[j, 1, 2]
+        a_zx, a_zy, a_zz = linear[j, 2, 0], linear[j, 2, 1], linear[j, 2, 2]
+        b_x, b_y, b_z = translation[j, 0], translation[j, 1], translation[j, 2]
+        cell = np.empty(longest, np.int32)
+        fraction_x, fraction_y = np.empty(longest, np.float32), np.empty(longest, np.float32)
+        fraction_z = np.empty(longest, np.float32)
         for k in range(len(start) - 1):
-            s_y = s_m = s_yy = s_mm = s_ym = 0.0
-            for p in range(start[k], start[k + 1]):
-                u, v, w = point[p, 0], point[p, 1], point[p, 2]
-                x = a[0, 0] * u + a[0, 1] * v + a[0, 2] * w + b[0]
-                y = a[1, 0] * u + a[1, 1] * v + a[1, 2] * w + b[1]
-                z = a[2, 0] * u + a[2, 1] * v + a[2, 2] * w + b[2]
-                m = 0.0
-                if 0 <= x < n_i - 1 and 0 <= y < n_j - 1 and 0 <= z < n_k - 1:
-                    i, h, q = int(x), int(y), int(z)
-                    fx, fy, fz = x - i, y - h, z - q
-                    v00 = volume[i, h, q] + fz * (volume[i, h, q + 1] - volume[i, h, q])
-                    v01 = volume[i, h + 1, q] + fz * (volume[i, h + 1, q + 1] - volume[i, h + 1, q])
-                    v10 = volume[i + 1, h, q] + fz * (volume[i + 1, h, q + 1] - volume[i + 1, h, q])
-                    v11 = volume[i + 1, h + 1, q] + fz * (volume[i + 1, h + 1, q + 1] - volume[i + 1, h + 1, q])
-                    v0, v1 = v00 + fy * (v01 - v00), v10 + fy * (v11 - v10)
-                    m = v0 + fx * (v1 - v0)
-                s_y += value[p]
+            own = slice(start[k], start[k + 1])
+            at_u, at_v, at_w, own_value = point[0, own], point[1, own], point[2, own], value[own]
+            for p in range(len(own_value)):
+                u, v, w = at_u[p], at_v[p], at_w[p]
+                x = a_xx * u + a_xy * v + a_xz * w + b_x
+                y = a_yx * u + a_yy * v + a_yz * w + b_y
+                z = a_zx * u + a_zy * v + a_zz * w + b_z
+                inside = (x >= zero) & (x < last_i) & (y >= zero) & (y < last_j) & (z >= zero) & (z < last_k)
+                x, y, z = x if inside else zero, y if inside else zero, z if inside else zero
+                i, h, q = np.int32(x), np.int32(y), np.int32(z)
+                fraction_x[p], fraction_y[p] = x - np.float32(i), y - np.float32(h)
+                fraction_z[p] = z - np.float32(q)
+                cell[p] = i * stride_i + h * stride_j + q if inside else outside
+            s_m = s_mm = s_ym = zero
+            for p in range(len(own_value)):
+                c = np.uint64(cell[p])
+                fx, fy, fz = fraction_x[p], fraction_y[p], fraction_z[p]
+                v00 = flat[c] + fz * (flat[c + to_k] - flat[c])
+                v01 = flat[c + to_j] + fz * (flat[c + to_j + to_k] - flat[c + to_j])
+                v10 = flat[c + to_i] + fz * (flat[c + to_i + to_k] - flat[c + to_i])
+                v11 = flat[c + to_i + to_j] + fz * (flat[c + to_i + to_j + to_k] - flat[c + to_i + to_j])
+                v0, v1 = v00 + fy * (v01 - v00), v10 + fy * (v11 - v10)
+                m = v0 + fx * (v1 - v0)
                 s_m += m
-                s_yy += value[p] * value[p]
                 s_mm += m * m
-                s_ym += value[p] * m
-            out[j, k, 0] = start[k + 1] - start[k]
-            out[j, k, 1] = s_y
+                s_ym += own_value[p] * m
             out[j, k, 2] = s_m
-            out[j, k, 3] = s_yy
             out[j, k, 4] = s_mm
             out[j, k, 5] = s_ym

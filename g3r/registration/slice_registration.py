@@ -94,7 +94,7 @@ def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64],
     """
     motion = slices.world_from_header()
     best_pose = slices.planes.pose
-    current = model.evaluate(slices.planes, gain, width).loss
+    current = model.losses(slices.planes, gain, width)
     best = current.copy()
     for step in NEIGHBOURS:
         source = np.arange(len(slices)) + step
@@ -103,7 +103,7 @@ def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64],
         valid &= slices.stack_id[source] == slices.stack_id
         source = np.where(valid, source, np.arange(len(slices)))
         candidate = motion.take(source) @ slices.header_pose
-        loss = model.evaluate(slices.planes.with_pose(candidate), gain, width).loss
+        loss = model.losses(slices.planes.with_pose(candidate), gain, width)
         # a margin, because each slice helped to make the volume and so fits best where it is
         better = valid & (loss < 0.97 * best)
         best_pose = _where(better, candidate, best_pose)

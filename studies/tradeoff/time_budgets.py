@@ -49,7 +49,7 @@ def measure(folder: Path, budget_s: float, thickness_mm: float | None, output: P
         output: folder for the results.
     """
     case = load_case(folder, thickness_mm)
-    plain = infer_arguments(case, "draft", output)
+    plain = infer_arguments(case, "preview", output)
     compiled(tuple(plain), output)
     at = plain.index("--preset")
     run = run_infer([*plain[:at], "--time-budget", f"{budget_s:g}", *plain[at + 2 :]], output)

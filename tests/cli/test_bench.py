@@ -93,7 +93,7 @@ def variant(seconds: float, psnr: float, *, same: bool = False) -> dict[str, Any
 
 def made_record() -> dict[str, Any]:
     fit = {"curve": {"step": [1, 2], "seconds_before_end": [2.0, 0.0], "psnr_db": [20.0, 24.0]}}
-    presets = {"draft": preset(16.0, 20.0), "balanced": preset(60.0, 24.0), "accurate": preset(200.0, 24.6)}
+    presets = {"preview": preset(16.0, 20.0), "balanced": preset(60.0, 24.0), "accurate": preset(200.0, 24.6)}
     case = {
         "presets": presets,
         "sweeps": {"cut-off": {"2 sigma": variant(10.0, 23.0), "3.2 sigma": variant(20.0, 24.0, same=True)}},
@@ -104,7 +104,7 @@ def made_record() -> dict[str, Any]:
 
 def test_trade_tables_and_figure(tmp_path: Path) -> None:
     text = trade_tables(made_record())
-    assert "| made | `draft` | 16.0 (!) | 15 | 4.60 (!) | 4 |" in text
+    assert "| made | `preview` | 16.0 (!) | 15 | 4.60 (!) | 4 |" in text
     assert "| made | `balanced` | 60.0 | 75 | 0.60 (!) | 0.5 |" in text
     assert "| made | `accurate` | 200.0 | 240 |  |  |" in text
     assert "| cut-off | 2 sigma | 50.0 | 10.0 | 100 | 23.00 |" in text  # 60 - 20 + 10 seconds
@@ -148,15 +148,15 @@ def test_trade_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert simulate.main([*words, "--output", str(tmp_path / "case")]) == 0
     page = tmp_path / "page.md"
     page.write_text("<!-- trade:begin -->\n<!-- trade:end -->\n", encoding="utf-8")
-    words = ["trade", str(tmp_path / "case"), "--repeats", "1", "--presets", "draft", "--base", "draft"]
+    words = ["trade", str(tmp_path / "case"), "--repeats", "1", "--presets", "preview", "--base", "preview"]
     words += ["--sweeps", "--output", str(tmp_path), "--docs", str(page), "--figure", str(tmp_path / "t.png")]
     assert bench.main(words) == 0
     case = json.loads((tmp_path / "trade.json").read_text())["cases"]["case"]
-    row = case["presets"]["draft"]
+    row = case["presets"]["preview"]
     assert row["seconds"] == pytest.approx(sum(row["stages"].values()), abs=0.1)
     assert row["peak_bytes"] > 1e8
-    assert case["fits"]["draft"]["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.5)
-    assert case["fits"]["draft"]["curve"]["psnr_db"][-1] == pytest.approx(row["psnr_db"], abs=0.5)
+    assert case["fits"]["preview"]["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.5)
+    assert case["fits"]["preview"]["curve"]["psnr_db"][-1] == pytest.approx(row["psnr_db"], abs=0.5)
     assert set(case["sweeps"]) == {"Gaussians", "iterations", "cut-off", "resolution"}
-    assert "`draft`" in page.read_text(encoding="utf-8")
+    assert "`preview`" in page.read_text(encoding="utf-8")
     assert (tmp_path / "t.png").is_file()

@@ -26,7 +26,7 @@ from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from tests.faults.small_case import WHOLE
 
-QUICK = ("--preset", "draft", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
+QUICK = ("--preset", "preview", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 
 
 def run(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -122,7 +122,7 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path) ->
     assert [stack["name"] for stack in record["stacks"]] == [path.name for path in files(subject, "stack")]
     assert all(seconds >= 0 for seconds in record["seconds"].values())
     assert record["peak_memory_bytes"] > 1e7
-    assert record["command"]["preset"] == "draft"
+    assert record["command"]["preset"] == "preview"
     for key in ("versions", "warnings", "notes", "loss", "inactive_terms", "registration"):
         assert key in record
     assert record["registration"]["reliable"] is True
@@ -159,13 +159,13 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
 
 def quick_settings() -> ReconstructionSettings:
     """Without the prior and with a short registration and fit."""
-    draft = PRESETS["draft"]
+    preview = PRESETS["preview"]
     return replace(
-        draft,
+        preview,
         resolution_mm=1.5,
         use_prior=False,
-        registration=replace(draft.registration, n_rounds=2),
-        slice_stage=replace(draft.slice_stage, n_steps=5),
+        registration=replace(preview.registration, n_rounds=2),
+        slice_stage=replace(preview.slice_stage, n_steps=5),
     )
 
 

@@ -100,7 +100,7 @@ def test_bad_input_is_refused_in_one_line_with_exit_code_3(kind: str, subject: P
         ["--stacks", "a.nii.gz", "--output", "o", "--threads", "0"],
         ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "0"],
         ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "nan"],
-        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "20", "--preset", "draft"],
+        ["--stacks", "a.nii.gz", "--output", "o", "--time-budget", "20", "--preset", "preview"],
         ["--stacks", "a.nii.gz", "--output", "o", "--ckpt", "p.pt", "--no-prior"],
         ["--stacks", "a.nii.gz", "--output", "o", "--resolution", "fine"],
     ],
@@ -114,12 +114,21 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
     assert "usage: g3r-infer" in capsys.readouterr().err
 
 
+def test_an_unknown_preset_is_refused_with_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    from g3r.cli.infer import main
+
+    with pytest.raises(SystemExit):
+        main(["--stacks", "a.nii.gz", "--output", "o", "--preset", "draft"])
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert all(name in line for name in ("'draft'", *PRESETS))
+
+
 def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent\.pt"):
         GaussianReconstructor(tmp_path / "absent.pt")
 
 
-@pytest.mark.parametrize("settings", ["best", replace(PRESETS["draft"], resolution_mm=5.0, use_prior=False)])
+@pytest.mark.parametrize("settings", ["best", replace(PRESETS["preview"], resolution_mm=5.0, use_prior=False)])
 def test_settings_without_meaning_are_refused(settings: ReconstructionSettings | str) -> None:
     with pytest.raises(InputError, match="expected"):
         GaussianReconstructor(settings=settings)

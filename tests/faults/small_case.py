@@ -72,9 +72,9 @@ class SmallCase:
 def make_small_case(folder: Path) -> SmallCase:
     """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
     simulate_small_subject(folder / "stacks", "--seed", "61001")
-    draft = PRESETS["draft"]
+    preview = PRESETS["preview"]
     registration = replace(
-        draft.registration,
+        preview.registration,
         template=False,
         network=False,
         stacks=False,
@@ -82,7 +82,7 @@ def make_small_case(folder: Path) -> SmallCase:
         n_rounds=1,
         standard_orientation=False,
     )  # a fraction of a second; the poses do not matter here
-    settings = replace(draft, registration=registration, resolution_mm=2.0, use_prior=False)
+    settings = replace(preview, registration=registration, resolution_mm=2.0, use_prior=False)
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
     stacks, masks = (tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask"))
     record = RunRecord(

@@ -219,7 +219,7 @@ USAGE = [
     ["--max-memory", "lots"],
     ["--max-memory", "-1G"],
     ["--ckpt", "p.pt", "--no-prior"],
-    ["--preset", "draft", "--time-budget", "9"],
+    ["--preset", "preview", "--time-budget", "9"],
     ["--nonsense"],
 ]
 

@@ -61,7 +61,7 @@ def line(subject: Path, output: Path) -> list[str]:
         "--masks",
         *files[1],
         "--preset",
-        "draft",
+        "preview",
         "--no-prior",
         "--resolution",
         "3",

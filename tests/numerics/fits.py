@@ -29,7 +29,7 @@ NOISE = 0.02
 SCANNER_UNITS = 700.0
 
 SETTINGS = replace(
-    PRESETS["draft"],
+    PRESETS["preview"],
     gaussian_spacing_pixels=2.0,
     registration=RegistrationSettings(
         template=False, network=False, stacks=False, segments=False, n_rounds=2, standard_orientation=False

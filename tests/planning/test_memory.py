@@ -27,7 +27,7 @@ from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
 from g3r.prior.inference import Tiling
 
-DRAFT = replace(PRESETS["draft"], resolution_mm=1.5)
+PREVIEW = replace(PRESETS["preview"], resolution_mm=1.5)
 PROCESS = 500_000_000
 MB = 1_000_000
 
@@ -58,7 +58,7 @@ def arguments(subject: Path, output: Path, *more: str) -> list[str]:
     ]
 
 
-QUIETLY = ("--preset", "draft", "--threads", "1", "--quiet")
+QUIETLY = ("--preset", "preview", "--threads", "1", "--quiet")
 
 
 @pytest.fixture(scope="module")
@@ -100,41 +100,41 @@ def test_sizes_for_people_are_rounded_up() -> None:
 
 def test_more_of_anything_needs_more(slices: Slices) -> None:
     def peak(**changed: object) -> int:
-        return estimate_memory(slices, replace(DRAFT, **changed), 1, PROCESS).peak  # type: ignore[arg-type]
+        return estimate_memory(slices, replace(PREVIEW, **changed), 1, PROCESS).peak  # type: ignore[arg-type]
 
     assert peak(resolution_mm=0.3) > peak(resolution_mm=0.4) > peak()
     assert peak() > peak(use_prior=False) > PROCESS
     few = slices.take(np.arange(0, len(slices), 2))
     assert (
-        estimate_memory(few, DRAFT, 1, PROCESS).stages[Stage.REGISTRATION]
-        < estimate_memory(slices, DRAFT, 1, PROCESS).stages[Stage.REGISTRATION]
+        estimate_memory(few, PREVIEW, 1, PROCESS).stages[Stage.REGISTRATION]
+        < estimate_memory(slices, PREVIEW, 1, PROCESS).stages[Stage.REGISTRATION]
     )
-    threads = [estimate_memory(slices, DRAFT, n, PROCESS).stages[Stage.REGISTRATION] for n in (1, 2, 4, 64)]
+    threads = [estimate_memory(slices, PREVIEW, n, PROCESS).stages[Stage.REGISTRATION] for n in (1, 2, 4, 64)]
     assert threads == sorted(threads)
     assert threads[2] == threads[3]  # scattering takes four at most
 
 
 def test_without_a_limit_nothing_changes(slices: Slices) -> None:
-    plan = plan_memory(slices, DRAFT, None, process_bytes=PROCESS)
-    assert plan.settings == DRAFT
+    plan = plan_memory(slices, PREVIEW, None, process_bytes=PROCESS)
+    assert plan.settings == PREVIEW
     assert (plan.changes, plan.at_once) == ([], False)
-    same = plan_memory(slices, DRAFT, plan.estimate.peak, process_bytes=PROCESS)
-    assert same.settings == DRAFT
+    same = plan_memory(slices, PREVIEW, plan.estimate.peak, process_bytes=PROCESS)
+    assert same.settings == PREVIEW
     assert same.changes == []
 
 
 def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices) -> None:
-    free = plan_memory(slices, DRAFT, None, process_bytes=PROCESS).estimate.peak
+    free = plan_memory(slices, PREVIEW, None, process_bytes=PROCESS).estimate.peak
     refused = []
     for limit in range(free, PROCESS - 10 * MB, -20 * MB):
         try:
-            plan = plan_memory(slices, DRAFT, limit, process_bytes=PROCESS)
+            plan = plan_memory(slices, PREVIEW, limit, process_bytes=PROCESS)
         except InputError as error:
             refused.append(str(error))
             continue
         assert not refused  # less never fits again
         assert plan.estimate.peak <= limit
-        assert plan.settings.resolution_mm == DRAFT.resolution_mm  # nobody asked for another volume
+        assert plan.settings.resolution_mm == PREVIEW.resolution_mm  # nobody asked for another volume
         assert bool(plan.changes) == (limit < free)
         if plan.settings.prior_whole_voxels == 0:
             assert plan.settings.prior_halo_voxels == PLANNED_HALO_VOXELS
@@ -145,7 +145,7 @@ def test_whatever_is_planned_stays_below_the_limit_or_is_refused(slices: Slices)
 
 def test_projections_are_given_up_where_the_fit_needs_most(slices: Slices) -> None:
     """Many Gaussians: their projections take the most."""
-    many = replace(DRAFT, gaussian_spacing_pixels=0.22, use_prior=False)
+    many = replace(PREVIEW, gaussian_spacing_pixels=0.22, use_prior=False)
     free = plan_memory(slices, many, None, process_bytes=PROCESS).estimate
     assert free.stage == "fit to slices"
     plan = plan_memory(slices, many, free.peak - 60 * MB, process_bytes=PROCESS)
@@ -169,8 +169,8 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "of memory" in line]
         return line
 
-    assert stated("--preset", "draft").startswith("needs about 0.")
-    assert "most of it in uncertainty" in stated("--preset", "draft", "--resolution", "0.3")
+    assert stated("--preset", "preview").startswith("needs about 0.")
+    assert "most of it in uncertainty" in stated("--preset", "preview", "--resolution", "0.3")
     # memory for a time budget is planned for the most that it may take
     fine = ("--resolution", "0.3", "--no-prior")
     assert stated("--time-budget", "5", *fine) == stated("--preset", "accurate", *fine)
@@ -244,8 +244,8 @@ def test_a_time_budget_keeps_what_was_planned(slices: Slices) -> None:
         use_prior=False,
         prior_whole_voxels=0,
         prior_tile_voxels=32,
-        prior_stage=replace(DRAFT.prior_stage, projection_bytes=30 * MB),
-        slice_stage=replace(DRAFT.slice_stage, projection_bytes=30 * MB),
+        prior_stage=replace(PREVIEW.prior_stage, projection_bytes=30 * MB),
+        slice_stage=replace(PREVIEW.slice_stage, projection_bytes=30 * MB),
     )
     ones = np.ones(len(slices))
     start = InitialVolumes.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)

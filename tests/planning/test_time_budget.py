@@ -14,7 +14,7 @@ from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_second
 from g3r.reconstruct import GaussianReconstructor
 from g3r.run.deadline import Deadline
 
-SETTINGS = replace(PRESETS["draft"], resolution_mm=1.5, use_prior=False)
+SETTINGS = replace(PRESETS["preview"], resolution_mm=1.5, use_prior=False)
 
 
 class Clock:
@@ -98,7 +98,7 @@ def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list
     record = result.record.time_budget
     assert record is not None
     assert record.seconds == 0.01
-    assert (record.registration, record.fit, record.prior_views) == ("draft", "draft", 1)
+    assert (record.registration, record.fit, record.prior_views) == ("preview", "preview", 1)
     assert len(result.record.loss["fit to slices"]) == 1
 
 

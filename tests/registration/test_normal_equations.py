@@ -1,5 +1,7 @@
 """Gradient and Gauss-Newton matrix of the slice model against finite differences of the voxel operator."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -131,6 +133,33 @@ def test_stride_takes_every_nth_pixel_and_residuals_match() -> None:
     expected = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
     np.testing.assert_allclose(model.residuals(slices.planes, gain), expected[::3], atol=1e-5)
     assert model.evaluate(slices.planes, gain, 1.0).moments[:, 0].sum() == len(expected[::3])
+
+
+def test_losses_are_those_of_the_equations() -> None:
+    slices, gain = make_slices(4)
+    model = SliceModel(slices, smooth_volume(), GRID)
+    expected = model.evaluate(slices.planes, gain, 0.1).loss
+    np.testing.assert_allclose(model.losses(slices.planes, gain, 0.1), expected, rtol=1e-4)
+
+
+def test_equations_of_many_pixels_are_sums_of_those_of_some() -> None:
+    """A slice of more pixels than a run has, and the same slice in two parts."""
+    small, gain = make_slices(6)
+    shape = np.full((4, 2), 40)
+    planes = replace(small.planes, shape=shape, spacing_mm=np.full((4, 2), 0.4))
+    rng = np.random.default_rng(6)
+    value = rng.random(planes.n_pixels).astype(np.float32)
+    chosen = rng.random(planes.n_pixels) < 0.3
+    parts = []
+    for mask in (np.ones(planes.n_pixels, bool), chosen, ~chosen):
+        slices = replace(small, planes=planes, value=value, mask=mask)
+        parts.append(SliceModel(slices, smooth_volume(), GRID).evaluate(planes, gain, 0.1))
+    whole, first, second = parts
+    assert (whole.moments[:, 0] == 1600).all()
+    for name in ("hessian", "gradient", "moments"):
+        np.testing.assert_allclose(
+            getattr(first, name) + getattr(second, name), getattr(whole, name), rtol=1e-9, atol=1e-9
+        )
 
 
 def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero() -> None:

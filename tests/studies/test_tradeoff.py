@@ -38,7 +38,7 @@ def test_convergence_measures_every_way_against_the_best_of_all() -> None:
 
 def test_budgets_mark_what_is_late_or_worse_and_nothing_else() -> None:
     given = [(10, 13.0, 30.0), (20, 24.1, 29.95), (30, 30.0, 29.8)]
-    more = {"case": "one", "registration": "draft", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
+    more = {"case": "one", "registration": "preview", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
     rows = {str(b): {"budget_s": b, "seconds": s, "psnr_db": db, **more} for b, s, db in given}
     text = time_budgets.tables({"rows": rows})["time-budgets"]
     lines = [line for line in text.splitlines() if line.startswith("| one")]
@@ -62,7 +62,7 @@ def test_each_part_of_the_slice_model_is_left_out_once_and_all_of_them_together(
 
 
 def test_memory_is_judged_by_statements_and_limits() -> None:
-    stated = dict.fromkeys(("weeks", "stacks", "threads"), 1) | {"preset": "draft", "more": "", "voxel_mm": 0.5}
+    stated = dict.fromkeys(("weeks", "stacks", "threads"), 1) | {"preset": "preview", "more": "", "voxel_mm": 0.5}
     stated |= {"stage": "prior", "stated_bytes": 1.2e9, "measured_bytes": 1e9}
     limit = {"name": "a", "limit_bytes": 1e9, "stated_bytes": 9e8, "measured_bytes": 9e8, "changes": []}
     limit |= {"cpu_seconds": 9.0, "psnr_db": 28.0}
