@@ -1,13 +1,13 @@
-"""What held-out slices say of the model: how far V_prior improves the volume, and how wide the slice profile is.
+"""What held-out slices say of the model: how wide the slice profile is, and how far V_prior improves the volume.
 
 Every few slices are held out of a short fit in a slab of the head, and predicted by it. The residual of slices that
-are fitted always prefers less prior and a narrower profile; that of slices that are not has a minimum.
+are fitted always prefers a narrower profile and less prior; that of slices that are not has a minimum.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,10 +40,6 @@ wants a wider profile than its inside, and counts for most of the error (docs/me
 MIN_CONTRAST = 0.003
 """Smallest rise of the error within the widths tried by which a width counts as found."""
 
-PRIOR_TRUST = 0.75
-"""Weight of V_prior in the volume over the best one on held-out slices: V_prior was made of all slices, and the short
-fit has fewer of them than the whole one, so both flatter it (docs/method.md)."""
-
 MIN_PIXELS, MIN_HELD_OUT = 100, 3
 """Held-out slices with fewer pixels in the slab do not count; fewer slices say nothing."""
 
@@ -58,12 +54,10 @@ class HeldOutSettings:
     Args:
         slab: share of the head's voxels in the slab.
         n_steps: of each short fit.
-        find_width: whether they are asked for the width of the profile, too, with two more fits.
     """
 
     slab: float = 0.4
     n_steps: int = 25
-    find_width: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,10 +65,11 @@ class HeldOutChoice:
     """What the held-out slices chose.
 
     Attributes:
-        width: of the slice profile over the nominal one; None where it was not asked for or the error has no clear
-            minimum.
-        prior_weight: of V_prior in the volume, from 0 to 1; None where too few slices were held out.
-        error: mean absolute error of held-out pixels by width (that of the model: "usual"), in normalised intensities.
+        width: of the slice profile over the nominal one; None where the error has no clear minimum.
+        prior_weight: of V_prior in the mixture of volumes that predicts them best, from 0 to 1; None where too few
+            slices were held out. V_prior was made of all slices, and the short fit has fewer of them than the whole
+            one: both flatter it, see `prior_weight`.
+        error: mean absolute error of held-out pixels by width, in normalised intensities.
         prior_error: that of V_prior.
         n_slices: that were held out and counted.
     """
@@ -118,21 +113,22 @@ def ask_held_out_slices(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
 ) -> HeldOutChoice:
-    """Weight of the prior, and width of the slice profile if asked, with which held-out slices are predicted best.
+    """Width of the slice profile and weight of the prior with which held-out slices are predicted best.
 
     Args:
         cloud: of stage 1, fitted to V_prior.
         prior: with the posed slices.
         weight: [K] slice weights.
         distillation: whether the fits are held to V_prior.
-        model: of the slices; its widths are replaced by those that are tried, if any are.
+        model: of the slices; its widths are replaced by those that are tried.
         stage: of the fit to the slices, of which these are short ones.
-        settings: how long, and what for.
+        settings: how long.
         rng: draws what the fits draw.
         progress: called with (fits done, fits in all).
     """
     slices = prior.volumes.slices
     held = held_out_rows(slices, weight)
+    single = slices.n_stacks == 1
     axis, low, high = _slab(prior, settings.slab)
     target = _target(prior, axis, low, high) if distillation else None
     mean_mm = cloud.mean_mm.numpy()[:, axis] + cloud.origin_mm[axis]
@@ -141,51 +137,36 @@ def ask_held_out_slices(
     in_slab = (place > low) & (place < high)
     short = replace(stage, n_steps=settings.n_steps, optimise_poses=False)
 
-    def predict(width: float | None) -> Prediction | None:
+    def predict(width: float) -> Prediction | None:
         whole = slice_target(prior, weight, model.of_width(width))
         seen = replace(whole.slices, mask=slices.mask & in_slab)
         sliced = SliceTarget(seen, whole.pixel_weight * in_slab)
         return _predict(part, sliced, prior.gain, weight, held, target, short, rng)
 
-    # between slices of a single stack a narrow profile and a smooth volume look alike
-    find_width = settings.find_width and slices.n_stacks > 1
-    n_fits = 3 if find_width else 1
-    progress(0, n_fits)
-    first = predict(WIDTHS[0] if find_width else None)
-    if first is None:
-        return HeldOutChoice(error={})
-    progress(1, n_fits)
-    if not find_width:
-        return _choice({"usual": first.error()}, first)
-    found = {WIDTHS[0]: first}
-    for number in (2, 3):
-        width = _next_width(found)
+    found: dict[float, Prediction] = {}
+    progress(0, 3)
+    for width in WIDTHS:
         predicted = predict(width)
-        assert predicted is not None  # the same pixels
+        if predicted is None:
+            return HeldOutChoice(error={})
         found[width] = predicted
-        progress(number, n_fits)
+        progress(len(found), 3)
+    narrower = found[WIDTHS[0]].error() < found[WIDTHS[1]].error()
+    third = WIDTHS[0] / STEP if narrower else WIDTHS[1] * STEP
+    last = predict(third)
+    assert last is not None  # the same pixels
+    found[third] = last
+    progress(3, 3)
     error = {width: found[width].error() for width in sorted(found)}
     best = found[min(error, key=lambda width: error[width])]
-    choice = _choice({f"{width:.3g}": value for width, value in error.items()}, best)
-    return replace(choice, width=_minimum(error))
-
-
-def _choice(error: dict[str, float], best: Prediction) -> HeldOutChoice:
-    """The weight of V_prior that a prediction asks for."""
     return HeldOutChoice(
-        prior_weight=PRIOR_TRUST * _best_weight(best),
-        error=error,
+        # between slices of a single stack a narrow profile and a smooth volume look alike
+        width=None if single else _minimum(error),
+        prior_weight=_best_weight(best),
+        error={f"{width:.3g}": value for width, value in error.items()},
         prior_error=best.error(1.0),
         n_slices=int(best.slice_number.max()) + 1,
     )
-
-
-def _next_width(found: Mapping[float, Prediction]) -> float:
-    """The second of `WIDTHS`, then one beyond the better of both."""
-    if len(found) == 1:
-        return WIDTHS[1]
-    narrower = found[WIDTHS[0]].error() < found[WIDTHS[1]].error()
-    return WIDTHS[0] / STEP if narrower else WIDTHS[1] * STEP
 
 
 def held_out_rows(slices: Slices, weight: NDArray[np.float64]) -> NDArray[np.bool_]:

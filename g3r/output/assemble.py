@@ -21,6 +21,7 @@ from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
+from g3r.fitting.prior_weight import prior_weight
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
@@ -46,8 +47,7 @@ LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
 RIM_MM = 1.6
-"""How far beyond the support V_prior is shown, which is soft there: a brain that ends on whole voxels, where masks end,
-has a fifth of its squared error in that edge."""
+"""How far beyond the support V_prior is shown: where the brain ends on whole voxels, a fifth of the error is there."""
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 
@@ -101,7 +101,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     with run.clock(Stage.VOLUME):
         mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
-        left_to_prior = _left_to_prior(density, _prior_weight(found, settings))
+        least = _prior_weight(found, fit, float(mask.sum()) * grid.voxel_volume_mm3, settings)
+        left_to_prior = _left_to_prior(density, least)
         shown = support | (settings.use_prior & _margin(support, RIM_MM, grid))
         volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
@@ -173,7 +174,11 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         ncc=found.registration.ncc,
         uncertainty=uncertainty,
         prior_share=prior_share,
-        record=replace(_record(found, fit, qualities, plan, run, uncertainty_record), unseen=unseen_part),
+        record=replace(
+            _record(found, fit, qualities, plan, run, uncertainty_record),
+            unseen=unseen_part,
+            prior_weight=round(least, 3),
+        ),
     )
 
 
@@ -208,12 +213,12 @@ def _no_fit(found: StageResults) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 
 
-def _prior_weight(found: StageResults, settings: ReconstructionSettings) -> float:
-    """Least weight of V_prior in the volume: as held-out slices have it, else as set; 0 without a prior."""
+def _prior_weight(found: StageResults, fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings) -> float:
+    """Least weight of V_prior in the volume; 0 without a prior."""
     if not settings.use_prior:
         return 0.0
-    chosen = found.held_out.prior_weight if found.held_out else None
-    return settings.prior_weight if chosen is None else chosen
+    held_out = found.held_out.prior_weight if found.held_out else None
+    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3, held_out)
 
 
 def _left_to_prior(density: NDArray[np.float32], least: float) -> NDArray[np.float32]:

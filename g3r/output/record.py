@@ -140,6 +140,7 @@ class RunRecord:
         common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
         pose_rounds: what rounds of poses and volume did; None where there was none.
         held_out: what held-out slices chose; None where they were not asked.
+        prior_weight: least weight of V_prior in the volume.
         gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
@@ -165,6 +166,7 @@ class RunRecord:
     n_gaussians: int = 0
     pose_rounds: PoseRounds | None = None
     held_out: HeldOutChoice | None = None
+    prior_weight: float = 0.0
     gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)

@@ -31,9 +31,9 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
-        held_out: how held-out slices are asked for the weight of the prior and the width of the profile; None takes
-            `prior_weight` and what `slice_model` says.
-        prior_weight: least weight of V_prior in the volume, where held-out slices do not choose it.
+        held_out: how held-out slices are asked for the width of the profile and the weight of the prior; None takes
+            those of `slice_model` and `prior_weight`.
+        prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
@@ -53,7 +53,7 @@ class ReconstructionSettings:
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_model: SliceModel = field(default_factory=SliceModel)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
-    held_out: HeldOutSettings | None = field(default_factory=HeldOutSettings)
+    held_out: HeldOutSettings | None = None
     prior_weight: float = 0.3
     prior_views: int = 2
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
@@ -97,7 +97,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=2.85,
         max_gaussian_spacing_mm=4.0,
         pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
-        held_out=None,
+        prior_weight=0.45,
         prior_views=1,
         share_probes=1,
         registration=replace(
@@ -126,7 +126,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=3),
-        held_out=HeldOutSettings(find_width=True),
+        held_out=HeldOutSettings(),
         prior_views=8,
         prior_stage=replace(_BALANCED.prior_stage, n_steps=40),
     ),
@@ -152,8 +152,6 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
         settings: as requested.
         n_stacks: with slices.
     """
-    if settings.held_out and not (settings.use_prior or settings.held_out.find_width):
-        settings = replace(settings, held_out=None)  # they would choose nothing
     stage = settings.slice_stage
     if n_stacks == 1:
         # registered to a volume made of themselves, slices of a single stack drift; the prior holds them

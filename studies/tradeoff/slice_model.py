@@ -19,7 +19,7 @@ WITHOUT: dict[str, Mapping[str, Any]] = {
     "common bias field": {"common_bias_field": False},
     "surroundings": {"slice_model.surroundings": False},
     "narrower profile": {"slice_model.through_plane": 1.0, "slice_model.in_plane": 1.0},
-    "prior in the volume": {"prior_weight": 0.0, "held_out": None},
+    "prior in the volume": {"prior_weight": 0.0},
 }
 """The parts, and the settings that leave each out."""
 

@@ -1,0 +1,41 @@
+"""How much of V_prior is in the written volume where slices are dense."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+
+SINGLE_STACK_WEIGHT = 0.75
+"""Of V_prior with one stack, whose poses nothing but V_prior checks."""
+
+MAX_WEIGHT = 0.75
+"""However large the pixels are."""
+
+
+def prior_weight(
+    at_one_pixel: float, slices: Slices, weight: NDArray[np.float64], brain_mm3: float, held_out: float | None = None
+) -> float:
+    """Least weight of V_prior in the volume, from 0 to 1.
+
+    Noise of the fit and errors of the network are different, so a mixture beats both. The fewer pixels there are for a
+    volume, the less they determine it and the better V_prior is beside them; the weight that was best in simulated
+    subjects falls with the root of their number (docs/method.md).
+
+    Args:
+        at_one_pixel: weight with one pixel per mm3; 0 leaves V_prior out.
+        slices: with the pixels that were fitted.
+        weight: [K] slice weights.
+        brain_mm3: volume of the brain.
+        held_out: weight that predicts held-out slices best, where they were asked.
+    """
+    if slices.n_stacks == 1:
+        return SINGLE_STACK_WEIGHT if at_one_pixel > 0 else 0.0
+    pixels_per_mm3 = float(weight[slices.pixel_plane].sum()) / brain_mm3
+    expected = at_one_pixel / math.sqrt(pixels_per_mm3)
+    # two estimates that know little of each other
+    found = expected if held_out is None else math.sqrt(expected * held_out)
+    return min(found, MAX_WEIGHT)
