@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
-RIM_MM = 1.6
+RIM_MM = 0.8
 """How far beyond the support V_prior is shown: where the brain ends on whole voxels, a fifth of the error is there."""
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
