@@ -46,9 +46,6 @@ logger = logging.getLogger(__name__)
 LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
-RIM_MM = 0.8
-"""How far beyond the support V_prior is shown: where the brain ends on whole voxels, a fifth of the error is there."""
-
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 
 
@@ -103,7 +100,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
         least = _prior_weight(found, fit, float(mask.sum()) * grid.voxel_volume_mm3, settings)
         left_to_prior = _left_to_prior(density, least)
-        shown = support | (settings.use_prior & _margin(support, RIM_MM, grid))
+        shown = support | (settings.use_prior & _margin(support, settings.prior_rim_mm, grid))
         volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
         unseen = mask & (density < UNSEEN_BELOW)
         unseen_part = UnseenPart.of(

@@ -34,6 +34,7 @@ class ReconstructionSettings:
         held_out: how held-out slices are asked for the width of the profile and the weight of the prior; None takes
             those of `slice_model` and `prior_weight`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
+        prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
@@ -55,6 +56,7 @@ class ReconstructionSettings:
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
     held_out: HeldOutSettings | None = None
     prior_weight: float = 0.3
+    prior_rim_mm: float = 0.8
     prior_views: int = 2
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels

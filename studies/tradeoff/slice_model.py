@@ -20,6 +20,7 @@ WITHOUT: dict[str, Mapping[str, Any]] = {
     "surroundings": {"slice_model.surroundings": False},
     "narrower profile": {"slice_model.through_plane": 1.0, "slice_model.in_plane": 1.0},
     "prior in the volume": {"prior_weight": 0.0},
+    "prior at the rim": {"prior_rim_mm": 0.0},
 }
 """The parts, and the settings that leave each out."""
 
