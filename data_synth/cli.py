@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--thickness", type=float, default=2.2, help="slice thickness, mm")
     parser.add_argument("--gap", type=float, default=0.0, help="between slices, mm")
     parser.add_argument("--motion", default="moderate", choices=["none", "mild", "moderate", "severe"])
-    parser.add_argument("--profile", default="box", choices=["box", "gaussian"], help="through the slice")
+    parser.add_argument("--profile", default="box", choices=["box", "gaussian", "sinc"], help="through the slice")
     parser.add_argument("--snr", type=float, default=25.0, help="mid-grey over noise; inf for no noise")
     parser.add_argument("--bias", type=float, default=0.05, help="in-plane inhomogeneity; 0 for none")
     parser.add_argument("--gain", type=float, default=0.05, help="deviation of the slices' log intensity")

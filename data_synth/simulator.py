@@ -53,7 +53,8 @@ class StackSettings:
         motion: how much the head moves.
         interleave: 1 sequential, 2 every other slice first, 3 every third.
         oblique_deg: standard deviation per axis of a tilt of the slices, known to the header.
-        profile: `box` with soft edges through the slice (what scanners aim for) or `gaussian` (the model's).
+        profile: through the slice, `box` with soft edges (what scanners aim for), `gaussian` (the model's) or `sinc`
+            (of a short pulse).
         snr: the 99.5th percentile in the mask is 2 snr noise deviations; infinity for none.
         bias: strength of the smooth in-plane inhomogeneity; 0 for none.
         gain_deviation: standard deviation of the slices' log gains.

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import sici
 
 from g3r.acquisition.planes import Planes
 from g3r.acquisition.psf import psf_variance_mm2
@@ -17,7 +18,13 @@ from g3r.acquisition.voxel_operator import VoxelOperator, psf_nodes
 from g3r.geometry import VolumeGrid
 
 Array = NDArray[np.float64]
-Profile = Literal["box", "gaussian"]
+Profile = Literal["box", "gaussian", "sinc"]
+
+SINC_LOBES = 2
+"""Zero crossings on either side of the truncated sinc of the `sinc` profile's pulse."""
+
+SINC_REACH = 1.5
+"""Where the ripples of the `sinc` profile are cut off, in thicknesses from the centre of the slice."""
 
 TRILINEAR_VARIANCE = 1.0 / 6.0
 """Variance that trilinear reading adds on average, in squared voxels: the mean of f (1 - f) over a voxel."""
@@ -56,7 +63,8 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
     Args:
         resolution_mm: in-plane pixel spacing.
         thickness_mm: slice thickness.
-        profile: `gaussian` has the variance of the model's PSF; `box` is flat with soft edges.
+        profile: `gaussian` has the variance of the model's PSF; `box` is flat with soft edges; `sinc` is that of a
+            truncated sinc pulse, steep with ripples.
         voxel_mm: voxel size of the volume that is read.
 
     Returns:
@@ -72,12 +80,22 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
         n = 3 if axis < 2 else 2 * int(np.ceil(reach / max(0.6, voxel_mm) / 2)) + 1
         if axis == 2 and profile == "box":
             nodes, weights, variance = _soft_box(n, thickness_mm)
+        elif axis == 2 and profile == "sinc":
+            nodes, weights, variance = _truncated_sinc(4 * n + 1, thickness_mm)
         else:
             nodes, weights = psf_nodes(n)
             variance = float(target[axis])
         axes.append((nodes * np.sqrt(max(variance - blur_mm2, 0.0)), weights))
     grid = np.stack(np.meshgrid(*[a[0] for a in axes], indexing="ij"), -1).reshape(-1, 3)
     return grid, np.einsum("i,j,k->ijk", *[a[1] for a in axes]).ravel()
+
+
+def profile_deviation(profile: Profile) -> float:
+    """Standard deviation of a profile through the slice, over the thickness."""
+    if profile == "gaussian":
+        return float(np.sqrt(psf_variance_mm2([1.0, 1.0], 1.0)[2]))
+    shape = _soft_box if profile == "box" else _truncated_sinc
+    return float(np.sqrt(shape(301, 1.0)[2]))
 
 
 def _soft_box(n: int, thickness_mm: float) -> tuple[Array, Array, float]:
@@ -91,3 +109,19 @@ def _soft_box(n: int, thickness_mm: float) -> tuple[Array, Array, float]:
     weights = np.clip((0.6 - np.abs(nodes)) / 0.2, 0.0, 1.0)
     weights /= weights.sum()
     return nodes / np.sqrt((weights * nodes**2).sum()), weights, thickness_mm**2 * (1 + 0.2**2) / 12
+
+
+def _truncated_sinc(n: int, thickness_mm: float) -> tuple[Array, Array, float]:
+    """The profile of a pulse that is a sinc cut off after `SINC_LOBES` zeros, for small flip angles.
+
+    Returns:
+        n nodes scaled to unit variance, their weights (those of ripples may be negative), and the variance in mm^2.
+
+    Source: the profile is the Fourier transform of the pulse (Pauly et al., Journal of Magnetic Resonance 81, 1989);
+        that of a truncated sinc is a difference of two sine integrals.
+    """
+    nodes = np.linspace(-SINC_REACH, SINC_REACH, n + 2)[1:-1]
+    rising, falling = (sici(2 * np.pi * SINC_LOBES * (nodes + side))[0] for side in (0.5, -0.5))
+    weights = (rising - falling) / (rising - falling).sum()
+    variance = float((weights * nodes**2).sum())
+    return nodes / np.sqrt(variance), weights, variance * thickness_mm**2

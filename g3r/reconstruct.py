@@ -274,10 +274,10 @@ class GaussianReconstructor:
         if cloud is None:
             return None
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
-        model = settings.slice_model.of_width(held_out.width if held_out else None)
+        widths = held_out.widths if held_out else None
 
         def fit() -> SliceFit:
-            target = slice_target(prior, poses.weight, model)
+            target = slice_target(prior, poses.weight, settings.slice_model, widths)
             return fit_slices(
                 cloud.cloud,
                 target.slices,

@@ -16,9 +16,7 @@ MAX_WEIGHT = 0.75
 """However large the pixels are."""
 
 
-def prior_weight(
-    at_one_pixel: float, slices: Slices, weight: NDArray[np.float64], brain_mm3: float, held_out: float | None = None
-) -> float:
+def prior_weight(at_one_pixel: float, slices: Slices, weight: NDArray[np.float64], brain_mm3: float) -> float:
     """Least weight of V_prior in the volume, from 0 to 1.
 
     Noise of the fit and errors of the network are different, so a mixture beats both. The fewer pixels there are for a
@@ -30,12 +28,8 @@ def prior_weight(
         slices: with the pixels that were fitted.
         weight: [K] slice weights.
         brain_mm3: volume of the brain.
-        held_out: weight that predicts held-out slices best, where they were asked.
     """
     if slices.n_stacks == 1:
         return SINGLE_STACK_WEIGHT if at_one_pixel > 0 else 0.0
     pixels_per_mm3 = float(weight[slices.pixel_plane].sum()) / brain_mm3
-    expected = at_one_pixel / math.sqrt(pixels_per_mm3)
-    # two estimates that know little of each other
-    found = expected if held_out is None else math.sqrt(expected * held_out)
-    return min(found, MAX_WEIGHT)
+    return min(at_one_pixel / math.sqrt(pixels_per_mm3), MAX_WEIGHT)

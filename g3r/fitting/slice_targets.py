@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +22,9 @@ class SliceModel:
         surroundings: whether what lies beside the brain is taken out of the pixels of its rim.
     """
 
-    through_plane: float = 0.9
-    in_plane: float = 0.9
+    through_plane: float = 0.95
+    in_plane: float = 1.0
     surroundings: bool = True
-
-    def of_width(self, width: float | None) -> SliceModel:
-        """The same with both widths as given; unchanged for None."""
-        return self if width is None else replace(self, through_plane=width, in_plane=width)
 
 
 @dataclass(frozen=True)
@@ -38,17 +35,23 @@ class SliceTarget:
     pixel_weight: NDArray[np.float32]
 
 
-def slice_target(prior: PriorVolume, weight: NDArray[np.float64], model: SliceModel) -> SliceTarget:
+def slice_target(
+    prior: PriorVolume, weight: NDArray[np.float64], model: SliceModel, widths: Sequence[float] | None = None
+) -> SliceTarget:
     """The posed slices under a slice model.
 
     Args:
         prior: with the slices and the support of the volume.
         weight: [K] slice weights.
         model: of the slices.
+        widths: of each stack's profile through the plane, where the data say them, in place of the model's.
     """
     slices = prior.volumes.slices
-    factor = np.array([model.in_plane, model.in_plane, model.through_plane])
-    slices = replace(slices, planes=replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * factor**2))
+    _, stack = np.unique(slices.stack_id, return_inverse=True)
+    through = np.broadcast_to(model.through_plane if widths is None else np.asarray(widths), slices.n_stacks)[stack]
+    in_plane = np.full(len(slices), model.in_plane)
+    variance = slices.planes.psf_var_mm2 * np.stack([in_plane, in_plane, through], axis=1) ** 2
+    slices = replace(slices, planes=replace(slices.planes, psf_var_mm2=variance))
     if not model.surroundings:
         return SliceTarget(slices, slices.mask.astype(np.float32))
     slices, share = without_surroundings(slices, prior.support, prior.volumes.grid, prior.gain, weight)

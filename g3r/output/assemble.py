@@ -98,7 +98,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     with run.clock(Stage.VOLUME):
         mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
-        least = _prior_weight(found, fit, float(mask.sum()) * grid.voxel_volume_mm3, settings)
+        least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings)
         left_to_prior = _left_to_prior(density, least)
         shown = support | (settings.use_prior & _margin(support, settings.prior_rim_mm, grid))
         volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
@@ -210,12 +210,11 @@ def _no_fit(found: StageResults) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 
 
-def _prior_weight(found: StageResults, fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings) -> float:
+def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings) -> float:
     """Least weight of V_prior in the volume; 0 without a prior."""
     if not settings.use_prior:
         return 0.0
-    held_out = found.held_out.prior_weight if found.held_out else None
-    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3, held_out)
+    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
 
 
 def _left_to_prior(density: NDArray[np.float32], least: float) -> NDArray[np.float32]:

@@ -31,8 +31,7 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
-        held_out: how held-out slices are asked for the width of the profile and the weight of the prior; None takes
-            those of `slice_model` and `prior_weight`.
+        held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
@@ -54,7 +53,7 @@ class ReconstructionSettings:
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_model: SliceModel = field(default_factory=SliceModel)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
-    held_out: HeldOutSettings | None = None
+    held_out: HeldOutSettings | None = field(default_factory=HeldOutSettings)
     prior_weight: float = 0.3
     prior_rim_mm: float = 0.8
     prior_views: int = 2
@@ -99,6 +98,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         gaussian_spacing_pixels=2.85,
         max_gaussian_spacing_mm=4.0,
         pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
+        held_out=None,
         prior_weight=0.45,
         prior_views=1,
         share_probes=1,
@@ -119,6 +119,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "fast": replace(
         _BALANCED,
         pose_rounds=PoseRoundSettings(two_stacks=1, more_stacks=0),
+        held_out=None,
         prior_views=1,
         registration=replace(_BALANCED.registration, n_candidates=2500, attempts=1, n_rounds=9, finest_voxel_mm=1.4),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
@@ -128,7 +129,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=3),
-        held_out=HeldOutSettings(),
+        held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
         prior_stage=replace(_BALANCED.prior_stage, n_steps=40),
     ),
@@ -160,6 +161,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
         held = settings.use_prior and settings.distillation and settings.registration.segments
         return replace(
             settings,
+            held_out=None,  # a narrow profile and a smooth volume look alike
             pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
             slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
         )

@@ -92,7 +92,8 @@ def refine_slices(
             }
         )
         logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
-    progress(settings.n_rounds, settings.n_rounds)
+    n_rounds = max(settings.n_rounds, 1)  # a single stack has none, and is done
+    progress(n_rounds, n_rounds)
     ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm)
     return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
 

@@ -18,7 +18,7 @@ from studies.tables import Cell, table
 WITHOUT: dict[str, Mapping[str, Any]] = {
     "common bias field": {"common_bias_field": False},
     "surroundings": {"slice_model.surroundings": False},
-    "narrower profile": {"slice_model.through_plane": 1.0, "slice_model.in_plane": 1.0},
+    "measured profile": {"held_out": None, "slice_model.through_plane": 1.0},
     "prior in the volume": {"prior_weight": 0.0},
     "prior at the rim": {"prior_rim_mm": 0.0},
 }

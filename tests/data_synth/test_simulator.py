@@ -1,7 +1,6 @@
 """Slices against volumes whose slices are known in closed form, and poses against sampling."""
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from data_synth.atlas import TruthVolume
 from data_synth.motion import LEVELS, MotionLevel
 from data_synth.simulator import SimulatedStack, StackSettings, orthogonal_settings, simulate_stacks
+from data_synth.slice_profile import Profile
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.slicing import slices_from_stacks
@@ -38,8 +38,8 @@ def deep(one: SimulatedStack, radius_mm: float = 15.0) -> np.ndarray:
     return np.linalg.norm(true_points_mm(one) - GRID.center_mm, axis=-1) < radius_mm
 
 
-@pytest.mark.parametrize("profile", ["box", "gaussian"])
-def test_a_ramp_is_seen_as_it_is(profile: Literal["box", "gaussian"]) -> None:
+@pytest.mark.parametrize("profile", ["box", "gaussian", "sinc"])
+def test_a_ramp_is_seen_as_it_is(profile: Profile) -> None:
     # any symmetric profile of unit integral leaves a linear function unchanged
     slope = np.array([3.0, -2.0, 5.0])
     volume = (500 + (WORLD - GRID.center_mm) @ slope).astype(np.float32)
@@ -54,11 +54,9 @@ def test_a_ramp_is_seen_as_it_is(profile: Literal["box", "gaussian"]) -> None:
         np.testing.assert_allclose(one.stack.image[inside], expected[inside], atol=2e-3)
 
 
-@pytest.mark.parametrize("profile", ["box", "gaussian"])
+@pytest.mark.parametrize("profile", ["box", "gaussian", "sinc"])
 @pytest.mark.parametrize("thickness_mm", [2.2, 4.0])
-def test_a_blob_keeps_its_integral_and_widens_by_the_profile(
-    profile: Literal["box", "gaussian"], thickness_mm: float
-) -> None:
+def test_a_blob_keeps_its_integral_and_widens_by_the_profile(profile: Profile, thickness_mm: float) -> None:
     sigma_mm = 4.5
     offset = WORLD - GRID.center_mm
     volume = (1000 * np.exp(-0.5 * (offset**2).sum(-1) / sigma_mm**2)).astype(np.float32)
@@ -67,6 +65,8 @@ def test_a_blob_keeps_its_integral_and_widens_by_the_profile(
     variance = psf_variance_mm2([1.1, 1.1], thickness_mm)
     if profile == "box":
         variance[2] = thickness_mm**2 * (1 + 0.2**2) / 12
+    elif profile == "sinc":
+        variance[2] = (0.287 * thickness_mm) ** 2
     observed = sigma_mm**2 + variance
     d = np.einsum("ijkw,kwf->ijkf", true_points_mm(one) - GRID.center_mm, one.true_pose.rotation)  # axial frame
     expected = 1000 * np.sqrt(sigma_mm**6 / observed.prod()) * np.exp(-0.5 * (d**2 / observed).sum(-1))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -24,11 +22,6 @@ def test_it_falls_with_the_root_of_the_pixels() -> None:
 def test_distrusted_slices_count_for_less() -> None:
     doubtful = 0.25 * ONES
     assert prior_weight(0.3, SLICES, doubtful, float(N_PIXELS)) == pytest.approx(0.6)
-
-
-def test_held_out_slices_have_half_the_say() -> None:
-    assert prior_weight(0.2, SLICES, ONES, float(N_PIXELS), held_out=0.45) == pytest.approx(math.sqrt(0.09))
-    assert prior_weight(0.2, SLICES, ONES, float(N_PIXELS), held_out=0.0) == 0
 
 
 def test_it_has_a_bound_and_one_stack_a_weight_of_its_own() -> None:

@@ -1,0 +1,95 @@
+"""Slices that were held out of a short fit, how well it predicts them, and which of the stacks are wider or narrower.
+
+The cloud was fitted with one width for all stacks. If the slices of one stack are narrower than that, and the others
+are not, the cloud is as sharp as the others say, and slices of this stack are predicted best with a narrower profile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.gaussians import GaussianCloud, render
+
+STRETCHES = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)
+"""Widths over that of the fit with which held-out slices are rendered."""
+
+MIN_CONTRAST = 0.003
+"""Smallest rise of the error within the widths tried by which a width counts as found."""
+
+MIN_HELD_OUT = 3
+"""Fewer held-out slices say nothing."""
+
+
+@dataclass(frozen=True)
+class HeldOutFit:
+    """A short fit and the slices that were held out of it.
+
+    Attributes:
+        cloud: that was fitted.
+        slices: that were held out, with the profile of the fit.
+        share: [P'] of brain in their masked pixels.
+    """
+
+    cloud: GaussianCloud
+    slices: Slices
+    share: NDArray[np.float32]
+
+    def errors(self, stretch: float = 1.0) -> NDArray[np.float64]:
+        """[P'] absolute errors of masked pixels after one gain a slice, in the units of what was measured.
+
+        Args:
+            stretch: width of the slice profile, through the plane, over the one of the fit.
+        """
+        index = self.slices.pixel_index
+        planes = self.slices.planes
+        number = planes.plane_id()[index]
+        planes = replace(planes, psf_var_mm2=planes.psf_var_mm2 * np.array([1, 1, stretch**2]))
+        predicted, measured = render(self.cloud, planes).numpy()[index], self.slices.value[index]
+        across = np.bincount(number, self.share * predicted * measured)
+        own = np.bincount(number, self.share * predicted * predicted)
+        gain = np.divide(across, own, out=np.ones_like(own), where=own > 0)
+        # the share takes back what the pixel was divided by where its surroundings were taken out
+        off: NDArray[np.float64] = self.share * np.abs(gain[number] * predicted - measured)
+        return off
+
+    def relative_widths(self) -> NDArray[np.float64]:
+        """Width of each stack's profile, through the plane, over that of the fit; their geometric mean is 1.
+
+        1 for all where one of the stacks has too few held-out slices, or no clear minimum.
+        """
+        _, stack = np.unique(self.slices.stack_id, return_inverse=True)
+        n_stacks = int(stack.max()) + 1
+        unknown = np.ones(n_stacks)
+        if n_stacks == 1 or np.bincount(stack).min() < MIN_HELD_OUT:
+            return unknown
+        stack_of_pixel = stack[self.slices.pixel_plane]
+        pixels = np.bincount(stack_of_pixel)
+        error = [np.bincount(stack_of_pixel, self.errors(stretch)) / pixels for stretch in STRETCHES]
+        found = [lowest(STRETCHES, of_stack) for of_stack in np.array(error).T]
+        widths = np.array([width for width in found if width is not None])
+        return widths / np.exp(np.log(widths).mean()) if len(widths) == n_stacks else unknown
+
+
+def lowest(widths: Sequence[float], error: Sequence[float] | NDArray[np.float64]) -> float | None:
+    """Width of the lowest error, by a parabola over the logarithm through its neighbours; None where all are alike.
+
+    Args:
+        widths: three or more, rising.
+        error: of each.
+    """
+    if not max(error) > (1 + MIN_CONTRAST) * min(error):
+        return None
+    best = int(np.argmin(error))
+    middle = min(max(best, 1), len(widths) - 2)
+    three = slice(middle - 1, middle + 2)
+    curvature, slope, _ = np.polyfit(np.log(widths[three]), error[three], 2)
+    if curvature <= 0:
+        return float(widths[best])
+    half_step = math.sqrt(widths[1] / widths[0])
+    return min(max(math.exp(-slope / (2 * curvature)), widths[0] / half_step), widths[-1] * half_step)
