@@ -169,7 +169,7 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "of memory" in line]
         return line
 
-    assert stated("--preset", "preview").startswith("needs about 0.")
+    assert stated("--preset", "preview").startswith("needs about 1.")
     assert "most of it in uncertainty" in stated("--preset", "preview", "--resolution", "0.3")
     # memory for a time budget is planned for the most that it may take
     fine = ("--resolution", "0.3", "--no-prior")
