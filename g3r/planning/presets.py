@@ -128,10 +128,10 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(
         _BALANCED,
-        pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=3),
+        # three stacks have found their poses after one round
+        pose_rounds=PoseRoundSettings(two_stacks=4),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
-        prior_stage=replace(_BALANCED.prior_stage, n_steps=40),
     ),
 }
 """Settings by name, from quick to careful."""
