@@ -15,6 +15,9 @@ SINGLE_STACK_WEIGHT = 0.75
 MAX_WEIGHT = 0.75
 """However large the pixels are."""
 
+FEWEST_STEPS = 8
+"""After fewer steps of the fit, where time or the user ended it, V_prior alone is better than any mixture."""
+
 
 def prior_weight(at_one_pixel: float, slices: Slices, weight: NDArray[np.float64], brain_mm3: float) -> float:
     """Least weight of V_prior in the volume, from 0 to 1.
@@ -33,3 +36,13 @@ def prior_weight(at_one_pixel: float, slices: Slices, weight: NDArray[np.float64
         return SINGLE_STACK_WEIGHT if at_one_pixel > 0 else 0.0
     pixels_per_mm3 = float(weight[slices.pixel_plane].sum()) / brain_mm3
     return min(at_one_pixel / math.sqrt(pixels_per_mm3), MAX_WEIGHT)
+
+
+def ended_early(n_steps: int, n_asked: int) -> bool:
+    """Whether a fit made too few of its steps for its Gaussians to be shown.
+
+    Args:
+        n_steps: made.
+        n_asked: by the settings; a fit that is meant to be shorter than `FEWEST_STEPS` is shown.
+    """
+    return n_steps < min(FEWEST_STEPS, n_asked)

@@ -21,7 +21,7 @@ from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_weight import prior_weight
+from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
@@ -98,7 +98,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     with run.clock(Stage.VOLUME):
         mask, support = _masks_on(grid, found.prior, fit)
         density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
-        least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings)
+        least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
         left_to_prior = _left_to_prior(density, least)
         shown = support | (settings.use_prior & _margin(support, settings.prior_rim_mm, grid))
         volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
@@ -210,10 +210,13 @@ def _no_fit(found: StageResults) -> SliceFit:
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 
 
-def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings) -> float:
-    """Least weight of V_prior in the volume; 0 without a prior."""
+def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:
+    """Least weight of V_prior in the volume; 0 without a prior, 1 where the fit had no time."""
     if not settings.use_prior:
         return 0.0
+    if settings.prior_weight > 0 and ended_early(n_steps := len(fit.history), settings.slice_stage.n_steps):
+        run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
+        return 1.0
     return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
 
 

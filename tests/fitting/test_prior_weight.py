@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.fitting.prior_weight import MAX_WEIGHT, SINGLE_STACK_WEIGHT, prior_weight
+from g3r.fitting.prior_weight import FEWEST_STEPS, MAX_WEIGHT, SINGLE_STACK_WEIGHT, ended_early, prior_weight
 from tests.fitting.scene import make_slices
 
 SLICES = make_slices()
@@ -29,3 +29,9 @@ def test_it_has_a_bound_and_one_stack_a_weight_of_its_own() -> None:
     one = SLICES.take(SLICES.stack_id == SLICES.stack_id[0])
     assert prior_weight(0.3, one, ONES[: len(one)], 1.0) == SINGLE_STACK_WEIGHT
     assert prior_weight(0.0, one, ONES[: len(one)], 1.0) == 0
+
+
+def test_a_fit_that_was_meant_to_be_short_has_not_ended_early() -> None:
+    assert ended_early(FEWEST_STEPS - 1, 80)
+    assert not ended_early(FEWEST_STEPS, 80)
+    assert not ended_early(1, 1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from g3r.acquisition.stacks import Stack, load_stack
+from g3r.geometry.grid import on_grid
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
@@ -100,6 +101,17 @@ def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list
     assert record.seconds == 0.01
     assert (record.registration, record.fit, record.prior_views) == ("preview", "preview", 1)
     assert len(result.record.loss["fit to slices"]) == 1
+
+
+def test_a_fit_without_time_is_not_shown_but_the_prior_volume_is(stacks: list[Stack]) -> None:
+    settings = replace(SETTINGS, use_prior=True)
+    result = GaussianReconstructor(settings=settings).reconstruct(stacks, plan=TimeBudget.of(settings, 0.01))
+    assert result.record.prior_weight == 1
+    assert any("prior volume alone" in note for note in result.record.notes)
+    assert result.prior_share is not None
+    assert result.prior_share[result.mask].min() == 1
+    prior = on_grid(result.prior, result.prior_grid, result.grid, outside=0.0)
+    np.testing.assert_allclose(result.volume[result.mask], prior[result.mask], rtol=1e-5)
 
 
 def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
