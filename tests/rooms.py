@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "acquisition": "geometry run",
     "checkpoints": "run",
     "gaussians": "geometry run acquisition",
+    "masking": "acquisition",
     "prior": "geometry acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
     "registration": "geometry run acquisition",
@@ -33,7 +34,7 @@ MAY_IMPORT = {
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
-    "cli": "run acquisition checkpoints prior pose_network training planning evaluation output reconstruct",
+    "cli": "run acquisition checkpoints masking prior pose_network training planning evaluation output reconstruct",
 }
 """From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.images import load_mask, load_volume
+from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
+from g3r.acquisition.images import Volume, load_mask, load_volume
 from g3r.acquisition.psf import IN_PLANE_FWHM_RANGE_PIXELS, THICKNESS_RANGE_MM
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.errors import InputError
@@ -32,6 +33,9 @@ INTENSITY_RANGE = (1e-30, 1e30)
 MIN_POSITIVE_SHARE = 0.01
 """Share of the masked values; intensities are normalised by their 99th percentile."""
 
+MaskOfStack = str | os.PathLike[str] | FoundMask | Callable[[Volume], FoundMask]
+"""The mask of a stack: its file, one that was found, or what finds it."""
+
 FARTHEST_MM = 500.0
 """Largest distance between the heads of two stacks by their headers; scans of one session share a frame."""
 
@@ -48,6 +52,8 @@ class Stack:
         name: for messages.
         in_plane_fwhm_pixels: of the PSF along the first and the second axis of the image.
         origin: where the PSF comes from, for the record.
+        slice_axis: axis of the file's image that became the last one.
+        mask_source, mask_detail: who made the mask, and with what.
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
@@ -62,6 +68,9 @@ class Stack:
     name: str = "stack"
     in_plane_fwhm_pixels: tuple[float, float] = NOMINAL_FWHM_PIXELS
     origin: ProfileOrigin = NOT_SAID
+    slice_axis: int = 2
+    mask_source: MaskSource = "file"
+    mask_detail: str = ""
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image, dtype=np.float32)
@@ -135,6 +144,19 @@ class Stack:
         return VolumeGrid(self.image.shape, self.affine)
 
     @property
+    def mask_as_in_file(self) -> NDArray[np.bool_]:
+        """The mask with the axes of the file's image."""
+        return np.moveaxis(self.mask, 2, self.slice_axis)
+
+    @property
+    def affine_as_in_file(self) -> NDArray[np.float64]:
+        """The affine [4, 4] that belongs to `mask_as_in_file`."""
+        affine = self.affine.copy()
+        order = [axis for axis in range(3) if axis != self.slice_axis] + [self.slice_axis]
+        affine[:3, order] = self.affine[:3, :3]
+        return affine
+
+    @property
     def spacing_mm(self) -> NDArray[np.float64]:
         """In-plane pixel spacing (two numbers) and the distance of neighbouring slices [3]."""
         return self.grid.spacing_mm
@@ -142,7 +164,7 @@ class Stack:
 
 def load_stack(
     path: str | os.PathLike[str],
-    mask_path: str | os.PathLike[str] | None = None,
+    mask: MaskOfStack = required_mask,
     thickness_mm: float | None = None,
     profile: SliceProfile | None = None,
 ) -> Stack:
@@ -153,41 +175,44 @@ def load_stack(
 
     Args:
         path: of the NIfTI image.
-        mask_path: of the brain mask; without one every positive voxel counts.
+        mask: of the brain: a file, one that was found, or what finds it, such as `whole_image`; without one the image
+            must show nothing but brain.
         thickness_mm: of the slices; without one that of the sidecar is taken, or else the slice spacing, with a
             warning, because a header does not show gaps.
         profile: of a run that is to be repeated, in place of the sidecar's.
 
     Raises:
-        InputError: what `load_volume`, `load_mask`, `read_sidecar` and `Stack` refuse, or a sidecar that is about
-            slices at another distance.
+        InputError: what `load_volume`, `load_mask`, `required_mask`, `read_sidecar` and `Stack` refuse, or a sidecar
+            that is about slices at another distance.
     """
     volume = load_volume(path)
     for remark in volume.remarks:
         logger.warning("%s: %s", volume.name, remark)
-    if mask_path is None:
-        mask = np.nan_to_num(volume.data) > 0
-        if not mask.any():
-            raise InputError(f"{volume.name}: no positive value; expected an image, or pass --masks")
-        logger.warning("%s: no mask given; every positive voxel is taken for brain", volume.name)
+    if isinstance(mask, FoundMask):
+        found = mask
+    elif callable(mask):
+        found = mask(volume)
     else:
-        mask = load_mask(mask_path, volume)
-        if mask.all():
-            logger.warning("%s: its mask marks every voxel; expected the brain alone", volume.name)
+        found = FoundMask(inside=load_mask(mask, volume), source="file")
+    if found.source != "whole image" and found.inside.all():
+        logger.warning("%s: its mask marks every voxel; expected the brain alone", volume.name)
     spacing = volume.grid.spacing_mm
-    through = int(np.argmax(spacing)) if np.max(spacing) > 1.1 * np.median(spacing) else 2
+    through = slice_axis(spacing)
     order = [axis for axis in range(3) if axis != through] + [through]
     affine = volume.affine.copy()
     affine[:3, :3] = affine[:3, order]
     profile = find_slice_profile(path, spacing, through, thickness_mm, profile)
     stack = Stack(
         image=np.ascontiguousarray(volume.data.transpose(order)),
-        mask=np.ascontiguousarray(mask.transpose(order)),
+        mask=np.ascontiguousarray(found.inside.transpose(order)),
         affine=affine,
         thickness_mm=profile.thickness_mm,
         name=volume.name,
         in_plane_fwhm_pixels=profile.in_plane_fwhm_pixels,
         origin=profile.origin,
+        slice_axis=through,
+        mask_source=found.source,
+        mask_detail=found.detail,
     )
     if stack.thickness_mm < stack.spacing_mm[:2].min():
         logger.warning(
@@ -201,7 +226,7 @@ def load_stack(
 
 def load_stacks(
     paths: Sequence[str | os.PathLike[str]],
-    mask_paths: Sequence[str | os.PathLike[str] | None] | None = None,
+    masks: Sequence[MaskOfStack] | None = None,
     thickness_mm: Sequence[float | None] | None = None,
     profiles: Sequence[SliceProfile | None] | None = None,
 ) -> list[Stack]:
@@ -209,7 +234,7 @@ def load_stacks(
 
     Args:
         paths: of the NIfTI images.
-        mask_paths: one for each stack, or none.
+        masks: one for each stack, or none.
         thickness_mm: one for each stack, or none.
         profiles: one for each stack, or none.
 
@@ -217,16 +242,21 @@ def load_stacks(
         InputError: a stack that cannot be used, the same image twice, or stacks too far apart.
         ValueError: another number of masks, thicknesses or profiles than of stacks.
     """
-    masks = mask_paths or [None] * len(paths)
+    inside = masks or [required_mask] * len(paths)
     thickness = thickness_mm or [None] * len(paths)
     known = profiles or [None] * len(paths)
     stacks: list[Stack] = []
-    for path, mask, own_mm, profile in zip(paths, masks, thickness, known, strict=True):
+    for path, mask, own_mm, profile in zip(paths, inside, thickness, known, strict=True):
         stack = load_stack(path, mask, own_mm, profile)
         for other, other_path in zip(stacks, paths, strict=False):
             _check_pair(stack, other, Path(path), Path(other_path))
         stacks.append(stack)
     return stacks
+
+
+def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
+    """The axis across the slices: the one whose spacing is clearly above the others, else the third."""
+    return int(np.argmax(spacing_mm)) if np.max(spacing_mm) > 1.1 * np.median(spacing_mm) else 2
 
 
 def spaced(lengths: NDArray[np.float64]) -> str:

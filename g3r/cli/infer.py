@@ -155,9 +155,14 @@ def _interrupted(result: ReconstructionResult, folder: Path, stop_request: StopR
 
 
 def _print_summary(result: ReconstructionResult, folder: Path) -> None:
+    from g3r.output.files import MASK_PICTURE
+
     seconds = sum(result.record.seconds.values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
+    found = sorted({stack.mask_from for stack in result.record.stacks} - {"file"})
+    if found:
+        print(f"masks:   {' and '.join(found)}: look at {folder / MASK_PICTURE}")
     if result.record.registration:
         print(f"poses:   {result.record.registration.summary}")
     unseen = result.record.unseen.line() if result.record.unseen else None

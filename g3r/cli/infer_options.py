@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from g3r._version import __version__
+from g3r.cli.mask_options import add_mask_options, check_mask_options
 from g3r.planning import PRESET_NAMES
 
 DEFAULTS = {"preset": "balanced", "space": "standard", "unseen": "fill", "resolution": 0.8, "seed": 0}
@@ -22,7 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
         "130 interrupted",
     )
     parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
-    parser.add_argument("--masks", nargs="+", metavar="NIFTI", help="brain masks, one per stack, same order")
+    add_mask_options(parser)
     parser.add_argument(
         "--thickness",
         nargs="+",
@@ -93,8 +94,7 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = build_parser()
     options = parser.parse_args(argv)
     n_stacks = len(options.stacks)
-    if options.masks is not None and len(options.masks) != n_stacks:
-        parser.error(f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order")
+    check_mask_options(parser, options)
     if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
         parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
     if options.seed is not None and options.seed < 0:

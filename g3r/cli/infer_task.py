@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r.cli.mask_options import given_masks, masked_stacks
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
     from g3r.checkpoints.weights_file import WeightsFile
+    from g3r.masking.find import MaskedStacks
     from g3r.output.record import Inputs, RunRecord
     from g3r.planning.memory_limit import MemoryPlan
     from g3r.planning.plan import Plan
@@ -36,7 +38,7 @@ class Task:
         inputs: hashes of all files.
         n_threads: in use.
         plan: settings and deadlines of the run.
-        warnings: what differs from the run that --config names.
+        warnings: stacks that are left out, and what differs from the run that --config names.
     """
 
     stacks: list[Stack]
@@ -69,7 +71,8 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     sources = {"prior": options.ckpt, "pose": options.pose_ckpt or set_of(options.ckpt)}
     networks = {kind: weights_path(source, kind) for kind, source in sources.items() if source}
     sidecars = [path for path in map(sidecar_path, options.stacks) if os.path.isfile(path)]
-    inputs = [*options.stacks, *sidecars, *(options.masks or ()), *networks.values()]
+    masks = [mask for mask in given_masks(options) if mask is not None]
+    inputs = [*options.stacks, *sidecars, *masks, *networks.values()]
     check_output_folder(folder, OUTPUT_NAMES, replace=replaces, inputs=inputs)
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
@@ -85,7 +88,8 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
         InputError: something in the files or options cannot be used.
     """
     earlier = _earlier(options)
-    stacks = _load(options, earlier)
+    masked = masked_stacks(options)
+    stacks = _load(options, masked, earlier)
     from g3r.planning.memory_limit import plan_for_stacks
     from g3r.reconstruct import GaussianReconstructor
     from g3r.run.machine import use_threads
@@ -96,7 +100,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
     reconstructor = GaussianReconstructor(
         networks.get("prior"), settings, pose_checkpoint=networks.get("pose"), device=options.device
     )
-    inputs = _inputs(options, reconstructor)
+    inputs = _inputs(options, masked, reconstructor)
     memory = plan_for_stacks(
         stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
     )
@@ -108,7 +112,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
         inputs=inputs,
         n_threads=n_threads,
         plan=_plan(options, memory.settings, earlier),
-        warnings=earlier.differences(inputs) if earlier else [],
+        warnings=masked.left_out + (earlier.differences(inputs) if earlier else []),
     )
 
 
@@ -127,15 +131,16 @@ def _earlier(options: argparse.Namespace) -> RunRecord | None:
     return earlier
 
 
-def _load(options: argparse.Namespace, earlier: RunRecord | None) -> list[Stack]:
+def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord | None) -> list[Stack]:
     from g3r.acquisition.stacks import load_stacks
 
     thickness = options.thickness
     if thickness and len(thickness) == 1:
         thickness = thickness * len(options.stacks)
-    repeats = earlier is not None and len(earlier.stacks) == len(options.stacks)
+    repeats = earlier is not None and len(earlier.stacks) == len(masked.kept)
     profiles = [stack.profile() for stack in earlier.stacks] if earlier and repeats else None
-    return load_stacks(options.stacks, options.masks, thickness, profiles)
+    paths = [options.stacks[n] for n in masked.kept]
+    return load_stacks(paths, masked.masks, [thickness[n] for n in masked.kept] if thickness else None, profiles)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
@@ -155,14 +160,15 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     )
 
 
-def _inputs(options: argparse.Namespace, reconstructor: GaussianReconstructor) -> Inputs:
+def _inputs(options: argparse.Namespace, masked: MaskedStacks, reconstructor: GaussianReconstructor) -> Inputs:
+    from g3r.acquisition.brain_mask import FoundMask
     from g3r.output.record import Inputs
     from g3r.run.provenance import FileHash
 
     prior, pose = reconstructor.prior, reconstructor.pose_model
     return Inputs(
-        stacks=tuple(map(FileHash.of, options.stacks)),
-        masks=tuple(map(FileHash.of, options.masks or [])),
+        stacks=tuple(FileHash.of(options.stacks[n]) for n in masked.kept),
+        masks=tuple(one.hash() if isinstance(one, FoundMask) else FileHash.of(one) for one in masked.masks),
         prior=FileHash(prior.file_name, prior.file_sha256) if prior else None,
         pose_network=FileHash(pose.file_name, pose.file_sha256) if pose else None,
     )

@@ -171,6 +171,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         ncc=found.registration.ncc,
         uncertainty=uncertainty,
         prior_share=prior_share,
+        stacks=tuple(found.stacks),
         record=replace(
             _record(found, fit, qualities, plan, run, uncertainty_record),
             unseen=unseen_part,

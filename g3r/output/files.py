@@ -7,6 +7,11 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 
+MASK_PICTURE = "masks.png"
+
+MASK_NAMES = (MASK_PICTURE, *(f"brain-mask-{n}.nii.gz" for n in range(32)))
+"""Of masks that were found, by the number of the stack in slices.tsv; not written for the user's own."""
+
 OUTPUT_NAMES = (
     "volume.nii.gz",
     "mask.nii.gz",
@@ -20,6 +25,7 @@ OUTPUT_NAMES = (
     "slices.tsv",
     "run.json",
     "sections.png",
+    *MASK_NAMES,
 )
 
 SLICE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason")

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from g3r.acquisition.header_text import HeaderText
 from g3r.acquisition.images import save_volume
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
-from g3r.output.files import OUTPUT_NAMES, slice_table
+from g3r.output.files import MASK_PICTURE, OUTPUT_NAMES, slice_table
 from g3r.output.record import RunRecord
 from g3r.run.output_folder import OutputFolder, check_output_folder
 
@@ -52,6 +53,7 @@ class ReconstructionResult:
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
+        stacks: that it was made of; masks that were found for them are written, too.
         header_text: text for the headers of the files; nothing when None.
     """
 
@@ -72,6 +74,7 @@ class ReconstructionResult:
     uncertainty: NDArray[np.float32] | None
     prior_share: NDArray[np.float32] | None
     record: RunRecord
+    stacks: tuple[Stack, ...] = ()
     header_text: HeaderText | None = None
 
     def __repr__(self) -> str:
@@ -121,11 +124,18 @@ class ReconstructionResult:
                 for name, grid in maps.items()
                 if (data := getattr(self, name)) is not None
             ]
+            saved += [
+                pool.submit(
+                    save_volume, folder / f"brain-mask-{n}.nii.gz", stack.mask_as_in_file, stack.affine_as_in_file
+                )
+                for n, stack in self._found_masks()
+            ]
             self._write_others(folder)
         for one in saved:
             one.result()
 
     def _write_others(self, folder: Path) -> None:
+        from g3r.output.mask_picture import save_mask_picture
         from g3r.output.sections import save_sections
 
         self.cloud.save(folder / "gaussians.npz")
@@ -154,6 +164,13 @@ class ReconstructionResult:
             marked=self.unseen,
             title=self._title(),
         )
+
+        if found := self._found_masks():
+            save_mask_picture(folder / MASK_PICTURE, [stack for _, stack in found])
+
+    def _found_masks(self) -> list[tuple[int, Stack]]:
+        """Stacks whose masks are not the user's files, with their numbers."""
+        return [(n, stack) for n, stack in enumerate(self.stacks) if stack.mask_source != "file"]
 
     def _title(self) -> str:
         """Warnings that belong on the picture."""

@@ -134,7 +134,7 @@ def save_sections(
     if marked is not None:
         outlined = nib.orientations.apply_orientation(np.asarray(marked) > 0, orientation)
     figure = _draw(rows, inside[box], outlined[box], center, spacing_mm, title)
-    _write(figure, Path(path))
+    write_figure(figure, Path(path))
 
 
 def _crop(
@@ -263,7 +263,8 @@ def _scale_bar(panel: Axes) -> None:
     panel.text(x, y + 1.5, f"{SCALE_BAR_MM / 10:.0f} cm", color=INK, fontsize=7.5, ha="left", va="bottom")
 
 
-def _write(figure: Figure, path: Path) -> None:
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all; raises `InputError` where it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     try:

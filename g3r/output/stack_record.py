@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from g3r.acquisition.brain_mask import MaskSource
 from g3r.acquisition.sidecar import Axis
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile, ThicknessSource
 from g3r.acquisition.stacks import Stack
@@ -26,6 +27,8 @@ class StackRecord:
         in_plane_fwhm_pixels: of the PSF along the two axes of a slice.
         phase_resolution, phase_axis: what the in-plane width follows from; None where the scanner does not say it.
         spacing_mm: of pixels and slices.
+        mask_from, mask_detail: who made the mask, and with what.
+        mask_ml: what is marked.
         quality, interleave, n_segments: None where the stack had no slices.
     """
 
@@ -36,6 +39,9 @@ class StackRecord:
     phase_resolution: float | None = None
     phase_axis: Axis | None = None
     spacing_mm: list[float] = field(default_factory=list)
+    mask_from: MaskSource = "file"
+    mask_detail: str = ""
+    mask_ml: float = 0.0
     n_slices: int = 0
     quality: StackQuality | None = None
     interleave: int | None = None
@@ -80,6 +86,9 @@ def stack_records(
             in_plane_fwhm_pixels=stack.in_plane_fwhm_pixels,
             **vars(stack.origin),
             spacing_mm=[round(float(x), 6) for x in stack.spacing_mm],
+            mask_from=stack.mask_source,
+            mask_detail=stack.mask_detail,
+            mask_ml=round(float(stack.mask.sum()) * stack.grid.voxel_volume_mm3 / 1000, 1),
             n_slices=int((stack_id == n).sum()),
             quality=qualities[n],
             interleave=registration.interleave[place[n]] if n in place else None,

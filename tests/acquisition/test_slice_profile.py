@@ -11,6 +11,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
+from g3r.acquisition.brain_mask import whole_image
 from g3r.acquisition.psf import FWHM_PER_SIGMA, phase_fwhm_pixels, psf_variance_mm2
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile
 from g3r.acquisition.slicing import slices_from_stacks
@@ -99,7 +100,7 @@ def test_each_stack_has_its_own(tmp_path: Path) -> None:
         write(tmp_path / f"{name}.nii.gz", arrays(n)[0], affine_of(AXES["RAS"]))
     (tmp_path / "b.json").write_text('{"SliceThickness": 2.5}')
     paths = [tmp_path / f"{name}.nii.gz" for name in names]
-    stacks = load_stacks(paths, None, [2.0, None, None])
+    stacks = load_stacks(paths, [whole_image] * 3, [2.0, None, None])
     assert [stack.origin.thickness_from for stack in stacks] == ["option", "sidecar", "spacing"]
     assert [stack.thickness_mm for stack in stacks] == pytest.approx([2.0, 2.5, 3.0])
 

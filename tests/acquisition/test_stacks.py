@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from g3r.acquisition.brain_mask import whole_image
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
@@ -36,18 +37,26 @@ def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.
     assert normal_sigma == pytest.approx(2.2 / 2.3548, rel=1e-4)
 
 
-def test_without_a_mask_positive_voxels_count_and_a_line_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mask_may_be_found_by_any_function(tmp_path: Path) -> None:
     image, mask = arrays()
-    stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])))
+    stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])), whole_image)
     np.testing.assert_array_equal(stack.mask, mask)
-    assert "no mask" in caplog.text
+    assert stack.mask_source == "whole image"
+
+
+def test_a_mask_as_in_the_file_is_on_the_grid_of_the_file(tmp_path: Path) -> None:
+    image, mask = (np.moveaxis(array, 2, 0) for array in arrays())
+    affine = affine_of(AXES["RAS"])
+    affine[:3, :3] = affine[:3, [2, 0, 1]]
+    stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine), whole_image)
+    assert stack.slice_axis == 0
+    np.testing.assert_array_equal(stack.mask_as_in_file, mask)
+    np.testing.assert_allclose(stack.affine_as_in_file, affine, atol=1e-6)
 
 
 def test_a_stack_without_a_positive_value_and_without_mask_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no positive value"):
-        load_stack(write(tmp_path / "a.nii.gz", -arrays()[0], affine_of(AXES["RAS"])))
+        load_stack(write(tmp_path / "a.nii.gz", -arrays()[0], affine_of(AXES["RAS"])), whole_image)
 
 
 SHEARED = affine_of(np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]))

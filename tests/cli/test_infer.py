@@ -21,7 +21,7 @@ from g3r.cli.infer_task import check_files
 from g3r.errors import InputError
 from g3r.evaluation.pose_error import read_poses, slice_points, target_registration_error
 from g3r.gaussians import GaussianCloud
-from g3r.output.files import FULL_WEIGHT, OUTPUT_NAMES, SLICE_COLUMNS
+from g3r.output.files import FULL_WEIGHT, MASK_NAMES, OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from tests.faults.small_case import WHOLE
@@ -56,8 +56,8 @@ def reconstructed(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_every_output_is_there_and_nothing_else(reconstructed: Path) -> None:
-    assert {path.name for path in reconstructed.iterdir()} == WHOLE == set(OUTPUT_NAMES) - {"prior_share.nii.gz"}
-    assert [path.name for path in reconstructed.parent.iterdir()] == ["out"]
+    assert {path.name for path in reconstructed.iterdir()} == WHOLE
+    assert {*OUTPUT_NAMES} - {"prior_share.nii.gz", *MASK_NAMES} == WHOLE
 
 
 def test_the_maps_are_images_of_the_head(subject: Path, reconstructed: Path) -> None:

@@ -27,7 +27,7 @@ def kept_networks(tmp_path_factory: pytest.TempPathFactory) -> dict[type, Callab
         for kind in (Prior, PoseModel):
             loaders[kind] = functools.cache(kind.load)
             patch.setattr(kind, "load", loaders[kind])
-        line = ["--stacks", str(write(folder / "a.nii")), "--output", str(folder / "out"), "--dry-run"]
+        line = ["--stacks", str(write(folder / "a.nii")), "--whole-image", "--output", str(folder / "out"), "--dry-run"]
         assert main(line) == 0
     return loaders
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from g3r.acquisition.brain_mask import whole_image
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from tests.faults.nifti_files import ball, image, raw, write
@@ -120,7 +121,7 @@ class HeaderFuzz:
             if role == "mask":
                 stack = load_stack(self.stack, path)
             else:
-                stack = load_stack(path, self.mask if role == "stack with mask" else None)
+                stack = load_stack(path, self.mask if role == "stack with mask" else whole_image)
             check_stack(stack)
         finally:
             path.unlink()

@@ -124,7 +124,7 @@ def test_a_bad_prior(name: str, tmp_path: Path, tally: Tally) -> None:
     stack, bad = write(tmp_path / "stack.nii.gz"), tmp_path / "bad.safetensors"
     make(bad)
     with tally.case() as case:
-        line = ["--stacks", stack, "--ckpt", bad, "--output", tmp_path / "out"]
+        line = ["--stacks", stack, "--whole-image", "--ckpt", bad, "--output", tmp_path / "out"]
         assert_refused(run(main, line, tmp_path), "g3r-infer", "bad.safetensors", says)
         case.refused()
 
@@ -134,7 +134,7 @@ def test_a_bad_pose_network(name: str, tmp_path: Path, tally: Tally) -> None:
     stack, bad = write(tmp_path / "stack.nii.gz"), tmp_path / "bad.safetensors"
     BAD[name][0](bad)
     with tally.case() as case:
-        line = ["--stacks", stack, "--pose-ckpt", bad, "--output", tmp_path / "out"]
+        line = ["--stacks", stack, "--whole-image", "--pose-ckpt", bad, "--output", tmp_path / "out"]
         assert_refused(run(main, line, tmp_path), "g3r-infer", "bad.safetensors", "; pass a pose network")
         case.refused()
 

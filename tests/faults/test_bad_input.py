@@ -36,7 +36,7 @@ def test_a_bad_stack(name: str, stack: Path, tmp_path: Path, tally: Tally) -> No
     # where one stack has no usable slice the others go on, with a warning (tests/pipeline)
     for stacks in [[bad]] if name == "one pixel" else [[bad], [stack, bad]]:
         with tally.case() as case:
-            outcome = run(main, ["--stacks", *stacks, "--output", tmp_path / "out"], tmp_path)
+            outcome = run(main, ["--stacks", *stacks, "--whole-image", "--output", tmp_path / "out"], tmp_path)
             assert_refused(outcome, REFUSES, named, says)
             case.refused()
 
@@ -88,7 +88,7 @@ PAIRS = (
 def test_stacks_that_do_not_go_together(name: str, stack: Path, tmp_path: Path, tally: Tally) -> None:
     stacks, names, says = pairs(tmp_path)[name]
     with tally.case() as case:
-        outcome = run(main, ["--stacks", *stacks, "--output", tmp_path / "out"], tmp_path)
+        outcome = run(main, ["--stacks", *stacks, "--whole-image", "--output", tmp_path / "out"], tmp_path)
         assert_refused(outcome, REFUSES, names, says)
         case.refused()
 
@@ -144,7 +144,7 @@ def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, mo
         allowed = os.access
         monkeypatch.setattr(os, "access", lambda path, mode: "closed" not in str(path) and allowed(path, mode))
     with tally.case() as case:
-        outcome = run(main, ["--stacks", stack, "--output", folder], tmp_path)
+        outcome = run(main, ["--stacks", stack, "--whole-image", "--output", folder], tmp_path)
         assert_refused(outcome, REFUSES, "out", says)
         case.refused()
 
@@ -191,7 +191,7 @@ def test_a_value_without_meaning(
     monkeypatch.chdir(tmp_path)
     name, value = option.split()
     with tally.case() as case:
-        outcome = run(main, ["--stacks", stack, "--output", "out", f"{name}={value}"], tmp_path)
+        outcome = run(main, ["--stacks", stack, "--whole-image", "--output", "out", f"{name}={value}"], tmp_path)
         assert_refused(outcome, REFUSES, "", VALUES[option])
         case.refused()
 
@@ -220,6 +220,11 @@ USAGE = [
     ["--max-memory", "-1G"],
     ["--ckpt", "p.pt", "--no-prior"],
     ["--preset", "preview", "--time-budget", "9"],
+    ["--whole-image", "--masks", "m.nii", "auto"],
+    ["--whole-image", "--mask-command", "m {stack} {mask}"],
+    ["--mask-command", "m {stack}"],
+    ["--mask-timeout", "5"],
+    ["--mask-command", "m {stack} {mask}", "--mask-timeout", "0"],
     ["--nonsense"],
 ]
 

@@ -128,7 +128,7 @@ def dry_run(fields: dict[str, list[float]], ending: str, role: str, tally: Tally
     with tally.case() as case, TemporaryDirectory() as name:
         folder = Path(name)
         bad = write_raw(folder / f"bad{ending}", ball() if role == "mask" else image(), fitted(fields))
-        words = ["--stacks", bad]
+        words = ["--stacks", bad, "--whole-image"]
         if role == "mask":
             words = ["--stacks", write(folder / "stack.nii"), "--masks", bad]
         outcome = run(main, [*words, "--output", folder / "out", "--dry-run"], folder)

@@ -15,6 +15,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
+from g3r.acquisition.brain_mask import whole_image
 from g3r.acquisition.stacks import load_stack
 from g3r.cli.infer import main
 from tests.faults.bad_files import header, moved, only_sform
@@ -154,8 +155,8 @@ STACKS: dict[str, tuple[Maker, str]] = {
     "bright": (lambda folder: write(folder / "odd.nii.gz", image() * np.float32(1e20)), ""),
 }
 
-USUAL = ("no mask given", "thickness taken as the distance of slices")
-"""Remarks on every image that comes alone."""
+USUAL = "thickness taken as the distance of slices"
+"""A remark on every image that comes alone."""
 
 AS_GOOD = ("one frame", "frames of one", "gzip members", "NIfTI-2", "big-endian", "header and voxels apart")
 
@@ -165,15 +166,15 @@ def test_an_odd_stack(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixtur
     make, remark = STACKS[name]
     path = make(tmp_path)
     with tally.case(), caplog.at_level(logging.WARNING):
-        outcome = run(main, ["--stacks", path, "--output", tmp_path / "out", "--dry-run"], tmp_path)
+        outcome = run(main, ["--stacks", path, "--output", tmp_path / "out", "--dry-run", "--whole-image"], tmp_path)
         assert outcome.code == 0, outcome.err
         assert outcome.changed == set()
-        remarks = [line for line in caplog.messages if not any(usual in line for usual in USUAL)]
+        remarks = [line for line in caplog.messages if USUAL not in line]
         assert len(remarks) == bool(remark), remarks
         if remark:
             assert path.name in remarks[0]
             assert remark.split(".*")[-1] in remarks[0]
-        stack = load_stack(path)
+        stack = load_stack(path, whole_image)
         if name in AS_GOOD:
             np.testing.assert_array_equal(stack.image, image())
         if name.startswith(("uint", "int", "float")) and "slope" not in name:
@@ -182,7 +183,7 @@ def test_an_odd_stack(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixtur
 
 def test_a_negative_slope_is_applied(tmp_path: Path, tally: Tally) -> None:
     with tally.case():
-        stack = load_stack(STACKS["int16 with a negative slope"][0](tmp_path))
+        stack = load_stack(STACKS["int16 with a negative slope"][0](tmp_path), whole_image)
         np.testing.assert_allclose(stack.image, image(), atol=0.06)
 
 
@@ -216,7 +217,7 @@ def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tal
 def test_twelve_stacks(tmp_path: Path, tally: Tally) -> None:
     paths = [write(tmp_path / f"{n}.nii.gz", image(n), moved(n, 0, 0)) for n in range(12)]
     with tally.case():
-        outcome = run(main, ["--stacks", *paths, "--output", tmp_path / "out", "--dry-run"], tmp_path)
+        outcome = run(main, ["--stacks", *paths, "--whole-image", "--output", tmp_path / "out", "--dry-run"], tmp_path)
         assert outcome.code == 0, outcome.err
         assert outcome.out.count("thickness 3 mm") == 12
 
@@ -231,7 +232,7 @@ def test_an_output(kind: str, tmp_path: Path, tally: Tally) -> None:
         (folder / "volume.nii.gz").write_text("earlier")
         options = ["--force"]
     with tally.case():
-        line = ["--stacks", write(tmp_path / "s.nii"), "--output", folder, "--dry-run", *options]
+        line = ["--stacks", write(tmp_path / "s.nii"), "--whole-image", "--output", folder, "--dry-run", *options]
         assert run(main, line, tmp_path).code == 0
 
 
@@ -245,6 +246,7 @@ def test_names_that_are_no_text_as_a_process(tmp_path: Path, tally: Tally) -> No
         "g3r.cli.infer",
         "--stacks",
         name,
+        "--whole-image",
         "--output",
         name + b".out",
         "--dry-run",

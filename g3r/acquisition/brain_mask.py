@@ -1,0 +1,95 @@
+"""Which voxels of a stack are brain, who says so, and stacks that show nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from g3r.acquisition.images import Volume
+from g3r.errors import InputError
+from g3r.run.provenance import FileHash
+
+MaskSource = Literal["file", "empty background", "whole image", "automatic", "command"]
+"""Who says what is brain: the user's file, zeros around it, the user by word, the network, or the user's masker."""
+
+MIN_ZERO_SHARE = 0.4
+"""A stack that was masked before is zero in most of its voxels; real stacks have 5 to 21 % zeros."""
+
+BRAIN_RANGE_ML = (20.0, 900.0)
+"""A fetal or neonatal brain is not smaller or larger; what a whole field of view holds is ten times as large."""
+
+WAYS_ON = (
+    "pass --masks with a brain mask for each stack, or --mask-command with a tool that makes them, or --whole-image if "
+    "the image shows nothing but brain"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundMask:
+    """A brain mask and who made it.
+
+    Attributes:
+        inside: [I, J, K] on the grid of the image's file.
+        source: who made it.
+        detail: network or command, with what it found.
+    """
+
+    inside: NDArray[np.bool_]
+    source: MaskSource
+    detail: str = ""
+
+    def hash(self) -> FileHash:
+        """By which a mask that is no file is told from another one."""
+        return FileHash(self.source, hashlib.sha256(np.packbits(self.inside).tobytes()).hexdigest())
+
+
+def without_surroundings(volume: Volume) -> FoundMask | None:
+    """The positive voxels of an image that shows the brain alone; None where tissue surrounds it.
+
+    Args:
+        volume: of a stack.
+    """
+    value = np.nan_to_num(volume.data)
+    positive = value > 0
+    if np.count_nonzero(value == 0) <= MIN_ZERO_SHARE * value.size or not positive.any():
+        return None
+    pieces, _ = label(positive, structure=np.ones((3, 3, 3)))
+    largest_ml = np.bincount(pieces[positive]).max() * volume.grid.voxel_volume_mm3 / 1000
+    low, high = BRAIN_RANGE_ML
+    if not low <= largest_ml <= high:
+        return None
+    return FoundMask(inside=positive, source="empty background", detail=f"{largest_ml:.0f} ml in the largest piece")
+
+
+def whole_image(volume: Volume) -> FoundMask:
+    """Every positive voxel.
+
+    Raises:
+        InputError: there is none.
+    """
+    positive = np.nan_to_num(volume.data) > 0
+    if not positive.any():
+        raise InputError(f"{volume.name}: no positive value; expected an image")
+    return FoundMask(inside=positive, source="whole image")
+
+
+def required_mask(volume: Volume) -> FoundMask:
+    """The mask of an image that shows the brain alone.
+
+    Raises:
+        InputError: there are surroundings, and nobody says what is brain.
+    """
+    found = without_surroundings(volume)
+    if found is None:
+        zeros = 100 * float(np.mean(np.nan_to_num(volume.data) == 0))
+        raise InputError(
+            f"{volume.name}: no mask says what is brain, and the image shows more than that ({zeros:.0f} % of the "
+            f"voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
+            f"{BRAIN_RANGE_ML[0]:g} to {BRAIN_RANGE_ML[1]:g} ml); {WAYS_ON}"
+        )
+    return found

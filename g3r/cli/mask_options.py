@@ -1,0 +1,89 @@
+"""The options of `g3r-infer` and `g3r-mask` that say what is brain, and what they mean."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from g3r.masking.find import MaskedStacks, Masker
+
+AUTO = "auto"
+"""In place of a mask's file: it is to be found."""
+
+
+def add_mask_options(parser: argparse.ArgumentParser) -> None:
+    """The options that say what is brain."""
+    parser.add_argument(
+        "--masks",
+        nargs="+",
+        metavar="NIFTI",
+        help="brain masks, one per stack, same order; auto in place of a file, or of all files, finds it (the default)",
+    )
+    parser.add_argument(
+        "--mask-command",
+        metavar="'CMD {stack} {mask}'",
+        help="a tool that makes the masks that are not given: run once for each stack, to write {mask}",
+    )
+    parser.add_argument(
+        "--mask-timeout", type=float, metavar="SECONDS", help="for --mask-command and one stack (default 900)"
+    )
+    parser.add_argument(
+        "--mask-ckpt", metavar="MASK.safetensors", help="mask network from g3r-export (default: shipped)"
+    )
+    parser.add_argument(
+        "--whole-image", action="store_true", help="every positive voxel is brain: the stacks show nothing else"
+    )
+
+
+def check_mask_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the program with 2 where options on masks cannot go together; `auto` alone is for all stacks."""
+    n_stacks = len(options.stacks)
+    if options.masks == [AUTO]:
+        options.masks = [AUTO] * n_stacks
+    if options.masks is not None and len(options.masks) != n_stacks:
+        parser.error(
+            f"{len(options.masks)} masks for {n_stacks} stacks; give one per stack, in the same order, and auto where "
+            "one is to be found"
+        )
+    if options.whole_image and (options.masks or options.mask_command):
+        parser.error("--whole-image excludes --masks and --mask-command: it says that no mask is needed")
+    missing = [place for place in ("{stack}", "{mask}") if place not in (options.mask_command or place)]
+    if missing:
+        parser.error(f"--mask-command: no {' and no '.join(missing)} in {options.mask_command!r}; the tool gets both")
+    if options.mask_timeout is not None:
+        if not 0 < options.mask_timeout < float("inf"):
+            parser.error(f"--mask-timeout {options.mask_timeout:g}; expected a positive number of seconds")
+        if not options.mask_command:
+            parser.error("--mask-timeout is for --mask-command, which is not given")
+
+
+def given_masks(options: argparse.Namespace) -> list[str | None]:
+    """The user's file for each stack; None where the mask is to be found."""
+    return [None if one == AUTO else one for one in options.masks or [None] * len(options.stacks)]
+
+
+def masked_stacks(options: argparse.Namespace) -> MaskedStacks:
+    """Which stacks are used, and with which masks.
+
+    Raises:
+        InputError: a stack that cannot be read, a masker that fails, or no stack with a brain in it.
+    """
+    from g3r.masking.find import find_masks
+
+    return find_masks(options.stacks, given_masks(options), _masker(options))
+
+
+def _masker(options: argparse.Namespace) -> Masker:
+    """What finds the masks that are not given."""
+    if options.whole_image:
+        from g3r.acquisition.brain_mask import whole_image
+
+        return lambda path, volume: whole_image(volume)
+    if options.mask_command:
+        from g3r.masking.command import TIMEOUT_S, MaskCommand
+
+        return MaskCommand(options.mask_command, options.mask_timeout or TIMEOUT_S).mask_of
+    from g3r.acquisition.brain_mask import required_mask
+
+    return lambda path, volume: required_mask(volume)

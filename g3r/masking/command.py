@@ -1,0 +1,121 @@
+"""A user's own masker: a command that is run once for each stack, and whose mask is checked as a user's is."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from g3r.acquisition.brain_mask import FoundMask
+from g3r.acquisition.images import Volume, load_mask
+from g3r.errors import InputError
+
+STACK, MASK = "{stack}", "{mask}"
+"""Stand for the file of the stack and for the file that the command has to write."""
+
+PLACE = re.compile("|".join(map(re.escape, (STACK, MASK))))
+
+TIMEOUT_S = 900.0
+"""A masker that takes longer hangs: published networks take up to two minutes for a stack without a GPU."""
+
+MAX_SAID = 300
+"""Letters of what a command said that go into a message."""
+
+
+@dataclass(frozen=True)
+class MaskCommand:
+    """A command line with `{stack}` and `{mask}` in it; no shell reads it.
+
+    Args:
+        line: the command line.
+        timeout_s: after which it is ended.
+
+    Raises:
+        InputError: it cannot be split into words, or lacks one of the two places.
+    """
+
+    line: str
+    timeout_s: float = TIMEOUT_S
+
+    def __post_init__(self) -> None:
+        try:
+            words = shlex.split(self.line)
+        except ValueError as error:
+            raise InputError(f"--mask-command: {error} in {self.line!r}; quote it as a shell would want it") from None
+        missing = [place for place in (STACK, MASK) if not any(place in word for word in words)]
+        if missing:
+            raise InputError(
+                f"--mask-command: no {' and no '.join(missing)} in {self.line!r}; expected a command such as "
+                f"'tool --input {STACK} --output {MASK}'"
+            )
+
+    def mask_of(self, path: str | os.PathLike[str], volume: Volume) -> FoundMask:
+        """The mask that the command makes of a stack.
+
+        Args:
+            path: of the stack.
+            volume: that was read from it.
+
+        Raises:
+            InputError: the command cannot be started, fails or takes too long, or it writes no mask of this stack.
+        """
+        with tempfile.TemporaryDirectory(prefix="g3r-mask-") as folder:
+            target = Path(folder) / "mask.nii.gz"
+            places = {STACK: os.path.abspath(path), MASK: str(target)}
+            words = [PLACE.sub(lambda found: places[found[0]], word) for word in shlex.split(self.line)]
+            self._run(words, volume.name)
+            if not target.is_file():
+                raise InputError(f"{volume.name}: --mask-command ended well but wrote no {MASK}; check {self.line!r}")
+            try:
+                inside = load_mask(target, volume)
+            except InputError as error:
+                raise InputError(f"{volume.name}: --mask-command wrote a mask that cannot be used: {error}") from None
+        return FoundMask(inside=inside, source="command", detail=self.line)
+
+    def _run(self, words: list[str], name: str) -> None:
+        try:
+            process = subprocess.Popen(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # what it starts ends with it
+            )
+        except (OSError, ValueError) as error:
+            found = getattr(error, "strerror", None) or error
+            raise InputError(f"{name}: --mask-command cannot be started ({found}): {words[0]}") from None
+        try:
+            said, _ = process.communicate(timeout=self.timeout_s)
+        except BaseException as error:  # Ctrl-C, too
+            _end(process)
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            raise InputError(
+                f"{name}: --mask-command did not end within {self.timeout_s:g} s and was stopped; try it alone, or "
+                "raise --mask-timeout"
+            ) from None
+        if process.returncode:
+            raise InputError(f"{name}: --mask-command failed with exit code {process.returncode}{_last_words(said)}")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and whatever it started."""
+    with suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def _last_words(said: bytes) -> str:
+    lines = [line for line in said.decode(errors="replace").splitlines() if line.strip()]
+    return f": {lines[-1].strip()[-MAX_SAID:]}" if lines else " and said nothing"

@@ -1,0 +1,102 @@
+"""The mask of every stack: what the user gives is taken, the rest is found, and stacks without a brain are left out."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.brain_mask import WAYS_ON, FoundMask, without_surroundings
+from g3r.acquisition.images import Volume, load_volume
+from g3r.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+Masker = Callable[[str | os.PathLike[str], Volume], FoundMask | str]
+"""Finds the mask of a stack, from its file and what was read from it; or says why there is no brain in it."""
+
+ODD_SIZE = 2.0
+"""A found mask that is this many times larger or smaller than the median of all is not of the same brain."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskedStacks:
+    """Which stacks are used, and their masks.
+
+    Attributes:
+        kept: numbers of the stacks that are used, from 0.
+        masks: of each of them: the user's file, or what was found.
+        left_out: a sentence for each stack that is not used.
+    """
+
+    kept: list[int]
+    masks: list[str | os.PathLike[str] | FoundMask]
+    left_out: list[str]
+
+
+def find_masks(
+    paths: Sequence[str | os.PathLike[str]], given: Sequence[str | os.PathLike[str] | None] | None, masker: Masker
+) -> MaskedStacks:
+    """The masks of all stacks of a head.
+
+    An image that shows nothing but brain needs no masker.
+
+    Args:
+        paths: of the stacks.
+        given: one file for each stack, and None where the mask is to be found; None for all.
+        masker: finds it.
+
+    Raises:
+        InputError: a stack that cannot be read, what the masker raises, or no stack with a brain in it.
+    """
+    files = given or [None] * len(paths)
+    masks: dict[int, str | os.PathLike[str] | FoundMask] = {n: own for n, own in enumerate(files) if own is not None}
+    # all are read before the first mask is made, which may take minutes
+    volumes = {n: load_volume(path) for n, path in enumerate(paths) if n not in masks}
+    found_ml: dict[int, float] = {}
+    left_out: list[str] = []
+    for n, volume in volumes.items():
+        found = without_surroundings(volume) or masker(paths[n], volume)
+        if isinstance(found, str):
+            left_out.append(f"{volume.name}: left out, {found}")
+            continue
+        masks[n] = found
+        found_ml[n] = float(np.count_nonzero(found.inside) * volume.grid.voxel_volume_mm3 / 1000)
+        logger.info("%s: mask: %s, %.0f ml (%s)", volume.name, found.source, found_ml[n], found.detail)
+    for n in _odd_ones(masks, found_ml):
+        left_out.append(
+            f"{volumes[n].name}: left out, what was found in it ({found_ml[n]:.0f} ml) is not as large as in the "
+            f"other stacks ({', '.join(f'{ml:.0f}' for m, ml in found_ml.items() if m != n)} ml)"
+        )
+        del masks[n]
+    if not masks:
+        raise InputError(f"no brain was found in any stack ({'; '.join(left_out)}); {WAYS_ON}")
+    kept = sorted(masks)
+    return MaskedStacks(kept=kept, masks=[masks[n] for n in kept], left_out=left_out)
+
+
+def _odd_ones(masks: dict[int, str | os.PathLike[str] | FoundMask], found_ml: dict[int, float]) -> list[int]:
+    """Stacks whose found masks are far larger or smaller than most, where there are three or more.
+
+    A stack whose field of view ends within the head is smaller by right.
+    """
+    if len(found_ml) < 3:
+        return []
+    typical_ml = float(np.median(list(found_ml.values())))
+    odd = []
+    for n, own_ml in found_ml.items():
+        mask = masks[n]
+        assert isinstance(mask, FoundMask)
+        too_small = own_ml * ODD_SIZE < typical_ml and not _is_cut(mask.inside)
+        if too_small or own_ml > ODD_SIZE * typical_ml:
+            odd.append(n)
+    return odd
+
+
+def _is_cut(inside: NDArray[np.bool_]) -> bool:
+    """Whether a mask [I, J, K] reaches an end of the image."""
+    return any(inside.take(end, axis).any() for axis in range(3) for end in (0, -1))
