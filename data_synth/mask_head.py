@@ -88,7 +88,8 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
         for axis, n in enumerate(mask.shape)
     )  # type: ignore[assignment]
     share = gaussian_filter(mask.astype(np.float32), 0.6)
-    outside_mm = distance_transform_edt(~mask).astype(np.float32) * np.float32(spacing)
+    # from the surface, which is half a voxel from the last voxel inside
+    outside_mm = (distance_transform_edt(~mask).astype(np.float32) - 0.5) * np.float32(spacing)
     texture = lattice_noise(mask.shape, float(rng.uniform(1.0, 3.0)), rng)
     radius = float((3 / (4 * np.pi) * mask.sum() * spacing**3) ** (1 / 3))
     low = np.argwhere(mask)
@@ -144,13 +145,13 @@ def _face_and_neck(
         [Tissue.BONE, Tissue.FACE_MUSCLE, Tissue.FACE_FAT],
         Tissue.FETAL_FLUID,
     )
-    canal = tube(points, [tuple(base + [0, 0, 10]), tuple(end)], [6.0, 5.0])
+    canal = tube(points, [tuple(base + np.array([0, 0, 10])), tuple(end)], [6.0, 5.0])
     labels[canal > -2.5] = Tissue.BONE
     labels[canal > 0] = Tissue.FETAL_FLUID
     labels[canal > 2.5] = Tissue.CORD
     eye = radius * rng.uniform(0.17, 0.24)
     for side in (-1, 1):
-        at = (side * 0.36 * radius, front + 0.25 * radius, down + 0.3 * radius)
+        at = (side * 0.36 * radius, front + 0.35 * radius, down + 0.15 * radius)
         inside = ellipsoid(points, at, (eye, eye, eye))
         labels[inside > -1.5] = Tissue.BONE
         labels[inside > 0] = Tissue.EYE

@@ -23,6 +23,8 @@ JITTER_MM = 6.0
 """Standard deviation of a crop's centre per axis: as far as a found head may be off."""
 BESIDE_SLICES = 3
 MAX_NOISE = 0.08
+IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
+"""Standard deviations in pixels: from, to, along each axis."""
 WRAP_SHARE = 0.08
 
 
@@ -86,9 +88,7 @@ def _coarse(scan: Scan, rng: np.random.Generator, step_mm: float, shape: tuple[i
         start + np.arange(shape[2]) * step_mm
     ]
     spacing = (LOOK_MM, LOOK_MM, scan.spacing_mm)
-    weights = [
-        axis_weights(m, mm, where, step_mm) for m, mm, where in zip(fine[0].shape, spacing, at, strict=True)
-    ]
+    weights = [axis_weights(m, mm, where, step_mm) for m, mm, where in zip(fine[0].shape, spacing, at, strict=True)]
     return along_axes(fine[0], weights), along_axes(fine[1], weights)
 
 
@@ -124,7 +124,7 @@ def _transform() -> tio.Compose:
             tio.RandomBiasField(coefficients=0.3, order=2, p=0.7),
             tio.RandomGhosting(num_ghosts=(2, 6), axes=(0, 1), intensity=(0.1, 0.6), p=0.1),
             tio.RandomMotion(degrees=4, translation=3, num_transforms=2, p=0.05),
-            tio.RandomBlur(std=(0, 0.9, 0, 0.9, 0, 0), p=0.4),
+            tio.RandomBlur(std=IN_PLANE_BLUR, p=0.4),  # type: ignore[arg-type]  # six numbers are ranges per axis
         ]
     )
 

@@ -132,17 +132,19 @@ def draw_scan(scene: Scene, rng: np.random.Generator, negative: bool | None = No
         rotation = Rotation.random(rng=rng).as_matrix()
     spacing = float(rng.uniform(2.0, 5.0) if rng.random() < 0.5 else rng.uniform(2.5, 4.0))
     radius = scene.head.radius_mm * 1.15
-    low, high = -radius - rng.uniform(-5, 45), radius + rng.uniform(-5, 45)
+    low, high = -radius - float(rng.uniform(-5, 45)), radius + float(rng.uniform(-5, 45))
     if rng.random() < CUT_SHARE:
-        cut = rng.uniform(0.1, 0.5) * 2 * radius
+        cut = float(rng.uniform(0.1, 0.5)) * 2 * radius
         low, high = (low, radius - cut) if rng.random() < 0.5 else (cut - radius, high)
     if beside:
-        shift = (1.2 * radius + rng.uniform(10, 20) - low) * np.sign(rotation[:, 2] @ scene.around.trunk_mm)
-        low, high = sorted((low + shift, high + shift) if shift > 0 else (shift - high, shift - low))
+        shift = 1.2 * radius + float(rng.uniform(10, 20)) - low
+        low, high = low + shift, high + shift
+        if rotation[:, 2] @ scene.around.trunk_mm < 0:
+            low, high = -high, -low
     depth = np.arange(low + rng.uniform(0, spacing), high, spacing)
     fov = rng.uniform(220, 400, 2)
     room = np.maximum(fov / 2 - radius, 10)
-    offset = rng.uniform(-0.85, 0.85, 2) * np.minimum(room, 90)
+    offset: Array = rng.uniform(-0.85, 0.85, 2) * np.minimum(room, 90)
     if rng.random() < 0.08:  # the field of view cuts the head
         axis = int(rng.integers(2))
         offset[axis] = np.sign(offset[axis]) * (fov[axis] / 2 - radius * rng.uniform(-0.2, 0.8))
@@ -172,9 +174,7 @@ def draw_scan(scene: Scene, rng: np.random.Generator, negative: bool | None = No
     )
 
 
-def _coloured(
-    scene: Scene, rng: np.random.Generator, hidden: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _coloured(scene: Scene, rng: np.random.Generator, hidden: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The head's three channels and the surroundings' intensities with random contrasts."""
     mean, texture = draw_intensities(rng)
     head, around = scene.head, scene.around
@@ -199,9 +199,6 @@ def _coloured(
 
 
 def _intensities(
-    labels: NDArray[np.uint8],
-    noise: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    texture: NDArray[np.float32],
+    labels: NDArray[np.uint8], noise: NDArray[np.float32], mean: NDArray[np.float32], texture: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     return np.maximum(mean[labels] + (mean * texture)[labels] * noise, 0)

@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 
 def image_slices(
     head: NDArray[np.float32],
-    index_from_head: Array,
+    index_from_head: NDArray[np.floating],
     head_pose: RigidPose,
     behind: NDArray[np.float32],
-    index_from_scan: Array,
+    index_from_scan: NDArray[np.floating],
     scan_pose: RigidPose,
     *,
     first_mm: tuple[float, float],
@@ -57,7 +57,7 @@ def image_slices(
     )
 
 
-def _lines(index_from: Array, pose: RigidPose) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _lines(index_from: NDArray[np.floating], pose: RigidPose) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     linear = index_from[:3, :3]
     origin = pose.translation_mm @ linear.T + index_from[:3, 3]
     return np.ascontiguousarray(linear @ pose.rotation, np.float32), np.ascontiguousarray(origin, np.float32)

@@ -34,7 +34,9 @@ MAY_IMPORT = {
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
-    "cli": "run acquisition checkpoints prior pose_network mask_network training planning evaluation output reconstruct",
+    "cli": (
+        "run acquisition checkpoints prior pose_network mask_network training planning evaluation output reconstruct"
+    ),
 }
 """From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""
 

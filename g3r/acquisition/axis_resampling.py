@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def axis_weights(
-    n: int, spacing_mm: float, at_mm: NDArray[np.float64], new_spacing_mm: float
-) -> NDArray[np.float32]:
+def axis_weights(n: int, spacing_mm: float, at_mm: NDArray[np.floating], new_spacing_mm: float) -> NDArray[np.float32]:
     """Weights of n samples in new samples, by a hat as wide as the coarser of the two spacings.
 
     What lies beyond the samples counts as zero.
@@ -51,7 +49,7 @@ def along_axes(volume: NDArray[np.float32], weights: Sequence[NDArray[np.float32
     return np.ascontiguousarray(volume, dtype=np.float32)
 
 
-def centred_positions_mm(n: int, spacing_mm: float, n_old: int, old_spacing_mm: float) -> NDArray[np.float64]:
+def centred_positions_mm(n: int, spacing_mm: float, n_old: int, old_spacing_mm: float) -> NDArray[np.floating]:
     """Positions [n] of new samples about the middle of old ones, from the first old sample (mm).
 
     Args:

@@ -75,7 +75,7 @@ class FoundHead:
         return self.volume_ml >= MIN_VOLUME_ML and self.presence >= MIN_PRESENCE
 
 
-def find_brain(image: Image, spacing_mm: Sequence[float], model: MaskModel) -> BrainMask:
+def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: MaskModel) -> BrainMask:
     """Find the fetal brain in a stack and outline it.
 
     Args:
@@ -170,7 +170,7 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
 
 def _found(
     network: MaskNetwork, image: Image, spacing: NDArray[np.float64]
-) -> tuple[FoundHead, list[NDArray[np.float64]]]:
+) -> tuple[FoundHead, list[NDArray[np.floating]]]:
     """The likeliest head on the coarse grid, and the grid's positions along each axis (mm from the first voxel)."""
     step = network.config.coarse_mm
     at = [
@@ -186,7 +186,7 @@ def _outlined(
     image: Image,
     spacing: NDArray[np.float64],
     inside: NDArray[np.bool_],
-    at_mm: Sequence[NDArray[np.float64]],
+    at_mm: Sequence[NDArray[np.floating]],
 ) -> Image:
     """Probability of brain on the stack's own grid.
 

@@ -70,7 +70,9 @@ class SubpixelUNet(nn.Module):
         size = image.shape[2:]
         strides = [f**self.n_levels for f in self.factor]
         far_end = [
-            padding for extent, stride in zip(size[::-1], strides[::-1], strict=True) for padding in (0, -extent % stride)
+            padding
+            for extent, stride in zip(size[::-1], strides[::-1], strict=True)
+            for padding in (0, -extent % stride)
         ]
         # bfloat16 halves the time of a training step; what is inferred is computed in float32
         short = self.training and is_bfloat16_fast(image.device.type)

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from g3r.checkpoints.shipped import weights_path
 from g3r.errors import InputError
 from studies.harness import Record, Row
+from studies.tables import Cell
 
 if TYPE_CHECKING:
     from g3r.mask_network.model import MaskModel
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--masks": {"metavar": "MASK.safetensors", "help": "mask networks (None: those shipped)"},
+    "--masks": {"metavar": "MASK.safetensors", "help": "mask networks (None: those shipped)"}
 }
 LOST_PIXELS = 50
 """A slice with more pixels of brain than these, of which none was found, is lost."""
@@ -95,7 +96,7 @@ def line(key: str, row: Row) -> str:
     )
 
 
-EACH = {
+EACH: dict[str, Cell] = {
     "stack": "{name}",
     "true ml": "{true_ml:.0f}",
     "found ml": "{volume_ml:.0f}",

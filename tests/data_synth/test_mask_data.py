@@ -43,8 +43,9 @@ def test_every_fifth_validation_scan_has_no_head(centred_head: TruthVolume) -> N
 
 
 def test_batches(centred_head: TruthVolume) -> None:
-    options = {"coarse_shape": (48, 48, 16), "crop_shape": (48, 48, 4)}
-    data = MaskDataModule(source="phantom", samples_per_epoch=4, scans_per_scene=4, batch_size=2, val_samples=1, **options)  # type: ignore[arg-type]
+    data = MaskDataModule(
+        coarse_shape=(48, 48, 16), crop_shape=(48, 48, 4), samples_per_epoch=4, batch_size=2, val_samples=1
+    )
     data.setup()
     for one in (data.train_set, data.val_set):
         assert one is not None

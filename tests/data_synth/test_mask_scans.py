@@ -23,7 +23,7 @@ def scene(centred_head: TruthVolume) -> Scene:
 
 
 def whole(scan: Scan, pixel_mm: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-    shape = tuple(int(mm / pixel_mm) for mm in scan.fov_mm)
+    shape = (int(scan.fov_mm[0] / pixel_mm), int(scan.fov_mm[1] / pixel_mm))
     return scan.images((-scan.fov_mm[0] / 2, -scan.fov_mm[1] / 2), pixel_mm, shape)
 
 

@@ -27,9 +27,7 @@ def stub() -> Any:
     return SimpleNamespace(network=network)
 
 
-def ball(
-    shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float
-) -> np.ndarray:
+def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
     at = np.stack(np.meshgrid(*(np.arange(n) * mm for n, mm in zip(shape, SPACING_MM, strict=True)), indexing="ij"), -1)
     return np.linalg.norm(at - np.array(centre_mm), axis=-1) < radius_mm
 

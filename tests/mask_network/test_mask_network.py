@@ -54,9 +54,9 @@ def test_channels_and_pixels_are_inverse(factor: tuple[int, int, int]) -> None:
 def test_flat_levels_do_not_see_other_slices() -> None:
     torch.manual_seed(1)
     flat = SubpixelUNet((4, 8), (2, 2, 1), n_flat=2).eval()
-    weight = flat.down[0].conv1.conv.weight
-    assert weight.shape[2:] == (3, 3, 1)
-    assert SubpixelUNet((4, 8), (2, 2, 1), n_flat=0).down[0].conv1.conv.weight.shape[2:] == (3, 3, 3)
+    assert flat.state_dict()["down.0.conv1.conv.weight"].shape[2:] == (3, 3, 1)
+    deep = SubpixelUNet((4, 8), (2, 2, 1), n_flat=0)
+    assert deep.state_dict()["down.0.conv1.conv.weight"].shape[2:] == (3, 3, 3)
 
 
 def test_the_trained_networks_are_small() -> None:

@@ -13,6 +13,7 @@ from g3r.cli import export
 from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
 from g3r.mask_network.model import MaskModel
+from g3r.prior.model import Prior
 
 pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
 
@@ -30,9 +31,9 @@ def sample(seed: int, *, head: bool = True) -> dict[str, torch.Tensor]:
     """A bright ball in noise."""
     generator = torch.Generator().manual_seed(seed)
     made = {}
-    for name, shape in {"coarse_": (24, 24, 16), "": (32, 32, 6)}.items():
+    for name, shape in {"coarse_": (24, 24, 16), "": (48, 48, 6)}.items():
         at = torch.stack(torch.meshgrid(*(torch.arange(n) - n / 2 for n in shape), indexing="ij"), -1)
-        mask = ((at - torch.tensor([2.0, -3.0, 0.0])).norm(dim=-1) < shape[0] / 4).float() * head
+        mask = ((at - torch.tensor([2.0, -3.0, 0.0])).norm(dim=-1) < shape[0] / 3).float() * head
         image = 0.3 * torch.rand(shape, generator=generator) + 0.7 * mask
         made[f"{name}image"], made[f"{name}mask"] = image[None, None], mask[None, None]
     return made
@@ -54,11 +55,11 @@ class TinyData(lightning.LightningDataModule):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, MaskModule]:
-    """A run of twelve epochs, its folder and its checkpoint."""
+    """A run, its folder and its checkpoint."""
     folder = tmp_path_factory.mktemp("mask")
     lightning.seed_everything(1)
     module = MaskModule(network=NETWORK, warmup_steps=1, learning_rate=1e-2)
-    run = trainer(folder, max_epochs=12)
+    run = trainer(folder, max_epochs=30, check_val_every_n_epoch=15)
     run.fit(module, datamodule=TinyData())
     path = folder / "run.ckpt"
     run.save_checkpoint(path)
@@ -90,8 +91,6 @@ def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path)
             torch.sigmoid(model.network.outline(image)), torch.sigmoid(module.network.outline(image)), atol=0.02, rtol=0
         )
     with pytest.raises(InputError, match="not a prior checkpoint"):
-        from g3r.prior.model import Prior
-
         Prior.load(file)
 
 
