@@ -8,9 +8,10 @@ VENV ?= .venv
 # e.g. PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the small CPU build of torch
 PIP_ARGS ?=
 ATLAS ?=
-# e.g. PRETRAIN_ARGS="--trainer.max_time 00:00:10:00"; POSE_ARGS likewise, for the pose network
+# e.g. PRETRAIN_ARGS="--trainer.max_time 00:00:10:00"; POSE_ARGS and MASK_ARGS likewise
 PRETRAIN_ARGS ?=
 POSE_ARGS ?=
+MASK_ARGS ?=
 BENCH_ARGS ?=
 STUDY_ARGS ?=
 # processes of `make test`; the tests of a file stay together, since they share what they reconstruct
@@ -28,6 +29,7 @@ GATE_TRAINING ?= --data.num_workers=0 --data.patch_size=64 --data.batch_size=2 -
 	--model.learning_rate=1e-3 --model.warmup_steps=40 --trainer.check_val_every_n_epoch=100
 PRIOR ?= runs/prior.safetensors
 POSE ?= runs/pose.safetensors
+MASK ?= runs/mask.safetensors
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
@@ -85,11 +87,13 @@ lint: install ## ruff: style, imports, docstrings
 types: install ## mypy
 	$(BIN)/mypy
 
-pretrain: install ## train both networks on the phantom, or on ATLAS=DIR, and export them to POSE and PRIOR
+pretrain: install ## train all networks on the phantom, or on ATLAS=DIR, and export them to POSE, PRIOR and MASK
 	$(BIN)/g3r-pretrain fit --config lightning_configs/pose.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(POSE_ARGS)
 	$(BIN)/g3r-export --force "$$($(call best_of,runs/pose))" $(POSE)
 	$(BIN)/g3r-pretrain fit --config lightning_configs/prior.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(PRETRAIN_ARGS)
 	$(BIN)/g3r-export --force "$$($(call best_of,runs/prior))" $(PRIOR)
+	$(BIN)/g3r-pretrain fit --config lightning_configs/mask.yaml $(if $(ATLAS),--data.source "$(ATLAS)") $(MASK_ARGS)
+	$(BIN)/g3r-export --force "$$($(call best_of,runs/mask))" $(MASK)
 
 tensorboard: install ## watch the training runs
 	$(BIN)/tensorboard --logdir runs

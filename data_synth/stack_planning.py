@@ -88,7 +88,7 @@ def draw_stacks(
     stacks = []
     for stack in range(n_stacks):
         if planned or common is not None:
-            plan = _planned_rotation(int(axes[stack % 3]), rng)
+            plan = planned_rotation(int(axes[stack % 3]), rng)
             rotation = plan if common is None else common.as_matrix() @ plan
         else:
             rotation = Rotation.random(random_state=rng).as_matrix()
@@ -121,7 +121,7 @@ def _slice_depths(corner_depth_mm: Array, step_mm: float, rng: np.random.Generat
     return np.arange(low + rng.uniform(0, step_mm), high, step_mm)
 
 
-def _planned_rotation(axis: int, rng: np.random.Generator) -> Array:
+def planned_rotation(axis: int, rng: np.random.Generator) -> Array:
     """Columns x, y, normal of a stack on a head's axis: tilted a little, rotated in plane and flipped at random."""
     normal = np.roll([1.0, 0.0, 0.0], axis) * rng.choice([-1.0, 1.0])
     x = np.roll(normal, 1)

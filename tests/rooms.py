@@ -22,19 +22,23 @@ MAY_IMPORT = {
     "acquisition": "geometry run",
     "checkpoints": "run",
     "gaussians": "geometry run acquisition",
-    "masking": "acquisition",
     "prior": "geometry acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
+    "mask_network": "acquisition checkpoints",
+    "masking": "acquisition mask_network",
     "registration": "geometry run acquisition",
     "evaluation": "geometry acquisition registration",
-    "training": "geometry run checkpoints prior pose_network evaluation",
+    "training": "geometry run checkpoints prior pose_network mask_network evaluation",
     "fitting": "geometry run acquisition gaussians registration prior",
     "uncertainty": "geometry acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
-    "cli": "run acquisition checkpoints masking prior pose_network training planning evaluation output reconstruct",
+    "cli": (
+        "run acquisition checkpoints prior pose_network mask_network masking training planning evaluation output "
+        "reconstruct"
+    ),
 }
 """From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""
 

@@ -18,7 +18,7 @@ def weights_path(source: str | os.PathLike[str] | None, kind: str) -> Path:
 
     Args:
         source: as the user gave it.
-        kind: "prior" or "pose".
+        kind: "prior", "pose" or "mask".
     """
     if source is None:
         return WEIGHTS / f"{kind}{SUFFIX}"

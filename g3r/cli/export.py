@@ -1,4 +1,4 @@
-"""`g3r-export`: turn a training checkpoint of the prior or of the pose network into the file that is used."""
+"""`g3r-export`: turn a training checkpoint of the prior, the pose or the mask network into the file that is used."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def export(run: Path, file: Path, data_description: str | None = None, *, replace: bool = False) -> TrainedModel:
-    """Write the exported file of a Lightning checkpoint, of a prior or a pose network.
+    """Write the exported file of a Lightning checkpoint, of a prior, a pose or a mask network.
 
     Args:
-        run: checkpoint written by `PriorModule` or `PoseModule` under a Lightning trainer.
+        run: checkpoint written by `PriorModule`, `PoseModule` or `MaskModule` under a Lightning trainer.
         file: to write; its name ends in .safetensors.
         data_description: training data in words; None keeps what the run recorded.
         replace: overwrite an existing file.
@@ -79,10 +79,11 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
 
 
 def _model_types() -> dict[str, type[TrainedModel]]:
+    from g3r.mask_network.model import MaskModel
     from g3r.pose_network.model import PoseModel
     from g3r.prior.model import Prior
 
-    return {Prior.kind: Prior, PoseModel.kind: PoseModel}
+    return {Prior.kind: Prior, PoseModel.kind: PoseModel, MaskModel.kind: MaskModel}
 
 
 def _weights(content: dict[str, Any]) -> dict[str, Any]:

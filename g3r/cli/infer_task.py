@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g3r.cli.mask_options import given_masks, masked_stacks
+from g3r.cli.mask_options import given_masks, mask_weights_path, masked_stacks, needs_network
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,6 +70,8 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
 
     sources = {"prior": options.ckpt, "pose": options.pose_ckpt or set_of(options.ckpt)}
     networks = {kind: weights_path(source, kind) for kind, source in sources.items() if source}
+    if needs_network(options):
+        networks["mask"] = mask_weights_path(options)
     sidecars = [path for path in map(sidecar_path, options.stacks) if os.path.isfile(path)]
     masks = [mask for mask in given_masks(options) if mask is not None]
     inputs = [*options.stacks, *sidecars, *masks, *networks.values()]
@@ -88,7 +90,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
         InputError: something in the files or options cannot be used.
     """
     earlier = _earlier(options)
-    masked = masked_stacks(options)
+    masked = masked_stacks(options, networks.get("mask"))
     stacks = _load(options, masked, earlier)
     from g3r.planning.memory_limit import plan_for_stacks
     from g3r.reconstruct import GaussianReconstructor
@@ -100,7 +102,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> T
     reconstructor = GaussianReconstructor(
         networks.get("prior"), settings, pose_checkpoint=networks.get("pose"), device=options.device
     )
-    inputs = _inputs(options, masked, reconstructor)
+    inputs = _inputs(options, masked, reconstructor, networks.get("mask"))
     memory = plan_for_stacks(
         stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
     )
@@ -160,17 +162,24 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     )
 
 
-def _inputs(options: argparse.Namespace, masked: MaskedStacks, reconstructor: GaussianReconstructor) -> Inputs:
+def _inputs(
+    options: argparse.Namespace,
+    masked: MaskedStacks,
+    reconstructor: GaussianReconstructor,
+    mask_weights: WeightsFile | None,
+) -> Inputs:
     from g3r.acquisition.brain_mask import FoundMask
     from g3r.output.record import Inputs
     from g3r.run.provenance import FileHash
 
     prior, pose = reconstructor.prior, reconstructor.pose_model
+    asked = any(isinstance(one, FoundMask) and one.source == "automatic" for one in masked.masks)
     return Inputs(
         stacks=tuple(FileHash.of(options.stacks[n]) for n in masked.kept),
         masks=tuple(one.hash() if isinstance(one, FoundMask) else FileHash.of(one) for one in masked.masks),
         prior=FileHash(prior.file_name, prior.file_sha256) if prior else None,
         pose_network=FileHash(pose.file_name, pose.file_sha256) if pose else None,
+        mask_network=FileHash(mask_weights.path.name, mask_weights.sha256) if mask_weights and asked else None,
     )
 
 

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import functools
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r.errors import InputError
+
 if TYPE_CHECKING:
+    from g3r.checkpoints.weights_file import WeightsFile
+    from g3r.masking.automatic import AutomaticMask
     from g3r.masking.find import MaskedStacks, Masker
 
 AUTO = "auto"
@@ -63,18 +69,45 @@ def given_masks(options: argparse.Namespace) -> list[str | None]:
     return [None if one == AUTO else one for one in options.masks or [None] * len(options.stacks)]
 
 
-def masked_stacks(options: argparse.Namespace) -> MaskedStacks:
+def needs_network(options: argparse.Namespace) -> bool:
+    """Whether the mask network may be asked."""
+    return None in given_masks(options) and not options.whole_image and not options.mask_command
+
+
+def mask_weights_path(options: argparse.Namespace) -> Path:
+    """The file of the mask network.
+
+    Raises:
+        InputError: the set of weights that was asked for holds none.
+    """
+    from g3r.checkpoints.shipped import set_of, weights_path
+
+    name = None if options.mask_ckpt else set_of(options.ckpt)
+    path = weights_path(options.mask_ckpt or name, "mask")
+    if name and not path.is_file():
+        raise InputError(
+            f"--ckpt {name}: this set of weights has no mask network; pass --masks, --mask-command, or --mask-ckpt with a "
+            "network whose terms suit you"
+        )
+    return path
+
+
+def masked_stacks(options: argparse.Namespace, weights: WeightsFile | None) -> MaskedStacks:
     """Which stacks are used, and with which masks.
+
+    Args:
+        options: with the paths of stacks and masks.
+        weights: of the mask network; None where it is not needed.
 
     Raises:
         InputError: a stack that cannot be read, a masker that fails, or no stack with a brain in it.
     """
     from g3r.masking.find import find_masks
 
-    return find_masks(options.stacks, given_masks(options), _masker(options))
+    return find_masks(options.stacks, given_masks(options), _masker(options, weights))
 
 
-def _masker(options: argparse.Namespace) -> Masker:
+def _masker(options: argparse.Namespace, weights: WeightsFile | None) -> Masker:
     """What finds the masks that are not given."""
     if options.whole_image:
         from g3r.acquisition.brain_mask import whole_image
@@ -84,6 +117,14 @@ def _masker(options: argparse.Namespace) -> Masker:
         from g3r.masking.command import TIMEOUT_S, MaskCommand
 
         return MaskCommand(options.mask_command, options.mask_timeout or TIMEOUT_S).mask_of
-    from g3r.acquisition.brain_mask import required_mask
 
-    return lambda path, volume: required_mask(volume)
+    @functools.cache
+    def network() -> AutomaticMask:  # torch takes seconds, and most runs have masks
+        from g3r.mask_network.model import MaskModel
+        from g3r.masking.automatic import AutomaticMask
+        from g3r.run.machine import use_threads
+
+        use_threads(options.threads)
+        return AutomaticMask(MaskModel.load(weights))
+
+    return lambda path, volume: network().mask_of(path, volume)

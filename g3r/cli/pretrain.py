@@ -1,4 +1,4 @@
-"""`g3r-pretrain`: train the prior network or the pose network with LightningCLI."""
+"""`g3r-pretrain`: train the prior network, the pose network or the mask networks with LightningCLI."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from g3r.errors import G3RError
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
 
-Train the density-gated prior network, or the pose network (lightning_configs/pose.yaml). Logs for
-TensorBoard and checkpoints go to one folder.
+Train the density-gated prior network, the pose network (lightning_configs/pose.yaml) or the mask
+networks (lightning_configs/mask.yaml). Logs for TensorBoard and checkpoints go to one folder.
 
   fit, validate            what to do
   --config FILE            settings; every one of them can be overridden on the command line
-  --model CLASS            what to train, as the configs name it: g3r.training.prior_module.PriorModule or
-                           g3r.training.pose_module.PoseModule
+  --model CLASS            what to train, as the configs name it: g3r.training.prior_module.PriorModule,
+                           g3r.training.pose_module.PoseModule or g3r.training.mask_module.MaskModule
   --model.network.NAME V   an argument of the network
   --data.source DIR        folder with atlas volumes and masks; "phantom" (default) needs no data
   --trainer.max_time T     DD:HH:MM:SS; the learning rate is annealed to fit

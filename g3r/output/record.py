@@ -95,21 +95,22 @@ class Inputs:
 
     Attributes:
         stacks: one per stack.
-        masks: one per stack; empty without.
-        prior, pose_network: None where not used.
+        masks: one per stack: the file, or who made it and the hash of its voxels.
+        prior, pose_network, mask_network: None where not used.
     """
 
     stacks: tuple[FileHash, ...]
     masks: tuple[FileHash, ...] = ()
     prior: FileHash | None = None
     pose_network: FileHash | None = None
+    mask_network: FileHash | None = None
 
     def named(self) -> dict[str, FileHash]:
         """All of them, by what they are."""
         files = {f"stack {n + 1}": file for n, file in enumerate(self.stacks)}
         files |= {f"mask {n + 1}": file for n, file in enumerate(self.masks)}
-        files |= {"prior": self.prior} if self.prior else {}
-        return files | ({"pose network": self.pose_network} if self.pose_network else {})
+        networks = {"prior": self.prior, "pose network": self.pose_network, "mask network": self.mask_network}
+        return files | {name: file for name, file in networks.items() if file}
 
     def differences(self, now: Inputs) -> list[str]:
         """A sentence for each file of `now` that is not the same bytes, or is not used any more."""

@@ -6,6 +6,8 @@ import torch
 from monai.networks.blocks import Convolution, ResidualUnit, TransformerBlock
 from torch import Tensor, nn
 
+from g3r.checkpoints.device import is_bfloat16_fast
+
 
 class Encoder(nn.Module):
     """Slice image to token: MONAI's residual units, and a linear layer that keeps what is where in the image.
@@ -35,7 +37,7 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor, extra: Tensor | None = None) -> Tensor:
         """Return tokens [S, width] of images [S, 1, N, N] and, with `extra_channels`, [S, E, N / 2, N / 2]."""
         # bfloat16 halves the time of a training step; the poses are always computed in float32
-        short = self.training and _is_bfloat16_fast(image.device.type)
+        short = self.training and is_bfloat16_fast(image.device.type)
         with torch.autocast(image.device.type, torch.bfloat16, enabled=short):
             # a convolution on a CPU is faster with channels innermost
             features = self.stem(image.to(memory_format=torch.channels_last))
@@ -43,14 +45,6 @@ class Encoder(nn.Module):
                 features = torch.cat([features, self.extra(extra)], 1)
             token = self.token(self.body(features).flatten(1))
         return token.float()
-
-
-def _is_bfloat16_fast(device_type: str) -> bool:
-    """Whether a device computes in bfloat16; where a CPU only imitates it, a step takes ten times as long."""
-    if device_type != "cpu":
-        return True
-    can = torch.cpu.get_capabilities()
-    return bool(can.get("avx512_bf16") or can.get("amx_bf16"))
 
 
 class SetTransformer(nn.Module):

@@ -37,7 +37,7 @@ class AnnealedModule(LightningModule):
     """
 
     kind: ClassVar[str]
-    """Kind of the exported model: prior or pose."""
+    """Kind of the exported model: prior, pose or mask."""
     network: Any
 
     def __init__(self, learning_rate: float, weight_decay: float, warmup_steps: int) -> None:

@@ -1,0 +1,165 @@
+"""What mask networks learn from: a whole scan on a coarse grid, a finer crop about its head, and their masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torchio as tio
+from monai.transforms import RandRicianNoise
+from numpy.typing import NDArray
+
+from data_synth.augment import applied
+from data_synth.mask_scans import Scan
+from g3r.acquisition.axis_resampling import along_axes, axis_weights
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+LOOK_MM = 2.0
+"""Pixels of which those of the coarse grid are made."""
+JITTER_MM = 6.0
+"""Standard deviation of a crop's centre per axis: as far as a found head may be off."""
+BESIDE_SLICES = 3
+MAX_NOISE = 0.08
+IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
+"""Standard deviations in pixels: from, to, along each axis."""
+WRAP_SHARE = 0.08
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSample:
+    """Images of one scan with the share of brain in each pixel.
+
+    Args:
+        coarse_image: [A, B, C] the scan on the coarse isotropic grid.
+        coarse_mask: [A, B, C].
+        image: [H, W, K] some slices about the head; K of the scan's own slices.
+        mask: [H, W, K].
+    """
+
+    coarse_image: Image
+    coarse_mask: Image
+    image: Image
+    mask: Image
+
+
+def draw_sample(
+    scan: Scan,
+    rng: np.random.Generator,
+    *,
+    coarse_mm: float,
+    coarse_shape: tuple[int, int, int],
+    pixel_mm: float,
+    crop_shape: tuple[int, int, int],
+) -> MaskSample:
+    """A sample of a scan.
+
+    Args:
+        scan: of a scene.
+        rng: source of randomness.
+        coarse_mm: voxel size of the coarse grid.
+        coarse_shape: its voxels; a random part of a larger scan.
+        pixel_mm: of the crop.
+        crop_shape: pixels and slices of the crop.
+    """
+    coarse_image, coarse_mask = _coarse(scan, rng, coarse_mm, coarse_shape)
+    image, mask = _crop(scan, rng, pixel_mm, crop_shape)
+    return MaskSample(
+        coarse_image=with_artefacts(coarse_image, rng, wrap=True),
+        coarse_mask=coarse_mask,
+        image=with_artefacts(image, rng),
+        mask=mask,
+    )
+
+
+def _coarse(scan: Scan, rng: np.random.Generator, step_mm: float, shape: tuple[int, int, int]) -> tuple[Image, Image]:
+    n = [int(np.ceil(size * step_mm / LOOK_MM)) for size in shape[:2]]
+    window = np.array(n) * LOOK_MM
+    room = np.maximum(scan.fov_mm - window, 0) / 2
+    middle = rng.uniform(-1, 1, 2) * room
+    first = middle - (np.array(n) - 1) / 2 * LOOK_MM
+    fine = scan.images((float(first[0]), float(first[1])), LOOK_MM, (n[0], n[1]), n_through=1)
+    n_slices = fine[0].shape[2]
+    surplus = n_slices * scan.spacing_mm - shape[2] * step_mm
+    start = rng.uniform(min(surplus, 0), max(surplus, 0)) + (step_mm - scan.spacing_mm) / 2
+    at = [(np.arange(size) + 0.5) * step_mm - LOOK_MM / 2 for size in shape[:2]] + [
+        start + np.arange(shape[2]) * step_mm
+    ]
+    spacing = (LOOK_MM, LOOK_MM, scan.spacing_mm)
+    weights = [axis_weights(m, mm, where, step_mm) for m, mm, where in zip(fine[0].shape, spacing, at, strict=True)]
+    return along_axes(fine[0], weights), along_axes(fine[1], weights)
+
+
+def _crop(scan: Scan, rng: np.random.Generator, pixel_mm: float, shape: tuple[int, int, int]) -> tuple[Image, Image]:
+    n_slices = len(scan.depth_mm)
+    if scan.with_head:
+        _, look = scan.images(
+            (-scan.fov_mm[0] / 2, -scan.fov_mm[1] / 2), 5.0, (int(scan.fov_mm[0] / 5), int(scan.fov_mm[1] / 5))
+        )
+        area = look.sum((0, 1))
+        weight = look.sum(2)
+        total = max(float(weight.sum()), 1e-6)
+        at = [np.arange(size) * 5.0 - scan.fov_mm[axis] / 2 for axis, size in enumerate(weight.shape)]
+        centre = np.array([float(weight.sum(1) @ at[0]), float(weight.sum(0) @ at[1])]) / total
+        shown = np.flatnonzero(area > 1)
+        low, high = (int(shown[0]), int(shown[-1])) if len(shown) else (0, n_slices - 1)
+        middle = int(rng.integers(low - BESIDE_SLICES, high + BESIDE_SLICES + 1))
+        centre = centre + rng.normal(0, JITTER_MM, 2)
+    else:
+        middle = int(rng.integers(n_slices))
+        centre = rng.uniform(-0.4, 0.4, 2) * scan.fov_mm
+    first_slice = int(np.clip(middle - shape[2] // 2, 0, max(n_slices - shape[2], 0)))
+    first = centre - (np.array(shape[:2]) - 1) / 2 * pixel_mm
+    chosen = slice(first_slice, first_slice + shape[2])
+    image, mask = scan.images((float(first[0]), float(first[1])), pixel_mm, (shape[0], shape[1]), chosen)
+    missing = [(0, 0), (0, 0), (0, shape[2] - image.shape[2])]
+    return np.pad(image, missing), np.pad(mask, missing)
+
+
+def _transform() -> tio.Compose:
+    return tio.Compose(
+        [
+            tio.RandomBiasField(coefficients=0.3, order=2, p=0.7),
+            tio.RandomGhosting(num_ghosts=(2, 6), axes=(0, 1), intensity=(0.1, 0.6), p=0.1),
+            tio.RandomMotion(degrees=4, translation=3, num_transforms=2, p=0.05),
+            tio.RandomBlur(std=IN_PLANE_BLUR, p=0.4),  # type: ignore[arg-type]  # six numbers are ranges per axis
+        ]
+    )
+
+
+def with_artefacts(image: Image, rng: np.random.Generator, wrap: bool = False) -> Image:
+    """A stack with a bias field, ghosts, motion blur, Rician noise and another gamma, by torchio and MONAI.
+
+    Args:
+        image: [I, J, K], the brain's brightest about 1.
+        rng: source of randomness.
+        wrap: whether what is beyond the field of view may fold into it.
+    """
+    if wrap and rng.random() < WRAP_SHARE:
+        axis = int(rng.integers(2))
+        image = image + np.float32(rng.uniform(0.2, 0.8)) * np.roll(image, image.shape[axis] // 2, axis)
+    tensor = torch.from_numpy(np.ascontiguousarray(image))[None]
+    result = applied(_transform(), tio.Subject(image=tio.ScalarImage(tensor=tensor)), rng)["image"].data[0].numpy()
+    result = np.abs(result) ** np.float32(np.exp(rng.uniform(-0.3, 0.3)))
+    noise = RandRicianNoise(prob=1.0, std=MAX_NOISE)
+    noise.set_random_state(int(rng.integers(2**32)))
+    return np.asarray(noise(result), dtype=np.float32)
+
+
+def full_stack(scan: Scan, pixel_mm: float, rng: np.random.Generator) -> tuple[Image, NDArray[np.bool_]]:
+    """A scan as a scanner would write it, with artefacts, and the true mask: pixels of which half is brain.
+
+    Args:
+        scan: of a scene.
+        pixel_mm: edge of the pixels; those between slices are the scan's own.
+        rng: source of randomness.
+
+    Returns:
+        Two of [I, J, K].
+    """
+    shape = tuple(int(mm / pixel_mm) for mm in scan.fov_mm)
+    first = -(np.array(shape) - 1) / 2 * pixel_mm
+    image, inside = scan.images((float(first[0]), float(first[1])), pixel_mm, (shape[0], shape[1]))
+    return with_artefacts(image, rng, wrap=True), inside > 0.5

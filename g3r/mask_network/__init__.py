@@ -1,0 +1,1 @@
+"""The mask networks: one finds the fetal brain in a stack, one outlines it."""

@@ -1,0 +1,46 @@
+"""A trained pair of mask networks and its file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from g3r.checkpoints.trained_model import TrainedModel
+from g3r.mask_network.config import MaskNetworkConfig
+from g3r.mask_network.network import MaskNetwork
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskModel(TrainedModel):
+    """The mask networks as they are used. See `TrainedModel` for `load`, `save` and `record`.
+
+    Their weights are stored as float16, which changes hardly a pixel.
+    """
+
+    network: MaskNetwork
+
+    kind: ClassVar = "mask"
+    config_type: ClassVar = MaskNetworkConfig
+    network_type: ClassVar = MaskNetwork
+
+    @classmethod
+    def own_facts(cls, description: Mapping[str, Any]) -> dict[str, Any]:
+        """Nothing apart from the weights."""
+        return {}
+
+    def own_description(self) -> dict[str, Any]:
+        """Nothing apart from the weights."""
+        return {}
+
+    def in_words(self) -> str:
+        """Both resolutions."""
+        config = self.network.config
+        return f"brain masks, found at {config.coarse_mm:g} mm, outlined at {config.pixel_mm:g} mm"
+
+    @staticmethod
+    def stored(name: str, value: Tensor) -> Tensor:
+        """Half the bytes."""
+        return value.half()

@@ -1,0 +1,115 @@
+"""Two U-Nets made of MONAI's blocks: one looks at a whole stack coarsely, one outlines the brain in its slices."""
+
+from collections.abc import Sequence
+
+import torch
+from monai.networks.blocks.dynunet_block import UnetBasicBlock, UnetOutBlock, UnetUpBlock
+from torch import Tensor, nn
+from torch.nn import functional
+
+from g3r.checkpoints.device import is_bfloat16_fast
+from g3r.mask_network.config import MaskNetworkConfig
+
+BRIGHT_SHARE = 0.99
+"""Quantile of an image that is its unit of intensity."""
+N_FLAT_LEVELS = 2
+"""Levels of the outline that look at each slice alone; the deeper ones see neighbouring slices, too."""
+_NORM = ("INSTANCE", {"affine": True})  # intensities and contrasts differ from scan to scan
+
+
+class MaskNetwork(nn.Module):
+    """Both steps from a stack to the mask of the fetal brain.
+
+    Args:
+        config: see `MaskNetworkConfig`.
+    """
+
+    def __init__(self, config: MaskNetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.finder = SubpixelUNet(config.finder_channels, (2, 2, 2), n_flat=0)
+        self.outliner = SubpixelUNet(config.outline_channels, (2, 2, 1), n_flat=N_FLAT_LEVELS)
+
+    def find(self, image: Tensor) -> Tensor:
+        """Logits of brain in whole stacks [B, 1, I, J, K], isotropic at `coarse_mm`, in any units."""
+        return self.finder(normalised(image))
+
+    def outline(self, image: Tensor) -> Tensor:
+        """Logits of brain in crops about heads [B, 1, I, J, K] at `pixel_mm`, K slices, in any units."""
+        return self.outliner(normalised(image))
+
+
+class SubpixelUNet(nn.Module):
+    """A U-Net that leaves the full resolution at once, where a CPU spends its time: pixels become channels.
+
+    Args:
+        channels: of the levels.
+        factor: pixels per axis that become channels; also the stride from a level to the next.
+        n_flat: first levels whose kernels stay within a slice.
+    """
+
+    def __init__(self, channels: Sequence[int], factor: tuple[int, int, int], n_flat: int) -> None:
+        super().__init__()
+        self.factor = factor
+        self.n_levels = len(channels)
+        n_pixels = factor[0] * factor[1] * factor[2]
+        kernels = [(3, 3, 1) if level < n_flat else (3, 3, 3) for level in range(len(channels))]
+        self.down = nn.ModuleList()
+        for level, width in enumerate(channels):
+            into = channels[level - 1] if level else n_pixels
+            stride = factor if level else (1, 1, 1)
+            self.down.append(UnetBasicBlock(3, into, width, kernels[level], stride, _NORM))
+        self.up = nn.ModuleList(
+            UnetUpBlock(3, channels[level + 1], channels[level], kernels[level], 1, factor, _NORM)
+            for level in range(len(channels) - 1)
+        )
+        self.out = UnetOutBlock(3, channels[0], n_pixels)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return logits [B, 1, I, J, K] of images of that shape; any size works, it is padded with zeros inside."""
+        size = image.shape[2:]
+        strides = [f**self.n_levels for f in self.factor]
+        far_end = [
+            padding
+            for extent, stride in zip(size[::-1], strides[::-1], strict=True)
+            for padding in (0, -extent % stride)
+        ]
+        # bfloat16 halves the time of a training step; what is inferred is computed in float32
+        short = self.training and is_bfloat16_fast(image.device.type)
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=short):
+            features = to_channels(functional.pad(image, far_end), self.factor)
+            features = features.contiguous(memory_format=torch.channels_last_3d)
+            skips = []
+            for down in self.down:
+                features = down(features)
+                skips.append(features)
+            skips.pop()
+            for up in reversed(self.up):
+                features = up(features, skips.pop())
+            logits = to_pixels(self.out(features), self.factor)
+        return logits[:, :, : size[0], : size[1], : size[2]].float()
+
+
+def normalised(image: Tensor) -> Tensor:
+    """Images [B, 1, I, J, K] in units of their bright quantile: between 0 and about 1, a little more where brighter."""
+    flat = image.flatten(1).float()
+    rank = max(1, int(BRIGHT_SHARE * flat.shape[1]))
+    bright = flat.kthvalue(rank, dim=1).values.clamp_min(1e-6)
+    scaled = image.float() / bright[:, None, None, None, None]
+    return scaled.clamp(0.0, 2.0)
+
+
+def to_channels(image: Tensor, factor: tuple[int, int, int]) -> Tensor:
+    """Blocks of pixels as channels: [B, 1, I, J, K] to [B, F, I / f0, J / f1, K / f2] with F = f0 f1 f2."""
+    b, _, i, j, k = image.shape
+    f0, f1, f2 = factor
+    split = image.reshape(b, i // f0, f0, j // f1, f1, k // f2, f2)
+    return split.permute(0, 2, 4, 6, 1, 3, 5).reshape(b, f0 * f1 * f2, i // f0, j // f1, k // f2)
+
+
+def to_pixels(features: Tensor, factor: tuple[int, int, int]) -> Tensor:
+    """The inverse of `to_channels`."""
+    b, _, i, j, k = features.shape
+    f0, f1, f2 = factor
+    split = features.reshape(b, f0, f1, f2, i, j, k)
+    return split.permute(0, 4, 1, 5, 2, 6, 3).reshape(b, 1, i * f0, j * f1, k * f2)

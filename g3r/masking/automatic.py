@@ -1,0 +1,42 @@
+"""Masks by the mask network."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from g3r.acquisition.brain_mask import FoundMask
+from g3r.acquisition.images import Volume
+from g3r.acquisition.stacks import slice_axis
+from g3r.mask_network.inference import find_brain
+from g3r.mask_network.model import MaskModel
+
+
+@dataclass(frozen=True)
+class AutomaticMask:
+    """The mask network as a masker.
+
+    Args:
+        model: trained networks.
+    """
+
+    model: MaskModel
+
+    def mask_of(self, path: str | os.PathLike[str], volume: Volume) -> FoundMask | str:
+        """The brain in a stack, or why none was found.
+
+        Args:
+            path: of the stack; not used.
+            volume: that was read from it.
+        """
+        spacing_mm = volume.grid.spacing_mm
+        through = slice_axis(spacing_mm)
+        order = [axis for axis in range(3) if axis != through] + [through]
+        image = np.nan_to_num(volume.data.transpose(order), posinf=0.0, neginf=0.0)
+        found = find_brain(image, spacing_mm[order].tolist(), self.model)
+        if not found.found:
+            return found.reason
+        detail = f"{self.model.file_name}, probability of a head {found.presence:.2f}"
+        return FoundMask(inside=np.moveaxis(found.mask, 2, through), source="automatic", detail=detail)

@@ -1,0 +1,1 @@
+"""What docs/masks.md shows: how good the automatic brain masks are."""

@@ -1,0 +1,111 @@
+"""From a stack to a mask: the way there and back, with networks that take bright for brain; and refusals."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from g3r.mask_network.config import MaskNetworkConfig
+from g3r.mask_network.inference import cleaned, find_brain, likeliest_head
+from g3r.mask_network.model import MaskModel
+from g3r.mask_network.network import MaskNetwork
+
+SPACING_MM = (1.1, 1.3, 3.5)
+
+
+def bright_is_brain(image: torch.Tensor) -> torch.Tensor:
+    return (image - 0.5) * 40
+
+
+@pytest.fixture
+def stub() -> Any:
+    network = SimpleNamespace(config=MaskNetworkConfig(), find=bright_is_brain, outline=bright_is_brain)
+    return SimpleNamespace(network=network)
+
+
+def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
+    at = np.stack(np.meshgrid(*(np.arange(n) * mm for n, mm in zip(shape, SPACING_MM, strict=True)), indexing="ij"), -1)
+    return np.linalg.norm(at - np.array(centre_mm), axis=-1) < radius_mm
+
+
+@pytest.mark.parametrize("centre", [(90.0, 70.0, 40.0), (35.0, 120.0, 50.0), (20.0, 90.0, 8.0)])
+def test_a_ball_is_outlined_where_it_is(stub: Any, centre: tuple[float, float, float]) -> None:
+    true = ball((160, 140, 25), centre, 32.0)
+    found = find_brain(true.astype(np.float32), SPACING_MM, stub)
+    assert found.found
+    assert 2 * (found.mask & true).sum() / (found.mask.sum() + true.sum()) > 0.97
+    middle = np.argwhere(true).mean(0) * SPACING_MM
+    np.testing.assert_allclose(found.centre_mm, middle, atol=1.0)
+    assert found.volume_ml == pytest.approx(true.sum() * np.prod(SPACING_MM) / 1000, rel=0.05)
+    assert found.presence > 0.9
+    assert not found.probability[~ball((160, 140, 25), centre, 120.0)].any()
+
+
+def test_the_largest_of_two_is_taken(stub: Any) -> None:
+    large, small = ball((160, 140, 25), (60.0, 60.0, 40.0), 28.0), ball((160, 140, 25), (140.0, 140.0, 40.0), 16.0)
+    found = find_brain((large | small).astype(np.float32), SPACING_MM, stub)
+    assert (found.mask & large).sum() > 0.9 * large.sum()
+    assert not (found.mask & small).any()
+
+
+def test_too_little_is_no_head(stub: Any) -> None:
+    found = find_brain(ball((160, 140, 25), (60.0, 60.0, 40.0), 9.0).astype(np.float32), SPACING_MM, stub)
+    assert not found.found
+    assert "ml" in found.reason
+    assert not found.mask.any()
+    assert np.isnan(found.centre_mm).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (np.full((20, 20, 5), np.nan), "NaN"),
+        (np.zeros((20, 20, 5)), "every value"),
+        (np.ones((20, 20)), "shape"),
+        (np.ones((20, 0, 5)), "shape"),
+    ],
+)
+def test_what_is_no_image_is_refused(stub: Any, image: np.ndarray, says: str) -> None:
+    found = find_brain(image, SPACING_MM, stub)
+    assert not found.found
+    assert says in found.reason
+
+
+def test_impossible_spacings_are_refused(stub: Any) -> None:
+    for spacing in ((1.0, 0.0, 3.0), (1.0, np.nan, 3.0), (1.0, 1.0)):
+        assert "spacing" in find_brain(np.random.default_rng(0).random((9, 9, 9)), spacing, stub).reason
+
+
+def test_untrained_networks_find_no_head_in_noise(rng: np.random.Generator) -> None:
+    torch.manual_seed(0)
+    network = MaskNetwork(MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8))).eval()
+    network.finder.out.conv.conv.bias.data.fill_(-4.0)
+    model = MaskModel(network=network, training_data="nothing")
+    assert not find_brain(rng.random((64, 60, 10)), (2.0, 2.0, 4.0), model).found
+
+
+def test_the_likeliest_head_holds_most_probability() -> None:
+    probability = np.zeros((20, 20, 20), np.float32)
+    probability[:4, :4, :4] = 0.6
+    probability[10:16, 10:14, 10:14] = 0.9
+    head = likeliest_head(probability, 5.0)
+    assert head.volume_ml == pytest.approx(6 * 4 * 4 * 0.125)
+    assert head.presence == pytest.approx(0.9)
+    assert head.is_head
+    assert not likeliest_head(np.zeros((3, 3, 3), np.float32), 5.0).is_head
+
+
+def test_parts_of_a_moving_head_stay_and_holes_are_filled() -> None:
+    mask = np.zeros((60, 60, 6), dtype=bool)
+    for k in range(6):  # a head that jumps sideways half way
+        shift = 0 if k < 3 else 12
+        mask[10 + shift : 25 + shift, 10:30, k] = True
+    holes = mask.copy()
+    holes[15, 15, 1] = False
+    holes[50:53, 50:53, 2] = True  # far off
+    np.testing.assert_array_equal(cleaned(holes, np.array([1.0, 1.0, 4.0])), mask)
+    assert not cleaned(np.zeros((4, 4, 4), dtype=bool), np.ones(3)).any()

@@ -1,0 +1,129 @@
+"""Training of the mask networks, its logs, and the way to a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from g3r.cli import export
+from g3r.errors import InputError
+from g3r.mask_network.config import MaskNetworkConfig
+from g3r.mask_network.model import MaskModel
+from g3r.prior.model import Prior
+
+pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
+
+import lightning.pytorch as lightning
+from torch.utils.data import DataLoader
+
+from g3r.training.mask_module import MaskModule, dice, scores_of, summary
+from tests.training.small_runs import in_memory, logged, trainer
+
+NETWORK = MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8))
+CONFIG = "lightning_configs/mask.yaml"
+
+
+def sample(seed: int, *, head: bool = True) -> dict[str, torch.Tensor]:
+    """A bright ball in noise."""
+    generator = torch.Generator().manual_seed(seed)
+    made = {}
+    for name, shape in {"coarse_": (24, 24, 16), "": (48, 48, 6)}.items():
+        at = torch.stack(torch.meshgrid(*(torch.arange(n) - n / 2 for n in shape), indexing="ij"), -1)
+        mask = ((at - torch.tensor([2.0, -3.0, 0.0])).norm(dim=-1) < shape[0] / 3).float() * head
+        image = 0.3 * torch.rand(shape, generator=generator) + 0.7 * mask
+        made[f"{name}image"], made[f"{name}mask"] = image[None, None], mask[None, None]
+    return made
+
+
+class TinyData(lightning.LightningDataModule):
+    """A few stacks in memory."""
+
+    def __init__(self, coarse_mm: float = 4.0, pixel_mm: float = 1.2, source: str = "/some/where/atlas") -> None:
+        super().__init__()
+        self.save_hyperparameters()
+
+    def train_dataloader(self) -> DataLoader:
+        return in_memory([sample(seed) for seed in range(4)])
+
+    def val_dataloader(self) -> DataLoader:
+        return in_memory([sample(8), sample(9, head=False)])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, MaskModule]:
+    """A run, its folder and its checkpoint."""
+    folder = tmp_path_factory.mktemp("mask")
+    lightning.seed_everything(1)
+    module = MaskModule(network=NETWORK, warmup_steps=1, learning_rate=1e-2)
+    run = trainer(folder, max_epochs=30, check_val_every_n_epoch=15)
+    run.fit(module, datamodule=TinyData())
+    path = folder / "run.ckpt"
+    run.save_checkpoint(path)
+    return folder, path, module
+
+
+def test_the_loss_falls(trained: tuple[Path, Path, MaskModule]) -> None:
+    board = logged(trained[0] / "run" / "version_0")
+    for name in ("train/find_loss", "train/outline_loss"):
+        values = [point.value for point in board.Scalars(name)]
+        assert values[-1] < 0.6 * values[0], name
+    names = set(board.Tags()["scalars"])
+    assert {"val/outline_dice", "val/find_dice", "val/false_heads", "train/samples_per_second"} <= names
+    assert board.Tags()["images"]
+
+
+def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:
+    _, checkpoint, module = trained
+    file = tmp_path / "mask.safetensors"
+    assert export.main([str(checkpoint), str(file)]) == 0
+    model = MaskModel.load(file)
+    assert model.network.config == NETWORK
+    assert "atlas" in model.training_data
+    assert "/some" not in model.training_data
+    image = sample(3)["image"]
+    module.eval()
+    with torch.inference_mode():
+        torch.testing.assert_close(
+            torch.sigmoid(model.network.outline(image)), torch.sigmoid(module.network.outline(image)), atol=0.02, rtol=0
+        )
+    with pytest.raises(InputError, match="not a prior checkpoint"):
+        Prior.load(file)
+
+
+def test_start_from(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:
+    again = MaskModule(network=NETWORK, start_from=str(trained[1]))
+    for name, value in trained[2].network.state_dict().items():
+        assert torch.equal(again.network.state_dict()[name].cpu(), value.cpu()), name
+    with pytest.raises(InputError, match="start_from"):
+        MaskModule(network=NETWORK, start_from=str(tmp_path / "none.ckpt"))
+
+
+def test_data_of_another_resolution_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"data\.pixel_mm: 2\.0"):
+        trainer(tmp_path, max_epochs=1).fit(MaskModule(network=NETWORK), datamodule=TinyData(pixel_mm=2.0))
+
+
+def test_scores() -> None:
+    batch = sample(1)
+    found = scores_of(batch["coarse_mask"], batch["mask"], batch, MaskNetworkConfig(pixel_mm=4.0))
+    assert found == {"found": 1.0, "find_dice": 1.0, "centre_mm": 0.0, "outline_dice": 1.0}
+    none = sample(1, head=False)
+    assert scores_of(none["coarse_mask"], none["mask"], none, NETWORK) == {"false_heads": 0.0}
+    assert scores_of(batch["coarse_mask"], batch["mask"], none, NETWORK) == {"false_heads": 1.0}
+    assert summary([found, {"false_heads": 1.0}])["false_heads"] == 1.0
+    assert dice(torch.tensor([True, False]), torch.tensor([True, True])) == pytest.approx(2 / 3)
+
+
+def test_impossible_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="finder_weight"):
+        MaskModule(network=NETWORK, finder_weight=0.0)
+
+
+def test_the_config_names_what_exists() -> None:
+    settings: dict[str, Any] = yaml.safe_load(Path(CONFIG).read_text(encoding="utf-8"))
+    assert settings["model"]["class_path"] == f"{MaskModule.__module__}.{MaskModule.__qualname__}"
+    assert settings["data"]["class_path"] == "data_synth.mask_data.MaskDataModule"
