@@ -43,6 +43,10 @@ class FoundMask:
     source: MaskSource
     detail: str = ""
 
+    def volume_ml(self, volume: Volume) -> float:
+        """Size of what is marked in an image."""
+        return float(np.count_nonzero(self.inside) * volume.grid.voxel_volume_mm3 / 1000)
+
     def hash(self) -> FileHash:
         """By which a mask that is no file is told from another one."""
         return FileHash(self.source, hashlib.sha256(np.packbits(self.inside).tobytes()).hexdigest())

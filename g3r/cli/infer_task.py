@@ -71,7 +71,7 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     sources = {"prior": options.ckpt, "pose": options.pose_ckpt or set_of(options.ckpt)}
     networks = {kind: weights_path(source, kind) for kind, source in sources.items() if source}
     if needs_network(options):
-        networks["mask"] = mask_weights_path(options)
+        networks["mask"] = mask_weights_path(options.mask_ckpt, options.ckpt)
     sidecars = [path for path in map(sidecar_path, options.stacks) if os.path.isfile(path)]
     masks = [mask for mask in given_masks(options) if mask is not None]
     inputs = [*options.stacks, *sidecars, *masks, *networks.values()]

@@ -26,6 +26,14 @@ def add_mask_options(parser: argparse.ArgumentParser) -> None:
         metavar="NIFTI",
         help="brain masks, one per stack, same order; auto in place of a file, or of all files, finds it (the default)",
     )
+    add_masker_options(parser)
+    parser.add_argument(
+        "--whole-image", action="store_true", help="every positive voxel is brain: the stacks show nothing else"
+    )
+
+
+def add_masker_options(parser: argparse.ArgumentParser) -> None:
+    """The options that say who finds masks."""
     parser.add_argument(
         "--mask-command",
         metavar="'CMD {stack} {mask}'",
@@ -36,9 +44,6 @@ def add_mask_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mask-ckpt", metavar="MASK.safetensors", help="mask network from g3r-export (default: shipped)"
-    )
-    parser.add_argument(
-        "--whole-image", action="store_true", help="every positive voxel is brain: the stacks show nothing else"
     )
 
 
@@ -54,6 +59,11 @@ def check_mask_options(parser: argparse.ArgumentParser, options: argparse.Namesp
         )
     if options.whole_image and (options.masks or options.mask_command):
         parser.error("--whole-image excludes --masks and --mask-command: it says that no mask is needed")
+    check_masker_options(parser, options)
+
+
+def check_masker_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the program with 2 where options on a masker make no sense."""
     missing = [place for place in ("{stack}", "{mask}") if place not in (options.mask_command or place)]
     if missing:
         parser.error(f"--mask-command: no {' and no '.join(missing)} in {options.mask_command!r}; the tool gets both")
@@ -74,20 +84,24 @@ def needs_network(options: argparse.Namespace) -> bool:
     return None in given_masks(options) and not options.whole_image and not options.mask_command
 
 
-def mask_weights_path(options: argparse.Namespace) -> Path:
+def mask_weights_path(given: str | None, prior: str | None = None) -> Path:
     """The file of the mask network.
 
+    Args:
+        given: path of it.
+        prior: path or set of the prior's weights, whose set is meant for all networks.
+
     Raises:
-        InputError: the set of weights that was asked for holds none.
+        InputError: the set holds no mask network.
     """
     from g3r.checkpoints.shipped import set_of, weights_path
 
-    name = None if options.mask_ckpt else set_of(options.ckpt)
-    path = weights_path(options.mask_ckpt or name, "mask")
+    name = None if given else set_of(prior)
+    path = weights_path(given or name, "mask")
     if name and not path.is_file():
         raise InputError(
-            f"--ckpt {name}: this set of weights has no mask network; pass --masks, --mask-command, or --mask-ckpt with a "
-            "network whose terms suit you"
+            f"--ckpt {name}: this set of weights has no mask network; pass --masks, --mask-command, or --mask-ckpt "
+            "with a network whose terms suit you"
         )
     return path
 
@@ -104,15 +118,20 @@ def masked_stacks(options: argparse.Namespace, weights: WeightsFile | None) -> M
     """
     from g3r.masking.find import find_masks
 
-    return find_masks(options.stacks, given_masks(options), _masker(options, weights))
-
-
-def _masker(options: argparse.Namespace, weights: WeightsFile | None) -> Masker:
-    """What finds the masks that are not given."""
     if options.whole_image:
         from g3r.acquisition.brain_mask import whole_image
 
-        return lambda path, volume: whole_image(volume)
+        return find_masks(options.stacks, None, lambda path, volume: whole_image(volume))
+    return find_masks(options.stacks, given_masks(options), masker_of(options, weights))
+
+
+def masker_of(options: argparse.Namespace, weights: WeightsFile | None) -> Masker:
+    """What finds the masks that are not given.
+
+    Args:
+        options: of `add_masker_options`, and `threads`.
+        weights: of the mask network; None where it is not asked.
+    """
     if options.mask_command:
         from g3r.masking.command import TIMEOUT_S, MaskCommand
 

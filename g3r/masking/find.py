@@ -65,7 +65,7 @@ def find_masks(
             left_out.append(f"{volume.name}: left out, {found}")
             continue
         masks[n] = found
-        found_ml[n] = float(np.count_nonzero(found.inside) * volume.grid.voxel_volume_mm3 / 1000)
+        found_ml[n] = found.volume_ml(volume)
         logger.info("%s: mask: %s, %.0f ml (%s)", volume.name, found.source, found_ml[n], found.detail)
     for n in _odd_ones(masks, found_ml):
         left_out.append(
