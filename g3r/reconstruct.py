@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 
-from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
@@ -16,6 +15,7 @@ from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
+from g3r.fitting.mask_agreement import FOUND
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
@@ -31,6 +31,7 @@ from g3r.pose_network.model import PoseModel
 from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_search import template_fits
+from g3r.registration.quality import unknown_orientation_note
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
 
@@ -61,8 +62,7 @@ class GaussianReconstructor:
         device: str = "auto",
         observer: FitObserver | None = None,
     ) -> None:
-        self.settings = preset(settings) if isinstance(settings, str) else settings
-        self.observer = observer
+        self.settings, self.observer = preset(settings) if isinstance(settings, str) else settings, observer
         low, high = RESOLUTION_RANGE_MM
         if not low <= self.settings.resolution_mm <= high:
             raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
@@ -102,7 +102,8 @@ class GaussianReconstructor:
         slices, intensity = normalised_slices(stacks)
         run.notes += skipped_slice_notes(stacks, slices)
         poses = self._poses(slices, registration, plan, run)
-        volumes = self._volumes(poses, run)
+        stacks, poses = self._masks(stacks, poses, intensity, run)
+        volumes = run.stage(Stage.COARSE, lambda: self.subject_prior.volumes(poses))
         prior = self._prior(volumes, poses, plan, run)
         prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
@@ -161,18 +162,22 @@ class GaussianReconstructor:
                 poses = with_pixels_of(slices, given)
         else:
             deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
-            settings = plan.settings.registration
-            poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, settings, report, deadline))
+            asked = plan.settings.registration
+            poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, asked, report, deadline))
         if plan.settings.registration.standard_orientation and poses.orientation is None:
-            run.notes.append(
-                "standard orientation unknown, the volume stays in scanner space: no atlas template fits the "
-                f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
-            )
+            run.notes.append(unknown_orientation_note(slices))
         return poses
 
-    def _volumes(self, poses: Registration, run: RunContext) -> InitialVolumes:
-        """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""
-        return run.stage(Stage.COARSE, lambda: self.subject_prior.volumes(poses))
+    def _masks(
+        self, stacks: Sequence[Stack], poses: Registration, intensity: float, run: RunContext
+    ) -> tuple[Sequence[Stack], Registration]:
+        """Stacks and slices with masks that were found once more, with what registration knows."""
+        if not any(stack.mask_source in FOUND for stack in stacks):
+            return stacks, poses
+        with run.clock(Stage.MASKS):
+            refined = self.subject_prior.refined_masks(stacks, poses, intensity)
+        run.notes += refined.notes
+        return refined.stacks, refined.poses
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
@@ -274,7 +279,7 @@ class GaussianReconstructor:
         if cloud is None:
             return None
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
-        widths = held_out.widths if held_out else None
+        stage, widths = settings.slice_stage, held_out.widths if held_out else None
 
         def fit() -> SliceFit:
             target = slice_target(prior, poses.weight, settings.slice_model, widths)
@@ -284,7 +289,7 @@ class GaussianReconstructor:
                 gain=prior.gain,
                 weight=poses.weight,
                 prior=distillation_target(prior) if settings.use_prior and settings.distillation else None,
-                settings=settings.slice_stage,
+                settings=stage,
                 rng=stage_rng(settings.seed, Stage.FIT_TO_SLICES),
                 pixel_weight=target.pixel_weight,
                 progress=run.report(Stage.FIT_TO_SLICES),
@@ -292,7 +297,4 @@ class GaussianReconstructor:
                 observer=self.observer,
             )
 
-        def steps_of(result: SliceFit) -> tuple[int, int]:
-            return len(result.history), settings.slice_stage.n_steps
-
-        return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, steps_of)
+        return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, lambda result: (len(result.history), stage.n_steps))

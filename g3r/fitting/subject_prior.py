@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.stacks import Stack
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.fitting.mask_agreement import RefinedMasks, refine_masks
 from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.prior.inference import Tiling
 from g3r.prior.model import Prior
@@ -36,6 +39,16 @@ class SubjectPrior:
     network: Prior | None
     voxel_mm: float
     common_bias_field: bool = True
+
+    def refined_masks(self, stacks: Sequence[Stack], poses: Registration, intensity: float) -> RefinedMasks:
+        """Masks that were found, refined with the network's atlas template; see `refine_masks`.
+
+        Args:
+            stacks: as they were registered.
+            poses: of their slices.
+            intensity: of 1 in these slices.
+        """
+        return refine_masks(stacks, poses, intensity, placed_template(self.network, poses.orientation))
 
     def volumes(self, poses: Registration) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""

@@ -12,6 +12,7 @@ class Stage(StrEnum):
 
     LOADING = "loading"
     REGISTRATION = "registration"
+    MASKS = "masks"
     COARSE = "coarse volume"
     PRIOR = "prior"
     SLICES_TO_PRIOR = "slices to prior"

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from g3r.acquisition.area_profile import head_volume_mm3
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.registration.estimate import Registration
 from g3r.registration.thresholds import (
@@ -51,6 +53,14 @@ class StackQuality:
     def record(self) -> dict[str, Any]:
         """For run.json."""
         return asdict(self)
+
+
+def unknown_orientation_note(slices: Slices) -> str:
+    """Why a volume stays in scanner space though the standard orientation was asked for."""
+    return (
+        "standard orientation unknown, the volume stays in scanner space: no atlas template fits the "
+        f"{head_volume_mm3(slices) / 1000:.0f} ml that are masked; check the masks"
+    )
 
 
 def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQuality]:
