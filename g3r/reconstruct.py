@@ -15,7 +15,7 @@ from g3r.checkpoints.weights_file import WeightsFile
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
-from g3r.fitting.mask_agreement import FOUND
+from g3r.fitting.mask_agreement import REFINED
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
@@ -172,7 +172,7 @@ class GaussianReconstructor:
         self, stacks: Sequence[Stack], poses: Registration, intensity: float, run: RunContext
     ) -> tuple[Sequence[Stack], Registration]:
         """Stacks and slices with masks that were found once more, with what registration knows."""
-        if not any(stack.mask_source in FOUND for stack in stacks):
+        if not any(stack.mask_source == REFINED for stack in stacks):
             return stacks, poses
         with run.clock(Stage.MASKS):
             refined = self.subject_prior.refined_masks(stacks, poses, intensity)

@@ -24,8 +24,8 @@ from g3r.geometry.grid import bounding_box, on_grid
 from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration import Registration
 
-FOUND = ("automatic", "command")
-"""Masks of these sources are refined; what a person drew is not."""
+REFINED = "automatic"
+"""Masks of this source are refined; what a person drew, or a tool of the user's made, is not."""
 
 VOXEL_MM = 2.0
 """Of the maps that carry the votes."""
@@ -61,7 +61,7 @@ def refine_masks(
     """
     slices = registration.slices
     present = [int(n) for n in np.unique(slices.stack_id)]
-    found = [n for n in present if stacks[n].mask_source in FOUND]
+    found = [n for n in present if stacks[n].mask_source == REFINED]
     if not found or (len(present) == 1 and template is None):
         return RefinedMasks(stacks=list(stacks), poses=registration, notes=[])
     grid = grid_around(slices, VOXEL_MM, margin_mm=MARGIN_MM)
