@@ -47,7 +47,7 @@ class MaskModule(AnnealedModule):
     def __init__(
         self,
         network: MaskNetworkConfig = DEFAULT_NETWORK,
-        learning_rate: float = 2e-3,
+        learning_rate: float = 4e-3,
         weight_decay: float = 1e-4,
         warmup_steps: int = 50,
         finder_weight: float = 1.0,
