@@ -31,7 +31,7 @@ class MaskNetwork(nn.Module):
         self.config = config
         self.finder = SubpixelUNet(config.finder_channels, (2, 2, 2), n_flat=0)
         self.outliner = SubpixelUNet(config.outline_channels, (2, 2, 1), n_flat=N_FLAT_LEVELS)
-        nn.init.constant_(self.finder.out.conv.conv.bias, RARE_LOGIT)  # type: ignore[arg-type, union-attr]
+        nn.init.constant_(self.finder.out.conv.conv.bias, RARE_LOGIT)
 
     def find(self, image: Tensor) -> Tensor:
         """Logits of brain in whole stacks [B, 1, I, J, K], isotropic at `coarse_mm`, in any units."""
