@@ -97,8 +97,6 @@ def tables(record: Record) -> dict[str, str]:
         "true masks, dB": "{true_psnr_db:.2f}",
         "found masks, dB": "{found_psnr_db:.2f}",
         "difference": _difference,
-            f"{row['found_psnr_db'] - row['true_psnr_db']:+.2f}" if "found_psnr_db" in row else ""
-        ),
         "poses with true masks, mm": "{true_poses_mm:.2f}",
         "with found masks, mm": "{found_poses_mm:.2f}",
     }
