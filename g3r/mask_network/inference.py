@@ -42,7 +42,7 @@ BESIDE_MM = 14.0
 """Further slices on each side of what was found."""
 JOIN_MM = 6.0
 """Parts of a mask no further from each other belong together: a head moves between slices."""
-FLIPS: tuple[tuple[int, ...], ...] = ((), (2,), (3,), (2, 3))
+FLIPS: tuple[tuple[int, ...], ...] = ((), (2, 3))
 """Axes of a tensor along which the images are mirrored for further estimates."""
 
 
@@ -138,12 +138,27 @@ def cleaned(mask: NDArray[np.bool_], spacing_mm: Array) -> NDArray[np.bool_]:
         mask: [I, J, K].
         spacing_mm: [3].
     """
+    index = np.argwhere(mask)
+    if not len(index):
+        return mask
     reach = np.maximum(np.round(JOIN_MM / 2 / spacing_mm[:2]).astype(int), 1)
+    low, high = index.min(0), index.max(0) + 1
+    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    result = np.zeros_like(mask)
+    result[part] = _joined(mask[part], reach)
+    return result
+
+
+def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """The largest part of a mask that is not empty, see `cleaned`.
+
+    Args:
+        mask: [I, J, K].
+        reach: pixels by which parts are widened along both axes of the plane.
+    """
     element = np.ones((2 * reach[0] + 1, 2 * reach[1] + 1, 1), dtype=bool)
     near = np.stack([np.any(mask[:, :, max(k - 1, 0) : k + 1], 2) for k in range(mask.shape[2])], 2)
     parts, n = label(binary_dilation(near, element))
-    if n == 0:
-        return mask
     size = np.bincount(parts[mask], minlength=n + 1)
     size[0] = 0
     kept = mask & (parts == int(size.argmax()))
