@@ -86,11 +86,14 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     if refused:
         return _nothing(image.shape, refused)
     network = model.network
-    tried = [_mask_in(network, image, spacing, low, high) for low, high in _boxes(network, image, spacing)]
-    best, score = max(tried, key=lambda found: found[1], default=(None, 0.0))
-    if best is None or score == 0:
+    coarse, boxes = _boxes(network, image, spacing)
+    tried = [_mask_in(network, image, spacing, low, high) for low, high in boxes]
+    # from near and from afar it should look like a brain
+    scores = [float((probability * coarse)[mask].sum()) for mask, probability in tried]
+    if not any(scores):
         return _nothing(image.shape, "no head found: nothing in the image looks like a brain")
     # again about what was outlined: the place was a rough one
+    best, _ = tried[int(np.argmax(scores))]
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
     mask = cleaned(probability > 0.5, spacing)
@@ -189,8 +192,8 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
     )
 
 
-def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> list[tuple[Array, Array]]:
-    """Where a head may be: lowest and highest positions [3] along the axes (mm from the first voxel)."""
+def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> tuple[Image, list[tuple[Array, Array]]]:
+    """Coarse probability on the stack's grid, and boxes where a head may be: two positions [3] (mm) each."""
     step = network.config.coarse_mm
     at = [
         centred_positions_mm(max(1, round(n * mm / step)), step, n, mm)
@@ -201,7 +204,11 @@ def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> list[tuple[Arr
     places = [np.array([a[k] for a, k in zip(at, place, strict=True)]) for place in likely_places(probability, step)]
     # the crop's size in the plane is never less than `CROP_MM`
     reach = np.array([0.0, 0.0, APART_MM])
-    return [(place - reach, place + reach) for place in places]
+    back = [
+        axis_weights(len(a), step, np.arange(n) * mm - a[0], mm)
+        for n, mm, a in zip(image.shape, spacing, at, strict=True)
+    ]
+    return along_axes(probability, back), [(place - reach, place + reach) for place in places]
 
 
 def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
@@ -212,11 +219,10 @@ def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
 
 def _mask_in(
     network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array
-) -> tuple[NDArray[np.bool_], float]:
-    """The mask outlined about a box, see `_outlined`, and the sum of its probabilities."""
+) -> tuple[NDArray[np.bool_], Image]:
+    """The mask outlined about a box, and the probability of brain; see `_outlined`."""
     probability = _outlined(network, image, spacing, low, high, FLIPS[:1])
-    mask = cleaned(probability > 0.5, spacing)
-    return mask, float(probability[mask].sum())
+    return cleaned(probability > 0.5, spacing), probability
 
 
 def _outlined(
