@@ -135,12 +135,14 @@ def _face_and_neck(
     """
     front, down = 0.62 * radius * rng.uniform(0.9, 1.1), -0.62 * radius * rng.uniform(0.9, 1.1)
     face = ellipsoid(points, (0, front, down), (0.55 * radius, 0.62 * radius, 0.6 * radius))
+    # the base of the skull and the jaw are as wide as the head
+    jaw = ellipsoid(points, (0, 0.2 * radius, -0.8 * radius), tuple(radius * rng.uniform(0.55, 0.85, 3)))
     tilt = rng.uniform(-0.2, 0.6)
     end = base + np.array([0, tilt, -1.0]) * 70
     thick = radius * rng.uniform(0.4, 0.55)
     neck = tube(points, [tuple(base), tuple(end)], [thick, thick])
     labels = np.zeros(np.broadcast_shapes(*(p.shape for p in points)), np.uint8)
-    both = (face > 0) | (neck > 0)
+    both = (face > 0) | (neck > 0) | (jaw > 0)
     labels[both] = np.select(
         [mosaic[both] < -0.8, mosaic[both] < 0.1, mosaic[both] < 1.2],
         [Tissue.BONE, Tissue.FACE_MUSCLE, Tissue.FACE_FAT],

@@ -21,6 +21,10 @@ LOOK_MM = 2.0
 """Pixels of which those of the coarse grid are made."""
 JITTER_MM = 6.0
 """Standard deviation of a crop's centre per axis: as far as a found head may be off."""
+FAR_JITTER_MM = 25.0
+"""That of some crops: a head is not to be known by being in the middle."""
+ELSEWHERE_SHARE = 0.25
+"""Crops about another place, where the network is to see that there is no head, or one at the rim."""
 BESIDE_SLICES = 3
 MAX_NOISE = 0.08
 COARSE_NOISE = 0.035
@@ -108,7 +112,10 @@ def _crop(scan: Scan, rng: np.random.Generator, pixel_mm: float, shape: tuple[in
         shown = np.flatnonzero(area > 1)
         low, high = (int(shown[0]), int(shown[-1])) if len(shown) else (0, n_slices - 1)
         middle = int(rng.integers(low - BESIDE_SLICES, high + BESIDE_SLICES + 1))
-        centre = centre + rng.normal(0, JITTER_MM, 2)
+        if rng.random() < ELSEWHERE_SHARE:
+            aside = scan.trunk_mm() if rng.random() < 0.4 else np.append(centre, 0) + rng.uniform(-90, 90, 3)
+            centre, middle = aside[:2], int(np.abs(scan.depth_mm - aside[2]).argmin())
+        centre = centre + rng.normal(0, JITTER_MM if rng.random() < 0.7 else FAR_JITTER_MM, 2)
     else:
         middle = int(rng.integers(n_slices))
         centre = rng.uniform(-0.4, 0.4, 2) * scan.fov_mm

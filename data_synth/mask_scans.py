@@ -71,6 +71,11 @@ class Scan:
     gain: NDArray[np.float32]
     with_head: bool
 
+    def trunk_mm(self) -> Array:
+        """Centre of the fetal trunk from the middle of the field of view, along rows, columns and slices [3]."""
+        along = self.scene.around.trunk_mm @ self.scan_pose.rotation[0]
+        return along + self.centre_mm
+
     def images(
         self,
         first_mm: tuple[float, float],

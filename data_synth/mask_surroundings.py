@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 SPACING_MM = 2.5
 HALF_MM = 190.0
 """Half the edge of the cube that is filled."""
+INNER = (Tissue.FETAL_BODY, Tissue.LIVER, Tissue.LUNG, Tissue.FETAL_FLUID, Tissue.BONE)
 ORGANS = (Tissue.ORGAN_A, Tissue.ORGAN_B, Tissue.ORGAN_C, Tissue.ORGAN_D, Tissue.FAT, Tissue.MUSCLE)
 
 
@@ -108,6 +109,8 @@ def draw_surroundings(base_mm: Array, radius_mm: float, rng: np.random.Generator
         _maternal_body(canvas, middle, mother, rng)
     _uterus(canvas, uterus, r, rng)
     canvas.put(Tissue.FETAL_BODY, trunk, size, bend)
+    if rng.random() < 0.7:  # bowel, kidneys and much else: as mixed as a brain
+        _mix(canvas, trunk, size - rng.uniform(1.5, 5), bend, rng)
     canvas.put(Tissue.LUNG, trunk - down * 0.45 * size[2], size * 0.55, bend, rough=0.1)
     canvas.put(Tissue.LIVER, trunk + down * 0.15 * size[2], size * [0.7, 0.6, 0.35], bend, rough=0.1)
     for _ in range(int(rng.integers(0, 5))):
@@ -186,6 +189,25 @@ def _shell(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.rando
     canvas.put(int(rng.choice([Tissue.BONE, Tissue.MUSCLE])), at, radius + shell, turn)
     canvas.put(Tissue.MATERNAL_FLUID, at, radius, turn)
     canvas.put(int(rng.choice([Tissue.DISTRACTOR, Tissue.PLACENTA])), at, radius - fluid, turn, rough=0.05)
+    if rng.random() < 0.5:
+        _mix(canvas, at, np.maximum(radius - fluid - 2, 5), turn, rng)
+
+
+def _mix(canvas: _Canvas, at: Array, radius: Array, turn: Array, rng: np.random.Generator) -> None:
+    """An ellipsoid of patches of a few tissues.
+
+    Args:
+        canvas: to paint on.
+        at: [3] its centre (mm).
+        radius: [3] its half axes (mm).
+        turn: [3, 3] its axes as columns.
+        rng: source of randomness.
+    """
+    part, value = canvas.ellipsoid(at, radius, turn)
+    kinds = rng.choice([*INNER, *ORGANS], 4)
+    first, second = (lattice_noise(value.shape, float(rng.uniform(1.5, 6)), rng) for _ in range(2))
+    patch = np.select([first < -0.6, first < 0.3, second < 0.5], kinds[:3], kinds[3])
+    canvas.labels[part] = np.where(value > 0, patch, canvas.labels[part])
 
 
 def _uterus(canvas: _Canvas, uterus: Ellipsoid, r: float, rng: np.random.Generator) -> None:

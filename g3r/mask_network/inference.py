@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_fill_holes, label
+from scipy.ndimage import binary_dilation, binary_fill_holes, gaussian_filter, label
 
 from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
 
@@ -26,9 +26,14 @@ MIN_VOLUME_ML = 10.0
 """What is smaller is no head; at 19 weeks a brain has 20 ml, and a stack may show half of it."""
 MIN_PRESENCE = 0.65
 """Mean probability of a mask that is taken for a brain."""
-N_CANDIDATES = 3
+N_PLACES = 3
 """Places at which a brain is outlined; the one that looks most like it from near is taken."""
-MIN_CANDIDATE_ML = 4.0
+PLACE_MM = 12.0
+"""Standard deviation of the smoothing before the most likely places are looked for."""
+APART_MM = 45.0
+"""Distance of places from each other, and how far from a place slices are looked at."""
+MIN_PLACE = 0.02
+"""Smoothed probability below which a place is not looked at."""
 CROP_MM = 150.0
 """Smallest edge of the crop in which the brain is outlined."""
 AROUND_MM = 20.0
@@ -37,7 +42,7 @@ BESIDE_MM = 14.0
 """Further slices on each side of what was found."""
 JOIN_MM = 6.0
 """Parts of a mask no further from each other belong together: a head moves between slices."""
-FLIPS: tuple[tuple[int, ...], ...] = ((), (2,), (3,), (2, 3))
+FLIPS: tuple[tuple[int, ...], ...] = ((), (2, 3))
 """Axes of a tensor along which the images are mirrored for further estimates."""
 
 
@@ -67,20 +72,6 @@ class BrainMask:
         return not self.reason
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A part of a coarse probability: `inside` [A, B, C], its volume (ml) and its mean probability."""
-
-    inside: NDArray[np.bool_]
-    volume_ml: float
-    presence: float
-
-    @property
-    def is_head(self) -> bool:
-        """Whether it is large and certain enough for a head, as far as can be seen coarsely."""
-        return self.volume_ml >= MIN_VOLUME_ML and self.presence >= MIN_PRESENCE
-
-
 def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: MaskModel) -> BrainMask:
     """Find the fetal brain in a stack and outline it.
 
@@ -94,19 +85,17 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     refused = _refusal(image, spacing)
     if refused:
         return _nothing(image.shape, refused)
-    best, score = None, 0.0
-    for low, high in _boxes(model.network, image, spacing):
-        probability = _outlined(model.network, image, spacing, low, high, FLIPS[:1])
-        mask = cleaned(probability > 0.5, spacing)
-        total = float(probability[mask].sum())
-        if total > score:
-            best, score = mask, total
-    if best is None:
+    network = model.network
+    coarse, boxes = _boxes(network, image, spacing)
+    tried = [_mask_in(network, image, spacing, low, high) for low, high in boxes]
+    # from near and from afar it should look like a brain
+    scores = [float((probability * coarse)[mask].sum()) for mask, probability in tried]
+    if not any(scores):
         return _nothing(image.shape, "no head found: nothing in the image looks like a brain")
-    # once more about what was outlined, which is more exact than what was found coarsely
-    index = np.argwhere(best)
-    low, high = index.min(0) * spacing, index.max(0) * spacing
-    probability = _outlined(model.network, image, spacing, low, high, FLIPS)
+    # again about what was outlined: the place was a rough one
+    best, _ = tried[int(np.argmax(scores))]
+    again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
+    probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
     mask = cleaned(probability > 0.5, spacing)
     volume_ml = float(mask.sum() * spacing.prod() / 1000)
     presence = float(probability[mask].mean()) if mask.any() else 0.0
@@ -125,20 +114,24 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     )
 
 
-def candidates(probability: Image, voxel_mm: float) -> list[Candidate]:
-    """The parts of a coarse probability that may be a head, those with most brain first.
+def likely_places(probability: Image, voxel_mm: float) -> list[NDArray[np.int64]]:
+    """Where a brain may be: voxels [3] about which there is most probability, the likeliest first.
 
     Args:
         probability: [A, B, C] of brain, isotropic.
         voxel_mm: its voxel size.
     """
-    parts, n = label(probability > 0.5)
-    weight = np.bincount(parts.ravel(), probability.ravel(), minlength=n + 1)[1:]
-    found = []
-    for number in np.argsort(-weight, kind="stable")[:N_CANDIDATES]:
-        inside = parts == 1 + int(number)
-        found.append(Candidate(inside, float(inside.sum() * voxel_mm**3 / 1000), float(probability[inside].mean())))
-    return found
+    left = gaussian_filter(probability, PLACE_MM / voxel_mm, mode="constant")
+    index = np.indices(left.shape)
+    places = []
+    for _ in range(N_PLACES):
+        place = np.array(np.unravel_index(int(left.argmax()), left.shape))
+        if left[tuple(place)] < MIN_PLACE:
+            break
+        places.append(place)
+        off = ((index - place[:, None, None, None]) ** 2).sum(0)
+        left[off < (APART_MM / voxel_mm) ** 2] = 0
+    return places
 
 
 def cleaned(mask: NDArray[np.bool_], spacing_mm: Array) -> NDArray[np.bool_]:
@@ -148,12 +141,27 @@ def cleaned(mask: NDArray[np.bool_], spacing_mm: Array) -> NDArray[np.bool_]:
         mask: [I, J, K].
         spacing_mm: [3].
     """
+    index = np.argwhere(mask)
+    if not len(index):
+        return mask
     reach = np.maximum(np.round(JOIN_MM / 2 / spacing_mm[:2]).astype(int), 1)
+    low, high = index.min(0), index.max(0) + 1
+    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    result = np.zeros_like(mask)
+    result[part] = _joined(mask[part], reach)
+    return result
+
+
+def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """The largest part of a mask that is not empty, see `cleaned`.
+
+    Args:
+        mask: [I, J, K].
+        reach: pixels by which parts are widened along both axes of the plane.
+    """
     element = np.ones((2 * reach[0] + 1, 2 * reach[1] + 1, 1), dtype=bool)
     near = np.stack([np.any(mask[:, :, max(k - 1, 0) : k + 1], 2) for k in range(mask.shape[2])], 2)
     parts, n = label(binary_dilation(near, element))
-    if n == 0:
-        return mask
     size = np.bincount(parts[mask], minlength=n + 1)
     size[0] = 0
     kept = mask & (parts == int(size.argmax()))
@@ -184,22 +192,37 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
     )
 
 
-def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> list[tuple[Array, Array]]:
-    """Where a head may be: lowest and highest positions [3] along the axes (mm from the first voxel)."""
+def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> tuple[Image, list[tuple[Array, Array]]]:
+    """Coarse probability on the stack's grid, and boxes where a head may be: two positions [3] (mm) each."""
     step = network.config.coarse_mm
     at = [
         centred_positions_mm(max(1, round(n * mm / step)), step, n, mm)
         for n, mm in zip(image.shape, spacing, strict=True)
     ]
     weights = [axis_weights(n, mm, a, step) for n, mm, a in zip(image.shape, spacing, at, strict=True)]
-    found = []
-    for one in candidates(_probability(network.find, along_axes(image, weights), FLIPS), step):
-        if one.volume_ml >= MIN_CANDIDATE_ML:
-            index = np.argwhere(one.inside)
-            ends = np.stack([index.min(0), index.max(0)])
-            box = np.stack([a[ends[:, axis]] for axis, a in enumerate(at)], axis=1)
-            found.append((box[0], box[1]))
-    return found
+    probability = _probability(network.find, along_axes(image, weights), FLIPS)
+    places = [np.array([a[k] for a, k in zip(at, place, strict=True)]) for place in likely_places(probability, step)]
+    # the crop's size in the plane is never less than `CROP_MM`
+    reach = np.array([0.0, 0.0, APART_MM])
+    back = [
+        axis_weights(len(a), step, np.arange(n) * mm - a[0], mm)
+        for n, mm, a in zip(image.shape, spacing, at, strict=True)
+    ]
+    return along_axes(probability, back), [(place - reach, place + reach) for place in places]
+
+
+def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
+    """Lowest and highest positions [3] of a mask (mm from the first voxel)."""
+    index = np.argwhere(mask)
+    return index.min(0) * spacing, index.max(0) * spacing
+
+
+def _mask_in(
+    network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array
+) -> tuple[NDArray[np.bool_], Image]:
+    """The mask outlined about a box, and the probability of brain; see `_outlined`."""
+    probability = _outlined(network, image, spacing, low, high, FLIPS[:1])
+    return cleaned(probability > 0.5, spacing), probability
 
 
 def _outlined(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import candidates
+from g3r.mask_network.inference import APART_MM, likely_places
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork, normalised
 from g3r.training.annealed_module import AnnealedModule
@@ -144,7 +144,10 @@ def dice(predicted: Tensor, true: Tensor) -> float:
 
 
 def scores_of(coarse: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkConfig) -> dict[str, float]:
-    """Dice of both networks and the error of the found head's centre where there is a head; what is found elsewhere.
+    """Dice of both networks, and whether and how near the head was found; where there is none, what they take for it.
+
+    `found` is whether one of the places that would be looked at is near the head, `centre_mm` the error of the first.
+    `false_find` and `false_outline` are volumes in ml, the slices taken to be as thick as a pixel is wide.
 
     Args:
         coarse: [1, 1, A, B, C] probabilities of the localiser.
@@ -153,18 +156,19 @@ def scores_of(coarse: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkCon
         config: of the networks.
     """
     voxel_ml = config.coarse_mm**3 / 1000
-    found = candidates(coarse[0, 0].float().cpu().numpy(), config.coarse_mm)
-    is_head = bool(found) and found[0].is_head
+    places = likely_places(coarse[0, 0].float().cpu().numpy(), config.coarse_mm)
     true = batch["coarse_mask"][0, 0].cpu() > 0.5
     result = {}
     if not bool((batch["coarse_mask"] > 0).any()):
-        return {"false_heads": float(is_head)}
+        elsewhere = {"find": (coarse, config.coarse_mm**3), "outline": (fine, config.pixel_mm**3)}
+        return {f"false_{name}": float((p > 0.5).sum()) * mm3 / 1000 for name, (p, mm3) in elsewhere.items()}
     if float(true.sum()) * voxel_ml > 2 * MIN_TRUE_ML:
-        result["found"] = float(is_head)
         result["find_dice"] = dice(coarse[0, 0].cpu() > 0.5, true)
-        if is_head:
-            off = np.argwhere(found[0].inside).mean(0) - np.argwhere(true.numpy()).mean(0)
-            result["centre_mm"] = float(np.linalg.norm(off) * config.coarse_mm)
+        middle = np.argwhere(true.numpy()).mean(0)
+        off_mm = [float(np.linalg.norm(place - middle)) * config.coarse_mm for place in places]
+        result["found"] = float(min(off_mm, default=np.inf) < APART_MM)
+        if off_mm:
+            result["centre_mm"] = off_mm[0]
     outlined = batch["mask"] > 0.5
     if float(outlined.sum()) * config.pixel_mm**3 / 1000 > MIN_TRUE_ML:
         result["outline_dice"] = dice(fine > 0.5, outlined)
@@ -174,7 +178,7 @@ def scores_of(coarse: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkCon
 def summary(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Means over the stacks that have a score, and the median of the centres' errors."""
     result = {}
-    for name in ("outline_dice", "find_dice", "found", "false_heads", "centre_mm"):
+    for name in ("outline_dice", "find_dice", "found", "centre_mm", "false_find", "false_outline"):
         values = [one[name] for one in scores if name in one]
         if values:
             result[name] = float(np.median(values) if name == "centre_mm" else np.mean(values))

@@ -10,6 +10,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.images import load_volume
 from g3r.output.files import MASK_NAMES
@@ -83,3 +84,36 @@ def test_the_whole_image_is_brain_where_the_user_says_so(surrounded: Path, tmp_p
     assert done.returncode == 0, done.stderr
     n_voxels = load_volume(files(surrounded, "stack")[0]).data.size
     assert f"{n_voxels} masked" in done.stdout
+
+
+@pytest.fixture(scope="module")
+def headless(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two stacks of the size of a mother, with smooth noise in them and no head."""
+    folder, rng = tmp_path_factory.mktemp("headless"), np.random.default_rng(0)
+    for n in range(2):
+        data = gaussian_filter(rng.normal(size=(100, 100, 20)), (6, 6, 2))
+        affine = np.diag([2.5, 2.5, 4.0, 1.0])
+        nib.save(nib.Nifti1Image((data - data.min() + 0.01).astype(np.float32), affine), folder / f"{n}.nii.gz")
+    return sorted(folder.iterdir())
+
+
+def test_no_head_anywhere_is_refused_with_ways_on(headless: list[Path], tmp_path: Path) -> None:
+    done = run("infer", "--stacks", *headless, *QUICK, "--output", tmp_path / "out")
+    assert done.returncode == 3
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    for words in (
+        "no brain was found in any stack",
+        "0.nii.gz",
+        "1.nii.gz",
+        "--masks",
+        "--mask-command",
+        "--whole-image",
+    ):
+        assert words in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_set_of_weights_without_a_mask_network_says_so(headless: list[Path], tmp_path: Path) -> None:
+    done = run("infer", "--stacks", *headless, "--ckpt", "cc0", "--output", tmp_path / "out")
+    assert done.returncode == 3
+    assert "--ckpt cc0: this set of weights has no mask network" in done.stderr

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import N_CANDIDATES, candidates, cleaned, find_brain
+from g3r.mask_network.inference import N_PLACES, cleaned, find_brain, likely_places
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork
 
@@ -88,18 +88,15 @@ def test_untrained_networks_find_no_head_in_noise(rng: np.random.Generator) -> N
     assert not find_brain(rng.random((64, 60, 10)), (2.0, 2.0, 4.0), model).found
 
 
-def test_candidates_are_those_with_most_probability() -> None:
-    probability = np.zeros((30, 20, 20), np.float32)
-    probability[:4, :4, :4] = 0.6
-    probability[10:16, 10:14, 10:14] = 0.9
-    probability[20:29:2, 0, 0] = 0.7
-    first, second, *others = candidates(probability, 5.0)
-    assert first.volume_ml == pytest.approx(6 * 4 * 4 * 0.125)
-    assert first.presence == pytest.approx(0.9)
-    assert first.is_head
-    assert not second.is_head
-    assert len(others) == N_CANDIDATES - 2
-    assert candidates(np.zeros((3, 3, 3), np.float32), 5.0) == []
+def test_places_have_most_probability_about_them_and_are_apart() -> None:
+    probability = np.zeros((40, 40, 20), np.float32)
+    probability[6:14, 6:14, 6:14] = 0.6
+    probability[28:34, 28:34, 8:14] = 0.9
+    first, second, *others = likely_places(probability, 4.0)
+    assert np.abs(first - [9.5, 9.5, 9.5]).max() <= 1
+    assert np.abs(second - [30.5, 30.5, 10.5]).max() <= 1
+    assert len(others) <= N_PLACES - 2
+    assert likely_places(np.zeros((3, 3, 3), np.float32), 4.0) == []
 
 
 def test_parts_of_a_moving_head_stay_and_holes_are_filled() -> None:

@@ -70,7 +70,7 @@ def test_the_loss_falls(trained: tuple[Path, Path, MaskModule]) -> None:
         values = [point.value for point in board.Scalars(name)]
         assert values[-1] < 0.6 * values[0], name
     names = set(board.Tags()["scalars"])
-    assert {"val/outline_dice", "val/find_dice", "val/false_heads", "train/samples_per_second"} <= names
+    assert {"val/outline_dice", "val/find_dice", "val/false_find", "train/samples_per_second"} <= names
     assert board.Tags()["images"]
 
 
@@ -108,11 +108,13 @@ def test_data_of_another_resolution_is_refused(tmp_path: Path) -> None:
 def test_scores() -> None:
     batch = sample(1)
     found = scores_of(batch["coarse_mask"], batch["mask"], batch, MaskNetworkConfig(pixel_mm=4.0))
-    assert found == {"found": 1.0, "find_dice": 1.0, "centre_mm": 0.0, "outline_dice": 1.0}
+    assert found.pop("centre_mm") < 4.0
+    assert found == {"found": 1.0, "find_dice": 1.0, "outline_dice": 1.0}
     none = sample(1, head=False)
-    assert scores_of(none["coarse_mask"], none["mask"], none, NETWORK) == {"false_heads": 0.0}
-    assert scores_of(batch["coarse_mask"], batch["mask"], none, NETWORK) == {"false_heads": 1.0}
-    assert summary([found, {"false_heads": 1.0}])["false_heads"] == 1.0
+    assert scores_of(none["coarse_mask"], none["mask"], none, NETWORK) == {"false_find": 0.0, "false_outline": 0.0}
+    false = scores_of(batch["coarse_mask"], batch["mask"], none, NETWORK)
+    assert false["false_find"] == pytest.approx(float(batch["coarse_mask"].sum()) * 0.064)
+    assert summary([found, {"false_find": 1.0}])["false_find"] == 1.0
     assert dice(torch.tensor([True, False]), torch.tensor([True, True])) == pytest.approx(2 / 3)
 
 
