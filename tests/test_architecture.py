@@ -107,7 +107,7 @@ def modules_after(statement: str, *wanted: str) -> set[str]:
     return set(json.loads(run.stdout.splitlines()[-1]))
 
 
-HEAVY = ("torch", "monai", "lightning", "torchio", "matplotlib", "SimpleITK")
+HEAVY = ("torch", "monai", "lightning", "torchio", "matplotlib", "SimpleITK", "pydicom")
 
 
 def test_import_g3r_is_light() -> None:

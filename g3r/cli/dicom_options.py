@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+UNRELIABLE = "registration unreliable: do not rely on this volume"
+
 AUTO = ["auto"]
 """Masks of all series are to be found."""
 
@@ -207,11 +209,13 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
     from g3r.dicom.volume_series import write_volume_series
 
     registration = result.record.registration
+    unreliable = registration is not None and registration.reliable is False
     write_volume_series(
         options.dicom_out,
         result.volume,
         result.grid.affine,
         dicom.study,
         in_scanner_space=registration is not None and registration.space == "scanner",
+        remark=UNRELIABLE if unreliable else "",
     )
     print(f"DICOM:   {options.dicom_out} (names the patient)")

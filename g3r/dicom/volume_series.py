@@ -99,6 +99,7 @@ def write_volume_series(
     study: SourceStudy,
     *,
     in_scanner_space: bool,
+    remark: str = "",
 ) -> None:
     """Write a volume as a series of its examination; the folder appears whole or not at all.
 
@@ -110,6 +111,7 @@ def write_volume_series(
         affine: [4, 4] RAS+ mm from index, right-handed.
         study: that it was made from.
         in_scanner_space: whether it is in the frame of the study's images.
+        remark: for whoever looks at the images, behind the words that all of them carry.
 
     Raises:
         InputError: the folder is not empty or cannot be written.
@@ -117,7 +119,8 @@ def write_volume_series(
     check_new_folder(folder)
     try:
         with OutputFolder(folder) as output, output.result() as staged:
-            for k, image in enumerate(_images(volume, affine, study, in_scanner_space=in_scanner_space)):
+            series = _series(study, in_scanner_space=in_scanner_space, remark=remark)
+            for k, image in enumerate(_images(volume, affine, series)):
                 image.save_as(staged / f"{k + 1:04d}.dcm", enforce_file_format=True)
     except OSError as error:
         raise InputError(
@@ -126,10 +129,14 @@ def write_volume_series(
         ) from None
 
 
-def _images(
-    volume: NDArray[np.floating], affine: NDArray[np.float64], study: SourceStudy, *, in_scanner_space: bool
-) -> Iterator[Dataset]:
-    """One image for each slice along the third axis, shown as radiologists expect: right on the left, front on top."""
+def _images(volume: NDArray[np.floating], affine: NDArray[np.float64], series: Dataset) -> Iterator[Dataset]:
+    """One image for each slice along the third axis, shown as radiologists expect: right on the left, front on top.
+
+    Args:
+        volume: [I, J, K].
+        affine: [4, 4] RAS+ mm from index.
+        series: what all images have in common; what depends on the volume is added.
+    """
     from pydicom.uid import generate_uid
 
     flipped = volume[::-1, ::-1]
@@ -137,20 +144,14 @@ def _images(
     from_flipped[:2, 3] = volume.shape[0] - 1, volume.shape[1] - 1
     lps = LPS_FROM_RAS @ affine @ from_flipped
     stored = StoredValues.of(flipped)
-    series = _common(study, lps, in_scanner_space=in_scanner_space)
+    _set_axes(series, lps)
     _set_values(series, flipped, stored)
     for k in range(volume.shape[2]):
         yield _slice(series, stored.numbers[:, :, k].T, lps @ [0, 0, k, 1], k + 1, generate_uid())
 
 
-def _common(study: SourceStudy, lps: NDArray[np.float64], *, in_scanner_space: bool) -> Dataset:
-    """What all images of the series have in common.
-
-    Args:
-        study: that the series joins.
-        lps: [4, 4] patient's frame from index.
-        in_scanner_space: whether that is the study's own frame.
-    """
+def _series(study: SourceStudy, *, in_scanner_space: bool, remark: str) -> Dataset:
+    """What all images of the series have in common, whatever they show."""
     from pydicom.dataset import Dataset
     from pydicom.uid import MRImageStorage, generate_uid
 
@@ -169,18 +170,22 @@ def _common(study: SourceStudy, lps: NDArray[np.float64], *, in_scanner_space: b
     one.Manufacturer, one.ManufacturerModelName, one.SoftwareVersions = "g3r", "g3r", f"g3r {__version__}"
     one.ImageType = ["DERIVED", "SECONDARY", "OTHER"]
     one.DerivationDescription = DERIVATION.format(version=__version__, space=SPACES[in_scanner_space])
-    one.ImageComments = "For research only, not for diagnosis"
+    one.ImageComments = "; ".join(filter(None, ("For research only, not for diagnosis", remark)))
     one.BurnedInAnnotation = "NO"
     # research mode: no pulse sequence made these images
     one.ScanningSequence, one.SequenceVariant, one.ScanOptions = "RM", "NONE", ""
     one.MRAcquisitionType = "3D"
     one.EchoTime = one.RepetitionTime = one.EchoTrainLength = one.AcquisitionNumber = None
     _set_references(one, study.images)
+    return one
+
+
+def _set_axes(one: Dataset, lps: NDArray[np.float64]) -> None:
+    """Directions and distances of pixels and slices, from the affine [4, 4] of the patient's frame from index."""
     spacing_mm = np.linalg.norm(lps[:3, :3], axis=0)
     one.PixelSpacing = [_decimal(spacing_mm[1]), _decimal(spacing_mm[0])]
     one.SliceThickness = one.SpacingBetweenSlices = _decimal(spacing_mm[2])
     one.ImageOrientationPatient = [_decimal(x) for x in (lps[:3, :2] / spacing_mm[:2]).T.ravel()]
-    return one
 
 
 def _set_references(one: Dataset, images: tuple[ImageHeader, ...]) -> None:

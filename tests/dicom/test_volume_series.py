@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from typing import Any
 
+import nibabel as nib
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from g3r.dicom.convert import converter
 from g3r.dicom.headers import read_images
 from g3r.dicom.study import SourceStudy, read_study
 from g3r.dicom.volume_series import DESCRIPTION, check_new_folder, write_volume_series
@@ -83,6 +86,19 @@ def test_a_constant_volume(value: float, study: SourceStudy, tmp_path: Path) -> 
     for one in read(tmp_path / "out"):
         values = one.pixel_array * float(one.RescaleSlope) + float(one.RescaleIntercept)
         np.testing.assert_allclose(values, value, atol=1e-6)
+
+
+def test_another_program_reads_the_same_volume(study: SourceStudy, tmp_path: Path) -> None:
+    data, affine = volume()
+    write_volume_series(tmp_path / "out", data, affine, study, in_scanner_space=True)
+    words = [converter(), "-z", "n", "-f", "volume", "-o", str(tmp_path), str(tmp_path / "out")]
+    subprocess.run(words, check=True, capture_output=True)
+    image = nib.Nifti1Image.from_filename(tmp_path / "volume.nii")
+    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3)
+    there = (np.linalg.inv(affine) @ image.affine @ np.c_[index, np.ones(len(index))].T)[:3]
+    assert np.abs(there - np.rint(there)).max() < 1e-3
+    values = np.asarray(image.dataobj).ravel()
+    np.testing.assert_allclose(values, data[tuple(np.rint(there).astype(int))], atol=0.02)
 
 
 def test_flags_and_references(study: SourceStudy, tmp_path: Path) -> None:
