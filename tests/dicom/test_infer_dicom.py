@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import json
 import shlex
@@ -9,14 +10,20 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import nibabel as nib
 import numpy as np
 import pytest
 
+from g3r import GaussianReconstructor
+from g3r.cli.dicom_options import DicomInput, write_dicom
 from g3r.cli.infer import main
 from g3r.dicom.convert import converter
+from g3r.dicom.study import read_study
 from g3r.output.record import RunRecord
+from g3r.output.result import ReconstructionResult
 from tests.cli.test_infer import run
 from tests.dicom.conftest import DERIVED, STACKS, THICKNESS_MM, Examination, block
 from tests.dicom.dicom_files import LPS_FROM_RAS, TRACES, Study, pydicom
@@ -142,7 +149,18 @@ def psnr_db(path: Path, reference: Path) -> float:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_same_order_as_asked_for(examination: Examination, tmp_path: Path) -> None:
+def test_the_same_order_as_asked_for(examination: Examination, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the images that were converted are gone before the reconstruction begins."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    work = GaussianReconstructor.reconstruct
+    left: list[Path] = []
+
+    def reconstruct(self: GaussianReconstructor, *arguments: Any, **options: Any) -> ReconstructionResult:
+        left.extend((tmp_path / "temporary").iterdir())
+        return work(self, *arguments, **options)
+
+    monkeypatch.setattr(GaussianReconstructor, "reconstruct", reconstruct)
     order = [2, 0]
     words = ["--series", *(SERIES[n] for n in order), "--masks", *(examination.dicom_masks[n] for n in order)]
     line = ["--dicom", examination.dicom, *words, "--thickness", "3", "3.1", "--threads", "1", "--output"]
@@ -152,6 +170,17 @@ def test_the_same_order_as_asked_for(examination: Examination, tmp_path: Path) -
         ("series-7.nii", 3.0),
         ("series-3.nii", 3.1),
     ]
+    assert not left
+
+
+def test_an_interrupted_run_writes_no_dicom(
+    examination: Examination, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    result: Any = SimpleNamespace(record=SimpleNamespace(partial=True))
+    options = argparse.Namespace(dicom_out=tmp_path / "series")
+    write_dicom(options, result, DicomInput(study=read_study(examination.dicom)))
+    assert "--dicom-out: not written, because the run was interrupted" in caplog.text
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_dry_run_shows_the_table_and_writes_nothing(
