@@ -100,8 +100,9 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
     # extra fluid, skull and scalp; thicker at places
     fluid = np.float32(rng.choice([0.0, rng.uniform(0, 2.5)]))
     uneven = np.float32(rng.uniform(0, 0.5)) * lattice_noise(mask.shape, 12.0, rng)
-    skull = fluid + np.float32(rng.uniform(0.8, 2.8)) * (1 + uneven)
-    scalp = skull + np.float32(rng.uniform(0.8, 4.5)) * (1 + uneven)
+    thin = rng.uniform(size=2) ** 1.5  # between two bright fluids both may be one dark line
+    skull = fluid + np.float32(0.6 + 2.2 * thin[0]) * (1 + uneven)
+    scalp = skull + np.float32(0.4 + 4.0 * thin[1]) * (1 + uneven)
     labels[outside_mm <= scalp] = Tissue.SCALP
     labels[outside_mm <= skull] = Tissue.SKULL
     if fluid > 0:

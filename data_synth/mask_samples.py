@@ -23,6 +23,8 @@ JITTER_MM = 6.0
 """Standard deviation of a crop's centre per axis: as far as a found head may be off."""
 BESIDE_SLICES = 3
 MAX_NOISE = 0.08
+COARSE_NOISE = 0.035
+"""Largest standard deviations of the noise; a coarse voxel is the mean of many pixels."""
 IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
 """Standard deviations in pixels: from, to, along each axis."""
 WRAP_SHARE = 0.08
@@ -67,7 +69,7 @@ def draw_sample(
     coarse_image, coarse_mask = _coarse(scan, rng, coarse_mm, coarse_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
     return MaskSample(
-        coarse_image=with_artefacts(coarse_image, rng, wrap=True),
+        coarse_image=with_artefacts(coarse_image, rng, wrap=True, max_noise=COARSE_NOISE),
         coarse_mask=coarse_mask,
         image=with_artefacts(image, rng),
         mask=mask,
@@ -129,13 +131,14 @@ def _transform() -> tio.Compose:
     )
 
 
-def with_artefacts(image: Image, rng: np.random.Generator, wrap: bool = False) -> Image:
+def with_artefacts(image: Image, rng: np.random.Generator, wrap: bool = False, max_noise: float = MAX_NOISE) -> Image:
     """A stack with a bias field, ghosts, motion blur, Rician noise and another gamma, by torchio and MONAI.
 
     Args:
         image: [I, J, K], the brain's brightest about 1.
         rng: source of randomness.
         wrap: whether what is beyond the field of view may fold into it.
+        max_noise: largest standard deviation of the noise.
     """
     if wrap and rng.random() < WRAP_SHARE:
         axis = int(rng.integers(2))
@@ -143,7 +146,7 @@ def with_artefacts(image: Image, rng: np.random.Generator, wrap: bool = False) -
     tensor = torch.from_numpy(np.ascontiguousarray(image))[None]
     result = applied(_transform(), tio.Subject(image=tio.ScalarImage(tensor=tensor)), rng)["image"].data[0].numpy()
     result = np.abs(result) ** np.float32(np.exp(rng.uniform(-0.3, 0.3)))
-    noise = RandRicianNoise(prob=1.0, std=MAX_NOISE)
+    noise = RandRicianNoise(prob=1.0, std=max_noise)
     noise.set_random_state(int(rng.integers(2**32)))
     return np.asarray(noise(result), dtype=np.float32)
 

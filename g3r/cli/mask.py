@@ -45,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     check_masker_options(parser, options)
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
+    logging.getLogger("g3r.acquisition.slice_profile").setLevel(logging.ERROR)  # the thickness decides nothing here
     try:
         return _run(options)
     except KeyboardInterrupt:

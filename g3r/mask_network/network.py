@@ -12,6 +12,8 @@ from g3r.mask_network.config import MaskNetworkConfig
 
 BRIGHT_SHARE = 0.99
 """Quantile of an image that is its unit of intensity."""
+RARE_LOGIT = -4.0
+"""Where the localiser begins: two voxels of a hundred are brain, and many steps would be spent on learning that."""
 N_FLAT_LEVELS = 2
 """Levels of the outline that look at each slice alone; the deeper ones see neighbouring slices, too."""
 _NORM = ("INSTANCE", {"affine": True})  # intensities and contrasts differ from scan to scan
@@ -29,6 +31,7 @@ class MaskNetwork(nn.Module):
         self.config = config
         self.finder = SubpixelUNet(config.finder_channels, (2, 2, 2), n_flat=0)
         self.outliner = SubpixelUNet(config.outline_channels, (2, 2, 1), n_flat=N_FLAT_LEVELS)
+        nn.init.constant_(self.finder.out.conv.conv.bias, RARE_LOGIT)
 
     def find(self, image: Tensor) -> Tensor:
         """Logits of brain in whole stacks [B, 1, I, J, K], isotropic at `coarse_mm`, in any units."""

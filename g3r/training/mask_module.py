@@ -11,7 +11,7 @@ from torch import Tensor
 
 from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import likeliest_head
+from g3r.mask_network.inference import candidates
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork, normalised
 from g3r.training.annealed_module import AnnealedModule
@@ -47,7 +47,7 @@ class MaskModule(AnnealedModule):
     def __init__(
         self,
         network: MaskNetworkConfig = DEFAULT_NETWORK,
-        learning_rate: float = 2e-3,
+        learning_rate: float = 4e-3,
         weight_decay: float = 1e-4,
         warmup_steps: int = 50,
         finder_weight: float = 1.0,
@@ -153,16 +153,17 @@ def scores_of(coarse: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkCon
         config: of the networks.
     """
     voxel_ml = config.coarse_mm**3 / 1000
-    head = likeliest_head(coarse[0, 0].float().cpu().numpy(), config.coarse_mm)
+    found = candidates(coarse[0, 0].float().cpu().numpy(), config.coarse_mm)
+    is_head = bool(found) and found[0].is_head
     true = batch["coarse_mask"][0, 0].cpu() > 0.5
     result = {}
     if not bool((batch["coarse_mask"] > 0).any()):
-        return {"false_heads": float(head.is_head)}
+        return {"false_heads": float(is_head)}
     if float(true.sum()) * voxel_ml > 2 * MIN_TRUE_ML:
-        result["found"] = float(head.is_head)
+        result["found"] = float(is_head)
         result["find_dice"] = dice(coarse[0, 0].cpu() > 0.5, true)
-        if head.is_head:
-            off = np.argwhere(head.inside).mean(0) - np.argwhere(true.numpy()).mean(0)
+        if is_head:
+            off = np.argwhere(found[0].inside).mean(0) - np.argwhere(true.numpy()).mean(0)
             result["centre_mm"] = float(np.linalg.norm(off) * config.coarse_mm)
     outlined = batch["mask"] > 0.5
     if float(outlined.sum()) * config.pixel_mm**3 / 1000 > MIN_TRUE_ML:

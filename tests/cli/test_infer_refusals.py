@@ -21,7 +21,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
     data, bad = np.asarray(image.dataobj), folder / "bad.nii.gz"
     options: list[object] = ["--no-prior", "--thickness", "4", "--output", folder / "out"]
     if kind == "missing file":
-        return ["--stacks", stacks[0], bad, *options], "bad.nii.gz"
+        return ["--stacks", stacks[0], bad, "--whole-image", *options], "bad.nii.gz"
     if kind == "text file":
         bad.write_text("hello\n")
     elif kind == "cut off":
@@ -48,7 +48,7 @@ def bad_command(kind: str, subject: Path, folder: Path) -> tuple[list[object], s
     elif kind == "resolution":
         return [*inputs(subject), *options, "--resolution", "0"], "resolution 0 mm"
     whole = kind in ("one slice", "NaN volume")
-    return ["--stacks", bad, *([] if whole else ["--masks", masks[0]]), *options], "bad.nii.gz"
+    return ["--stacks", bad, *(["--whole-image"] if whole else ["--masks", masks[0]]), *options], "bad.nii.gz"
 
 
 def _like(path: Path, image_path: Path) -> Path:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import cleaned, find_brain, likeliest_head
+from g3r.mask_network.inference import N_CANDIDATES, candidates, cleaned, find_brain
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork
 
@@ -53,7 +53,7 @@ def test_the_largest_of_two_is_taken(stub: Any) -> None:
 
 
 def test_too_little_is_no_head(stub: Any) -> None:
-    found = find_brain(ball((160, 140, 25), (60.0, 60.0, 40.0), 9.0).astype(np.float32), SPACING_MM, stub)
+    found = find_brain(ball((160, 140, 25), (60.0, 60.0, 40.0), 12.5).astype(np.float32), SPACING_MM, stub)
     assert not found.found
     assert "ml" in found.reason
     assert not found.mask.any()
@@ -88,15 +88,18 @@ def test_untrained_networks_find_no_head_in_noise(rng: np.random.Generator) -> N
     assert not find_brain(rng.random((64, 60, 10)), (2.0, 2.0, 4.0), model).found
 
 
-def test_the_likeliest_head_holds_most_probability() -> None:
-    probability = np.zeros((20, 20, 20), np.float32)
+def test_candidates_are_those_with_most_probability() -> None:
+    probability = np.zeros((30, 20, 20), np.float32)
     probability[:4, :4, :4] = 0.6
     probability[10:16, 10:14, 10:14] = 0.9
-    head = likeliest_head(probability, 5.0)
-    assert head.volume_ml == pytest.approx(6 * 4 * 4 * 0.125)
-    assert head.presence == pytest.approx(0.9)
-    assert head.is_head
-    assert not likeliest_head(np.zeros((3, 3, 3), np.float32), 5.0).is_head
+    probability[20:29:2, 0, 0] = 0.7
+    first, second, *others = candidates(probability, 5.0)
+    assert first.volume_ml == pytest.approx(6 * 4 * 4 * 0.125)
+    assert first.presence == pytest.approx(0.9)
+    assert first.is_head
+    assert not second.is_head
+    assert len(others) == N_CANDIDATES - 2
+    assert candidates(np.zeros((3, 3, 3), np.float32), 5.0) == []
 
 
 def test_parts_of_a_moving_head_stay_and_holes_are_filled() -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import yaml
 
-from g3r.cli import export
+from g3r.cli import export, pretrain
 from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
 from g3r.mask_network.model import MaskModel
@@ -24,7 +23,6 @@ from g3r.training.mask_module import MaskModule, dice, scores_of, summary
 from tests.training.small_runs import in_memory, logged, trainer
 
 NETWORK = MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8))
-CONFIG = "lightning_configs/mask.yaml"
 
 
 def sample(seed: int, *, head: bool = True) -> dict[str, torch.Tensor]:
@@ -123,7 +121,17 @@ def test_impossible_settings_are_refused() -> None:
         MaskModule(network=NETWORK, finder_weight=0.0)
 
 
-def test_the_config_names_what_exists() -> None:
-    settings: dict[str, Any] = yaml.safe_load(Path(CONFIG).read_text(encoding="utf-8"))
-    assert settings["model"]["class_path"] == f"{MaskModule.__module__}.{MaskModule.__qualname__}"
-    assert settings["data"]["class_path"] == "data_synth.mask_data.MaskDataModule"
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # jsonargparse's, of its own
+def test_the_command_reads_the_config(pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str]) -> None:
+    """Settings are read and shown, and the data module takes them."""
+    path = pytestconfig.rootpath / "lightning_configs" / "mask.yaml"
+    with pytest.raises(SystemExit) as done:
+        pretrain.main(["fit", "--config", str(path), "--model.network.coarse_mm", "5", "--print_config"])
+    assert done.value.code == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    network = shown["model"]["init_args"]["network"]
+    assert network["coarse_mm"] == 5
+    assert network["finder_channels"] == [24, 48, 96]  # the rest is kept
+    from data_synth.mask_data import MaskDataModule
+
+    MaskDataModule(**shown["data"]["init_args"])

@@ -1,0 +1,119 @@
+"""`python -m studies.masks.cases`: volumes from stacks in surroundings, with true and with automatic masks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+
+from g3r.acquisition.stacks import Stack
+from g3r.evaluation.case import SimulatedCase, load_case
+from g3r.reconstruct import GaussianReconstructor
+from studies.harness import Record, Row, Study, Task
+from studies.masks.overlap import OPTIONS, mask_model, settings
+from studies.masks.surrounded import SLICES_BEYOND, surrounded
+from studies.runs import aligned
+from studies.subjects import THICKNESS_MM, data_folder
+from studies.tables import Cell, table
+
+SEED = 81_000
+
+
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """Both ways, case by case."""
+    folders = options.folders or sorted(path for path in data_folder("cases").iterdir() if path.is_dir())
+    for n, folder in enumerate(folders):
+        yield Task(folder.name, measure, (folder, SEED + n, options))
+
+
+def measure(folder: Path, seed: int, options: argparse.Namespace) -> Row:
+    """The volume with true masks, and with those that are found.
+
+    Args:
+        folder: of the case.
+        seed: of its surroundings.
+        options: of the command.
+    """
+    case = load_case(folder, THICKNESS_MM.get(folder.name))
+    stacks = surrounded(case, seed)
+    found = [_masked(stack, options.masks) for stack in stacks]
+    row: Row = {
+        "case": case.name,
+        "n_found": sum(stack is not None for stack in found),
+        "dice": [_dice(mask, true) for mask, true in zip(found, stacks, strict=True)],
+    }
+    reconstructor = GaussianReconstructor(settings=options.preset)
+    for name, masked in (("true", stacks), ("found", [stack for stack in found if stack is not None])):
+        row |= {f"{name}_{key}": value for key, value in _scores(case, reconstructor, masked).items()} if masked else {}
+    return row
+
+
+def _dice(found: Stack | None, true: Stack) -> float:
+    if found is None:
+        return 0.0
+    shared = np.count_nonzero(found.mask & true.mask)
+    return round(2 * shared / (np.count_nonzero(found.mask) + np.count_nonzero(true.mask)), 4)
+
+
+def _masked(stack: Stack, source: str | None) -> Stack | None:
+    """The stack with the mask that is found; None where no head is."""
+    from g3r.mask_network.inference import find_brain
+
+    found = find_brain(stack.image, stack.spacing_mm.tolist(), mask_model(source))
+    return replace(stack, mask=found.mask, mask_source="automatic") if found.found else None
+
+
+def _scores(case: SimulatedCase, reconstructor: GaussianReconstructor, stacks: Sequence[Stack]) -> dict[str, float]:
+    result = reconstructor.reconstruct(stacks)
+    slices = replace(result.slices, slice_index=result.slices.slice_index - SLICES_BEYOND)
+    error = case.pose_error(slices)
+    scores = aligned(case, result.volume, result.grid, error.common).scores
+    return {"psnr_db": round(scores.psnr_db, 3), "poses_mm": round(error.median_mm, 3)}
+
+
+def line(key: str, row: Row) -> str:
+    """A finished case."""
+    return (
+        f"{key}: Dice {mean(row['dice']):.3f}, true masks {row['true_psnr_db']:.2f} dB, "
+        f"found masks {row.get('found_psnr_db', float('nan')):.2f} dB"
+    )
+
+
+def _difference(row: Row) -> str:
+    return f"{row['found_psnr_db'] - row['true_psnr_db']:+.2f}" if "found_psnr_db" in row else ""
+
+
+def tables(record: Record) -> dict[str, str]:
+    """A row for each case."""
+    columns: dict[str, Cell] = {
+        "case": "{case}",
+        "stacks found": lambda row: f"{row['n_found']} of {len(row['dice'])}",
+        "Dice": lambda row: " ".join(f"{one:.3f}" for one in row["dice"]),
+        "true masks, dB": "{true_psnr_db:.2f}",
+        "found masks, dB": "{found_psnr_db:.2f}",
+        "difference": _difference,
+        "poses with true masks, mm": "{true_poses_mm:.2f}",
+        "with found masks, mm": "{found_poses_mm:.2f}",
+    }
+    return {"masks-cases": table(list(record["rows"].values()), columns)}
+
+
+STUDY = Study(
+    name="masks.cases",
+    about="Put cases of g3r-simulate into surroundings, and reconstruct them with true and with automatic masks.",
+    document="masks.md",
+    shared=("--preset", "folders"),
+    options=OPTIONS,
+    settings=settings,
+    tasks=tasks,
+    line=line,
+    tables=tables,
+)
+
+if __name__ == "__main__":
+    sys.exit(STUDY.main())

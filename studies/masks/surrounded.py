@@ -1,0 +1,141 @@
+"""Simulated subjects, whose stacks are black around the brain, put into surroundings of the mask networks' scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import center_of_mass
+
+from data_synth.atlas import TruthVolume
+from data_synth.mask_head import SceneHead, filled_head, scene_head
+from data_synth.mask_labels import Tissue, draw_intensities
+from data_synth.mask_slicing import image_slices
+from data_synth.mask_surroundings import Surroundings, draw_surroundings
+from g3r.acquisition.stacks import Stack
+from g3r.evaluation.case import SimulatedCase
+from g3r.geometry import RigidPose, VolumeGrid
+
+FIELD_OF_VIEW_MM = 280.0
+"""In the plane; real stacks of a uterus have 250 to 400 mm."""
+
+SLICES_BEYOND = 4
+"""On each side of a stack: nobody plans one that ends with the brain."""
+
+N_THROUGH = 3
+
+
+def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
+    """The stacks of a case in a larger field of view, with everything around the brain, and their true masks.
+
+    Skull, scalp, face and neck move with the brain as the true poses say. The mother lies still in each stack, where
+    its middle slice saw the head.
+
+    Args:
+        case: black outside the masks.
+        seed: of the surroundings and their contrast.
+    """
+    rng = np.random.default_rng(seed)
+    grid = case.truth.grid
+    middle_mm = grid.world(center_of_mass(case.truth_mask))
+    affine = grid.affine.copy()
+    affine[:3, 3] -= middle_mm
+    bright = float(np.percentile(case.truth.data[case.truth_mask], 99.5))
+    truth = TruthVolume(name=case.name, data=case.truth.data / bright, mask=case.truth_mask, affine=affine)
+    head = scene_head(filled_head(truth), rng)
+    around = draw_surroundings(head.base_mm, head.radius_mm, rng)
+    mean, texture = draw_intensities(rng)
+    shells = _without_brain(head, truth, mean, texture)
+    behind = _intensities(around.labels, around.texture, mean, texture)
+    return [_in_scene(case, n, middle_mm, head, shells, around, behind) for n in range(len(case.stacks))]
+
+
+def _without_brain(
+    head: SceneHead, truth: TruthVolume, mean: NDArray[np.float32], texture: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The head's channels (see `image_slices`), black where the case itself shows the brain."""
+    grid = VolumeGrid(head.labels.shape, head.affine)
+    offset = np.rint(VolumeGrid(truth.mask.shape, truth.affine).index(grid.world([0, 0, 0]))).astype(int)
+    brain = np.zeros(head.labels.shape, bool)
+    box = tuple(slice(-o, -o + n) for o, n in zip(offset, truth.mask.shape, strict=True))
+    brain[box] = truth.mask
+    shells = np.zeros((*head.labels.shape, 3), np.float32)
+    fluid = np.where(head.labels == Tissue.BRAIN, Tissue.CSF, head.labels)  # clefts of the truth's mask
+    shells[..., 0] = np.where(brain, 0, _intensities(fluid, head.texture, mean, texture))
+    shells[..., 1] = head.labels > 0
+    shells[..., 2] = brain
+    return shells
+
+
+def _in_scene(
+    case: SimulatedCase,
+    number: int,
+    middle_mm: NDArray[np.float64],
+    head: SceneHead,
+    shells: NDArray[np.float32],
+    around: Surroundings,
+    behind: NDArray[np.float32],
+) -> Stack:
+    """One stack: the case's own pixels where they show brain, the scene around them.
+
+    Args:
+        case: that it belongs to.
+        number: of the stack.
+        middle_mm: [3] of the brain in the truth's frame, the origin of the scene.
+        head: gives the grid of the shells.
+        shells: [I, J, K, 3] of the head without brain.
+        around: gives the grid of the surroundings.
+        behind: [N, N, N] their intensities.
+    """
+    stack = _widened(case.stacks[number])
+    n_slices = stack.image.shape[2]
+    header = _slice_poses(stack)
+    rows = [row for row, key in enumerate(case.true.keys) if key[0] == number]
+    own = np.array([case.true.keys[row][1] for row in rows]) + SLICES_BEYOND
+    nearest = np.abs(np.arange(n_slices)[:, None] - own).argmin(1)  # slices without brain have no pose of their own
+    moved = case.true.pose.take(np.array(rows)[nearest])
+    origin = RigidPose.from_rotvec(np.zeros((1, 3)), -middle_mm[None])
+    head_pose = origin @ moved @ header
+    scan_pose = origin @ moved.take(np.full(n_slices, n_slices // 2)) @ header
+    pixel_mm = float(stack.spacing_mm[0])
+    first = -(np.array(stack.image.shape[:2]) - 1) / 2 * pixel_mm
+    outside, _ = image_slices(
+        shells,
+        np.linalg.inv(head.affine),
+        head_pose,
+        behind,
+        np.linalg.inv(around.affine),
+        scan_pose,
+        first_mm=(float(first[0]), float(first[1])),
+        pixel_mm=pixel_mm,
+        shape=(stack.image.shape[0], stack.image.shape[1]),
+        thickness_mm=stack.thickness_mm,
+        n_through=N_THROUGH,
+    )
+    bright = float(np.percentile(stack.image[stack.mask], 99.5))
+    return replace(stack, image=stack.image + np.float32(bright) * outside)
+
+
+def _widened(stack: Stack) -> Stack:
+    """The stack with black around it up to the field of view, and black slices at both ends."""
+    missing = np.maximum((FIELD_OF_VIEW_MM / stack.spacing_mm[:2] - stack.image.shape[:2]) / 2, 0).astype(int)
+    pad = [(int(missing[0]),) * 2, (int(missing[1]),) * 2, (SLICES_BEYOND,) * 2]
+    affine = stack.affine.copy()
+    affine[:3, 3] -= affine[:3, :3] @ [float(before) for before, _ in pad]
+    return replace(stack, image=np.pad(stack.image, pad), mask=np.pad(stack.mask, pad), affine=affine)
+
+
+def _slice_poses(stack: Stack) -> RigidPose:
+    """By the header: the middle of each slice's pixel grid, and its axes."""
+    n_i, n_j, n_slices = stack.image.shape
+    axes = stack.affine[:3, :3] / stack.spacing_mm
+    frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+    index = np.stack([np.full(n_slices, (n_i - 1) / 2), np.full(n_slices, (n_j - 1) / 2), np.arange(n_slices)], axis=1)
+    return RigidPose(np.broadcast_to(frame, (n_slices, 3, 3)), stack.grid.world(index))
+
+
+def _intensities(
+    labels: NDArray[np.integer], noise: NDArray[np.float32], mean: NDArray[np.float32], texture: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    return np.maximum(mean[labels] + (mean * texture)[labels] * noise, 0)

@@ -1,0 +1,70 @@
+"""The studies of the mask networks: what their tables say, and what they need."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g3r.errors import InputError
+from g3r.mask_network import inference
+from studies.harness import Row
+from studies.masks import overlap, real, simulated
+
+
+def found_mask(mask: np.ndarray, spacing_mm: np.ndarray) -> inference.BrainMask:
+    centre = np.argwhere(mask).mean(0) * spacing_mm if mask.any() else np.full(3, np.nan)
+    return inference.BrainMask(
+        mask=mask,
+        probability=mask.astype(np.float32),
+        presence=0.9,
+        centre_mm=centre,
+        volume_ml=float(mask.sum() * np.prod(spacing_mm) / 1000),
+        reason="" if mask.any() else "no head found",
+    )
+
+
+@pytest.fixture
+def row(monkeypatch: pytest.MonkeyPatch) -> Row:
+    """A mask that is moved by one pixel and lacks the last slice."""
+    true = np.zeros((30, 30, 4), dtype=bool)
+    true[5:15, 5:15, 1:4] = True
+    found = np.roll(true, 1, axis=0)
+    found[:, :, 3] = False
+    monkeypatch.setattr(inference, "find_brain", lambda *_: found_mask(found, np.array([1.0, 1.0, 4.0])))
+    monkeypatch.setattr(overlap, "mask_model", lambda _: None)
+    return overlap.scored(np.zeros((30, 30, 4), np.float32), true, (1.0, 1.0, 4.0), None)
+
+
+def test_scores_of_a_stack(row: Row) -> None:
+    assert row["dice"] == pytest.approx(2 * 180 / 500, abs=1e-4)
+    assert row["recall"] == pytest.approx(180 / 300, abs=1e-4)
+    assert row["lost_slices"] == 1
+    assert row["centre_mm"] == pytest.approx(np.hypot(1.0, 2.0), abs=0.01)
+    assert "1 slices lost" in overlap.line("stack", row)
+
+
+def test_tables(row: Row) -> None:
+    without = {"head": False, "found": True, "presence": 0.7, "volume_ml": 11.0, "seconds": 1.0, "reason": ""}
+    missed = {**row, "found": False, "centre_mm": None, "dice": 0.0, "lost_slices": 3}
+    text = simulated.tables({"rows": {"a": row, "b": missed, "c": without}})["masks-simulated"]
+    assert "2 stacks with a head: found in 1, centre within 5 mm in 1" in text
+    assert "1 stacks without a head: in 1 of them one was found" in text
+    assert "| a |" in real.tables({"rows": {"a": row}})["masks-real"]
+    assert "one found" in overlap.line("c", without)
+
+
+def test_nothing_without_weights(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        overlap.settings(argparse.Namespace(masks=str(tmp_path / "none.safetensors")))
+
+
+def test_real_stacks_need_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("G3R_TEST_DATA", str(tmp_path))
+    with pytest.raises(InputError, match="G3R_TEST_DATA"):
+        real.stacks_with_masks()
+    (tmp_path / "real").mkdir()
+    with pytest.raises(InputError, match="no stack with a mask"):
+        real.stacks_with_masks()
