@@ -95,8 +95,12 @@ def check_dicom_options(parser: argparse.ArgumentParser, options: argparse.Names
 
 
 @contextmanager
-def stacks_on_disk(options: argparse.Namespace) -> Iterator[DicomInput]:
+def stacks_on_disk(options: argparse.Namespace, *, replaces: bool) -> Iterator[DicomInput]:
     """Make `options.stacks` the paths of NIfTI files; those that are made of DICOM go when the block ends.
+
+    Args:
+        options: of g3r-infer.
+        replaces: whether earlier results in the output may be replaced.
 
     Raises:
         InputError: a folder of DICOM that cannot be used, or DICOM in place of NIfTI.
@@ -111,7 +115,10 @@ def stacks_on_disk(options: argparse.Namespace) -> Iterator[DicomInput]:
     from g3r.dicom.convert import convert, converter_version
     from g3r.dicom.private_folder import private_folder
     from g3r.dicom.study import study_of
+    from g3r.output.files import OUTPUT_NAMES
+    from g3r.run.output_folder import check_output_folder
 
+    check_output_folder(Path(options.output), OUTPUT_NAMES, replace=replaces)  # before anything is converted
     version = converter_version()
     taken, warnings = _chosen(options)
     study = None

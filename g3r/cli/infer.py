@@ -67,7 +67,7 @@ def _way_on(folder: Path) -> str:
 def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
-    with log_held_back(), stacks_on_disk(options) as dicom:
+    with log_held_back(), stacks_on_disk(options, replaces=replaces) as dicom:
         networks = check_files(options, folder, replaces=replaces)  # before an image is read
         task = prepared(options, networks)
     task = replace(task, warnings=dicom.warnings + task.warnings, notes=dicom.notes)
