@@ -120,6 +120,8 @@ def _fault(series: Series) -> str | None:
         return "its images do not say where they are"
     if series.n_directions > 1:
         return f"its slices have {series.n_directions} directions"
+    if len({(image.rows, image.columns) for image in series.images}) > 1:
+        return "its images have several sizes"
     if cut:
         return f"the file of image number {cut[0].instance_number or 0:.0f} is cut off"
     if series.n_images < 2:

@@ -123,6 +123,16 @@ def _check_geometry(path: Path, series: Series) -> None:
 
 
 def _reduce_sidecar(path: Path) -> None:
-    """Keep what decides the slice profile."""
-    found = json.loads(path.read_text(encoding="utf-8", errors="replace"), strict=False)
-    path.write_text(json.dumps({key: found[key] for key in KEPT_KEYS if key in found}), encoding="utf-8")
+    """Keep what decides the slice profile; a thickness of zero is none.
+
+    Raises:
+        InputError: it is not JSON.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8", errors="replace"), strict=False)
+    except ValueError:
+        raise InputError(
+            f"{path.stem}: what dcm2niix says of it is not JSON; leave it out (--series), or convert it by hand, mend "
+            "the file, and pass --stacks"
+        ) from None
+    path.write_text(json.dumps({key: found[key] for key in KEPT_KEYS if found.get(key)}), encoding="utf-8")

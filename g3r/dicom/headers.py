@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import stat
 import warnings
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
 PREAMBLE_BYTES, MAGIC = 128, b"DICM"
 """A DICOM file says what it is behind a preamble of this length."""
+
+FARTHEST_MM = 1e5
+"""From the middle of the scanner."""
 
 LOOKED_AT = 1000
 """Files that are looked at to see what a folder holds."""
@@ -202,7 +206,7 @@ def _header(path: Path, header: Dataset, n_left: int) -> ImageHeader:
         n_left: bytes from the pixels on.
     """
     texts = {ours: _value(header, name, str) or "" for ours, name in TEXTS.items()}
-    numbers = {ours: _value(header, name, float) for ours, name in NUMBERS.items()}
+    numbers = {ours: _value(header, name, _number) for ours, name in NUMBERS.items()}
     lists = {ours: _value(header, name, _words) or () for ours, name in LISTS.items()}
     position, axes = _value(header, POSITION, _vector), _value(header, AXES, _vector)
     meta = getattr(header, "file_meta", None)
@@ -211,8 +215,8 @@ def _header(path: Path, header: Dataset, n_left: int) -> ImageHeader:
     fields: dict[str, Any] = {**texts, **numbers, **lists}
     return ImageHeader(
         path=path,
-        position_mm=position if position is not None and position.size == 3 else None,
-        axes=axes.reshape(2, 3) if axes is not None and axes.size == 6 else None,
+        position_mm=position if _is_vector(position, 3, FARTHEST_MM) else None,
+        axes=axes.reshape(2, 3) if axes is not None and _is_vector(axes, 6, 1 + 1e-3) else None,
         is_cut=_is_cut(header, n_left, numbers),
         **fields,
     )
@@ -227,15 +231,24 @@ def _value(header: Dataset, name: str, parse: Callable[[Any], Value]) -> Value |
         return None
 
 
+def _number(found: Any) -> float:
+    number = float(found)
+    if not math.isfinite(number):
+        raise ValueError("not finite")
+    return number
+
+
 def _words(found: Any) -> tuple[str, ...]:
     return (found,) if isinstance(found, str) else tuple(map(str, found))
 
 
 def _vector(found: Any) -> NDArray[np.float64]:
-    vector = np.array([float(x) for x in found], dtype=np.float64)
-    if not np.isfinite(vector).all():
-        raise ValueError("not finite")
-    return vector
+    return np.array([_number(x) for x in found], dtype=np.float64)
+
+
+def _is_vector(found: NDArray[np.float64] | None, size: int, most: float) -> bool:
+    """Whether there are so many numbers, none larger than the most that makes sense."""
+    return found is not None and found.size == size and bool(np.abs(found).max() <= most)
 
 
 def _is_cut(header: Dataset, n_left: int, numbers: dict[str, float | None]) -> bool:

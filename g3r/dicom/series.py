@@ -27,6 +27,9 @@ MISSING_FROM, UNEVEN_FROM = 1.5, 1.02
 
 SHOWN_TILT_DEGREES = 3
 
+MAX_NAMED = 10
+"""Missing slices that are named one by one."""
+
 
 @dataclass(frozen=True)
 class Series:
@@ -122,9 +125,12 @@ class Series:
         n_missing = np.where(self.steps_mm > MISSING_FROM * usual_mm, np.rint(self.steps_mm / usual_mm) - 1, 0)
         if not n_missing.any():
             return None
+        n_whole = self.n_images + int(n_missing.sum())
+        if n_missing.sum() > MAX_NAMED:
+            return f"{n_missing.sum():.0f} of {n_whole} slices are missing"
         places = np.cumsum(np.concatenate([[1], n_missing + 1])).astype(int)
-        absent = sorted(set(range(1, int(places[-1]) + 1)) - set(places.tolist()))
-        text = f"{_counted(absent)} of {places[-1]} {'is' if len(absent) == 1 else 'are'} missing"
+        absent = sorted(set(range(1, n_whole + 1)) - set(places.tolist()))
+        text = f"{_counted(absent)} of {n_whole} {'is' if len(absent) == 1 else 'are'} missing"
         numbers = self._absent_numbers()
         if len(numbers) == len(absent):
             text += f" (image number {', '.join(map(str, numbers))})"
@@ -133,7 +139,9 @@ class Series:
     def _absent_numbers(self) -> list[int]:
         """Image numbers between the first and the last that no image has."""
         found = {int(image.instance_number) for image in self.images if image.instance_number is not None}
-        return sorted(set(range(min(found), max(found) + 1)) - found) if found else []
+        if not found or max(found) - min(found) > len(found) + MAX_NAMED:
+            return []
+        return sorted(set(range(min(found), max(found) + 1)) - found)
 
 
 def _counted(numbers: Sequence[int]) -> str:

@@ -37,7 +37,8 @@ def _row(one: Judged, *, descriptions: bool) -> tuple[str, ...]:
     spacing_mm, thickness_mm = series.spacing_mm, series.thickness_mm
     lengths = "-" if thickness_mm is None else f"{thickness_mm:.4g}"
     if spacing_mm is not None and thickness_mm is not None:
-        lengths += f" {'+' if spacing_mm >= thickness_mm - 5e-4 else '-'} {abs(spacing_mm - thickness_mm):.3g}"
+        gap_mm = round(spacing_mm - thickness_mm, 2)
+        lengths += f" {'-' if gap_mm < 0 else '+'} {abs(gap_mm):g}"
     verdict = "yes" if one.is_taken else "no"
     return (
         series.label,

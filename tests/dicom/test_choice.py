@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from g3r.dicom.series import grouped
 from g3r.dicom.table import HIDDEN, table_of
 from g3r.errors import InputError
 from tests.dicom.conftest import Examination, block
-from tests.dicom.dicom_files import CANARY, Study
+from tests.dicom.dicom_files import CANARY, Study, pydicom
 
 
 def verdicts(folder: Path, *asked_for: str) -> dict[str, Judged]:
@@ -143,10 +144,36 @@ def test_missing_slices_are_named(missing: list[int], says: str | None, tmp_path
     assert verdicts(tmp_path)["2"].series.missing() == says
 
 
+def test_many_missing_slices_are_counted(tmp_path: Path) -> None:
+    Study(tmp_path).write(*block(40), 2, missing=range(4, 30))
+    assert verdicts(tmp_path)["2"].reason == "26 of 40 slices are missing"
+
+
+def test_images_of_several_sizes_are_no_stack(tmp_path: Path) -> None:
+    paths = Study(tmp_path).write(*block(), 2)
+    header = pydicom.dcmread(paths[0])
+    header.Rows, header.Columns = header.Columns, header.Rows
+    header.save_as(paths[0])
+    assert verdicts(tmp_path)["2"].reason == "its images have several sizes"
+
+
+def test_damaged_headers_raise_nothing_else(tmp_path: Path) -> None:
+    """Bytes of headers are changed at random: a series is listed in some way, or the folder is refused."""
+    paths = Study(tmp_path).write(*block(), 2)
+    whole = [path.read_bytes() for path in paths]
+    rng = np.random.default_rng(7)
+    for _ in range(60):
+        for path, content in zip(paths, whole, strict=True):
+            changed = bytearray(content)
+            for place in rng.integers(132, len(content), rng.integers(0, 4)):
+                changed[place] = rng.integers(256)
+            path.write_bytes(changed)
+        with suppress(InputError):
+            table_of(list(verdicts(tmp_path).values()), descriptions=True)
+
+
 def test_uneven_slices_are_refused(tmp_path: Path) -> None:
     paths = Study(tmp_path).write(*block(), 2)
-    import pydicom
-
     header = pydicom.dcmread(paths[0])
     header.ImagePositionPatient = [0, 0, -1]
     header.save_as(paths[0])

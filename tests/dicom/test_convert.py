@@ -67,6 +67,13 @@ def test_phase_encoding_reaches_the_sidecar(tmp_path: Path) -> None:
     assert json.loads(path.with_suffix(".json").read_text())["InPlanePhaseEncodingDirectionDICOM"] == "COL"
 
 
+def test_a_thickness_of_zero_is_none(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    Study(tmp_path).write(*block(), 2, thickness_mm=0)
+    path = convert(series_of(tmp_path)["2"], tmp_path / "out")
+    assert "SliceThickness" not in json.loads(path.with_suffix(".json").read_text())
+
+
 def test_names_with_spaces_and_odd_letters(tmp_path: Path) -> None:
     folder = tmp_path / "a 'b' ü"
     folder.mkdir()
