@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "run": "",
     "acquisition": "geometry run",
     "checkpoints": "run",
+    "dicom": "run acquisition",
     "gaussians": "geometry run acquisition",
     "prior": "geometry acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
@@ -36,7 +37,7 @@ MAY_IMPORT = {
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (
-        "run acquisition checkpoints prior pose_network mask_network masking training planning evaluation output "
+        "run acquisition dicom checkpoints prior pose_network mask_network masking training planning evaluation output "
         "reconstruct"
     ),
 }

@@ -12,7 +12,11 @@ EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
 OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
 """In the messages of numpy, torch, the loader of libraries and the system."""
 
-EXTRAS = {"evaluate": ("skimage",), "train": ("lightning", "torchio", "jsonargparse", "tensorboard")}
+EXTRAS = {
+    "evaluate": ("skimage",),
+    "train": ("lightning", "torchio", "jsonargparse", "tensorboard"),
+    "dicom": ("pydicom", "dcm2niix"),
+}
 """Packages, as they are imported, that only some commands need."""
 
 OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset preview, or crop the stacks"

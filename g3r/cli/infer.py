@@ -14,10 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.dicom_options import stacks_on_disk, write_dicom
+from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options
 from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
 from g3r.cli.terminal import log_held_back, progress_bars
+from g3r.errors import InputError
 from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
         return _failed(line, stop_request.exit_code)
+    except ModuleNotFoundError as error:
+        return _failed(missing_extra(error), InputError.exit_code)
     except EXPECTED as error:
         return _failed(*line_and_code(error))
 
@@ -63,9 +67,10 @@ def _way_on(folder: Path) -> str:
 def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
-    networks = check_files(options, folder, replaces=replaces)  # before any work
-    with log_held_back():
+    with log_held_back(), stacks_on_disk(options, replaces=replaces) as dicom:
+        networks = check_files(options, folder, replaces=replaces)  # before an image is read
         task = prepared(options, networks)
+    task = replace(task, warnings=dicom.warnings + task.warnings, notes=dicom.notes)
     for warning in task.warnings:
         logging.getLogger("g3r").warning(warning)
     if options.dry_run:
@@ -77,6 +82,7 @@ def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
         write_tensorboard(Path(options.tensorboard), result.record.loss, result.volume, result.mask)
     _warn_of_missed_budget(task.plan)
     _print_summary(result, folder)
+    write_dicom(options, result, dicom)
     return _interrupted(result, folder, stop_request) if stop_request.is_requested() else 0
 
 
@@ -139,7 +145,7 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
         command=command,
         inputs=task.inputs,
         memory=task.memory.record(),
-        notes=result.record.notes + task.memory.changes,
+        notes=task.notes + result.record.notes + task.memory.changes,
         warnings=result.record.warnings + task.warnings,
         header_text=[text.record() for text in texts] or None,
     )

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from g3r._version import __version__
+from g3r.cli.dicom_options import add_dicom_output_options, add_input_options, check_dicom_options
 from g3r.cli.mask_options import add_mask_options, check_mask_options
 from g3r.planning import PRESET_NAMES
 
@@ -22,7 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out of memory, "
         "130 interrupted",
     )
-    parser.add_argument("--stacks", nargs="+", required=True, metavar="NIFTI", help="one file per stack")
+    add_input_options(parser)
     add_mask_options(parser)
     parser.add_argument(
         "--thickness",
@@ -33,6 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
         "else the distance of slices)",
     )
     parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
+    add_dicom_output_options(parser)
     parser.add_argument(
         "--ckpt",
         metavar="PRIOR.safetensors",
@@ -93,6 +95,7 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """The options as they hold, defaults filled in; ends the program with 2 where they cannot go together."""
     parser = build_parser()
     options = parser.parse_args(argv)
+    check_dicom_options(parser, options)
     n_stacks = len(options.stacks)
     check_mask_options(parser, options)
     if options.thickness is not None and len(options.thickness) not in (1, n_stacks):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +39,7 @@ class Task:
         n_threads: in use.
         plan: settings and deadlines of the run.
         warnings: stacks that are left out, and what differs from the run that --config names.
+        notes: for the record.
     """
 
     stacks: list[Stack]
@@ -49,6 +50,7 @@ class Task:
     n_threads: int
     plan: Plan
     warnings: list[str]
+    notes: list[str] = field(default_factory=list)
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:

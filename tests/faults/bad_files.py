@@ -136,7 +136,10 @@ BAD_STACKS: dict[str, tuple[Maker, str]] = {
         NOT_READABLE,
     ),
     "packed text": (content("bad.nii.gz", lambda: gzip.compress(b"not an image\n")), NOT_READABLE),
-    "DICOM": (content("bad.dcm", bytes(128) + b"DICM" + bytes(500)), "not NIfTI by its name.*dcm2niix"),
+    "DICOM": (
+        content("bad.dcm", bytes(128) + b"DICM" + bytes(500)),
+        "not NIfTI by its name.*dcm2niix|is a DICOM image; .*g3r-infer --dicom",
+    ),
     "MGH": (content("bad.mgz", lambda: gzip.compress(bytes(284))), "not NIfTI by its name"),
     "no ending": (content("bad", raw()), "not NIfTI by its name"),
     "bzip2": (content("bad.nii.bz2", lambda: bz2.compress(raw())), "not NIfTI by its name"),

@@ -15,7 +15,7 @@ from typing import Any
 from g3r.cli.infer import main as infer
 from g3r.output.record import CommandRecord, Inputs, RunRecord
 from g3r.output.stack_record import StackRecord
-from g3r.planning.presets import PRESETS
+from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.run.provenance import FileHash
 from tests.phantoms import simulate_small_subject
 
@@ -69,9 +69,8 @@ class SmallCase:
         return infer(self.arguments(output, *further))
 
 
-def make_small_case(folder: Path) -> SmallCase:
-    """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
-    simulate_small_subject(folder / "stacks", "--seed", "61001")
+def quick_settings() -> ReconstructionSettings:
+    """Settings of a run of about a second."""
     preview = PRESETS["preview"]
     registration = replace(
         preview.registration,
@@ -82,11 +81,16 @@ def make_small_case(folder: Path) -> SmallCase:
         n_rounds=1,
         standard_orientation=False,
     )  # a fraction of a second; the poses do not matter here
-    settings = replace(preview, registration=registration, resolution_mm=2.0, use_prior=False)
+    return replace(preview, registration=registration, resolution_mm=2.0, use_prior=False)
+
+
+def make_small_case(folder: Path) -> SmallCase:
+    """Simulate the stacks, write a run.json of the quick settings, and run it for its volume."""
+    simulate_small_subject(folder / "stacks", "--seed", "61001")
     case = SmallCase(folder / "stacks", folder / "run.json", b"")
     stacks, masks = (tuple(map(FileHash.of, case.files(kind))) for kind in ("stack", "mask"))
     record = RunRecord(
-        settings=settings,
+        settings=quick_settings(),
         inputs=Inputs(stacks=stacks, masks=masks),
         stacks=[StackRecord(name=stack.name, thickness_mm=4.0) for stack in stacks],
         command=CommandRecord(stacks=[], preset=None, seed=0, threads=1, space="scanner"),

@@ -1,0 +1,267 @@
+"""The headers of DICOM images below a folder, reduced to what decides whether and how a series is used."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import stat
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from pydicom.dataset import Dataset
+
+PREAMBLE_BYTES, MAGIC = 128, b"DICM"
+"""A DICOM file says what it is behind a preamble of this length."""
+
+FARTHEST_MM = 1e5
+"""From the middle of the scanner."""
+
+LOOKED_AT = 1000
+"""Files that are looked at to see what a folder holds."""
+
+TEXTS = {
+    "sop_class_uid": "SOPClassUID",
+    "sop_uid": "SOPInstanceUID",
+    "series_uid": "SeriesInstanceUID",
+    "study_uid": "StudyInstanceUID",
+    "frame_uid": "FrameOfReferenceUID",
+    "patient_id": "PatientID",
+    "description": "SeriesDescription",
+    "protocol": "ProtocolName",
+    "modality": "Modality",
+    "acquisition_type": "MRAcquisitionType",
+    "acquired_on": "AcquisitionDate",
+    "acquired_at": "AcquisitionTime",
+}
+"""Texts that are read, by our name; "" where a header has none."""
+
+NUMBERS = {
+    "number": "SeriesNumber",
+    "instance_number": "InstanceNumber",
+    "echo_time_ms": "EchoTime",
+    "thickness_mm": "SliceThickness",
+    "rows": "Rows",
+    "columns": "Columns",
+    "bits": "BitsAllocated",
+    "n_frames": "NumberOfFrames",
+}
+"""Numbers that are read; None where a header has none."""
+
+LISTS = {"image_type": "ImageType", "scanning_sequence": "ScanningSequence"}
+"""Code words that are read; () where a header has none."""
+
+MR_CLASSES = "1.2.840.10008.5.1.4.1.1.4"
+"""Their files have pixels, or they are cut off in the header."""
+
+POSITION, AXES, SPACING = "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageHeader:
+    """One DICOM image.
+
+    Attributes:
+        path: of its file.
+        position_mm: of the centre of its first pixel, in the patient's frame (LPS); None without.
+        axes: [2, 3] directions of a row and of a column; None without.
+        is_cut: whether the file is shorter than its pixels.
+        sop_class_uid, sop_uid, series_uid, study_uid, frame_uid, patient_id, description, protocol, modality,
+            acquisition_type, acquired_on, acquired_at: see `TEXTS`.
+        number, instance_number, echo_time_ms, thickness_mm, rows, columns, bits, n_frames: see `NUMBERS`.
+        image_type, scanning_sequence: see `LISTS`.
+    """
+
+    path: Path
+    position_mm: NDArray[np.float64] | None
+    axes: NDArray[np.float64] | None
+    is_cut: bool
+    sop_class_uid: str
+    sop_uid: str
+    series_uid: str
+    study_uid: str
+    frame_uid: str
+    patient_id: str
+    description: str
+    protocol: str
+    modality: str
+    acquisition_type: str
+    acquired_on: str
+    acquired_at: str
+    number: float | None
+    instance_number: float | None
+    echo_time_ms: float | None
+    thickness_mm: float | None
+    rows: float | None
+    columns: float | None
+    bits: float | None
+    n_frames: float | None
+    image_type: tuple[str, ...]
+    scanning_sequence: tuple[str, ...]
+
+
+def is_dicom(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is DICOM by its first bytes."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+            return False
+        with open(path, "rb") as stream:
+            return stream.read(PREAMBLE_BYTES + len(MAGIC))[PREAMBLE_BYTES:] == MAGIC
+    except (OSError, ValueError):
+        return False
+
+
+def dicom_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """The DICOM files below a folder, in the order of their paths."""
+    for parent, folders, names in os.walk(folder):
+        folders.sort()
+        yield from (Path(parent, name) for name in sorted(names) if is_dicom(Path(parent, name)))
+
+
+def holds_dicom(folder: str | os.PathLike[str]) -> bool:
+    """Whether there is DICOM among the first files below a folder, which may be the whole disk."""
+    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
+    return any(map(is_dicom, islice(paths, LOOKED_AT)))
+
+
+def read_images(folder: str | os.PathLike[str]) -> tuple[list[ImageHeader], int]:
+    """The images below a folder, each once, and the number of DICOM files that cannot be read.
+
+    Files without pixels (DICOMDIR, reports) are left out.
+
+    Raises:
+        InputError: no such folder, or no DICOM image in it.
+    """
+    if not Path(folder).is_dir():
+        found = "is a file" if Path(folder).exists() else "does not exist"
+        raise InputError(f"{folder}: {found}; expected a folder of DICOM images, pass it to --dicom")
+    images: dict[str, ImageHeader] = {}
+    n_damaged = 0
+    for path in dicom_files(folder):
+        try:
+            image = read_header(path)
+        except ModuleNotFoundError:
+            raise
+        except Exception:  # pydicom raises whatever damaged bytes make it raise
+            n_damaged += 1
+            continue
+        if image.rows and image.series_uid:
+            images.setdefault(image.sop_uid or str(path), image)
+        elif not image.sop_class_uid or image.sop_class_uid.startswith(MR_CLASSES):
+            n_damaged += 1
+    if not images:
+        damaged = f", {n_damaged} DICOM files that cannot be read" if n_damaged else ""
+        raise InputError(f"{folder}: holds no DICOM image{damaged}; expected the folder that the scanner exported")
+    return list(images.values()), n_damaged
+
+
+def read_header(path: Path) -> ImageHeader:
+    """The header of a DICOM image.
+
+    Raises:
+        Exception: whatever pydicom raises for a damaged file.
+    """
+    # Pixels are not read; values are parsed when they are asked for, so both happen where nothing is said about them:
+    # what pydicom says of a bad value quotes it.
+    from pydicom import dcmread
+
+    with quiet_pydicom(), path.open("rb") as stream:
+        header = dcmread(stream, stop_before_pixels=True)
+        n_left = os.fstat(stream.fileno()).st_size - stream.tell()
+        return _header(path, header, n_left)
+
+
+@contextmanager
+def quiet_pydicom() -> Iterator[None]:
+    """No warnings and log lines about the values of a header: they quote what they are about."""
+    logger = logging.getLogger("pydicom")
+    before, logger.disabled = logger.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.disabled = before
+
+
+def _header(path: Path, header: Dataset, n_left: int) -> ImageHeader:
+    """What is kept of a header.
+
+    Args:
+        path: of the file.
+        header: as it was read.
+        n_left: bytes from the pixels on.
+    """
+    texts = {ours: _value(header, name, str) or "" for ours, name in TEXTS.items()}
+    numbers = {ours: _value(header, name, _number) for ours, name in NUMBERS.items()}
+    lists = {ours: _value(header, name, _words) or () for ours, name in LISTS.items()}
+    position, axes = _value(header, POSITION, _vector), _value(header, AXES, _vector)
+    meta = getattr(header, "file_meta", None)
+    if meta is not None and not texts["sop_class_uid"]:  # DICOMDIR
+        texts["sop_class_uid"] = _value(meta, "MediaStorageSOPClassUID", str) or ""
+    fields: dict[str, Any] = {**texts, **numbers, **lists}
+    return ImageHeader(
+        path=path,
+        position_mm=position if _is_vector(position, 3, FARTHEST_MM) else None,
+        axes=axes.reshape(2, 3) if axes is not None and _is_vector(axes, 6, 1 + 1e-3) else None,
+        is_cut=_is_cut(header, n_left, numbers),
+        **fields,
+    )
+
+
+def _value(header: Dataset, name: str, parse: Callable[[Any], Value]) -> Value | None:
+    """A value of a header; None where it is absent, empty or not what it should be."""
+    try:
+        found = header.get(name)
+        return None if found is None or found == "" else parse(found)
+    except (TypeError, ValueError, KeyError, AttributeError, NotImplementedError, OverflowError):
+        return None
+
+
+def _number(found: Any) -> float:
+    number = float(found)
+    if not math.isfinite(number):
+        raise ValueError("not finite")
+    return number
+
+
+def _words(found: Any) -> tuple[str, ...]:
+    return (found,) if isinstance(found, str) else tuple(map(str, found))
+
+
+def _vector(found: Any) -> NDArray[np.float64]:
+    return np.array([_number(x) for x in found], dtype=np.float64)
+
+
+def _is_vector(found: NDArray[np.float64] | None, size: int, most: float) -> bool:
+    """Whether there are so many numbers, none larger than the most that makes sense."""
+    return found is not None and found.size == size and bool(np.abs(found).max() <= most)
+
+
+def _is_cut(header: Dataset, n_left: int, numbers: dict[str, float | None]) -> bool:
+    """Whether the file cannot hold its pixels; nobody knows that of compressed ones.
+
+    Args:
+        header: of the file.
+        n_left: bytes from the pixels on.
+        numbers: see `NUMBERS`.
+    """
+    rows, columns, bits = (numbers[name] or 0 for name in ("rows", "columns", "bits"))
+    meta = getattr(header, "file_meta", None)
+    syntax = None if meta is None else meta.get("TransferSyntaxUID")
+    if syntax is None or syntax.is_compressed or syntax.is_deflated:
+        return False
+    return n_left < rows * columns * bits / 8 * (numbers["n_frames"] or 1)

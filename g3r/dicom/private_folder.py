@@ -1,0 +1,36 @@
+"""A folder for images on their way: nobody else can read it, and it is gone at the end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+
+PREFIX = "g3r-dicom-"
+
+
+@contextmanager
+def private_folder() -> Iterator[Path]:
+    """A new folder below the system's for temporary files (TMPDIR).
+
+    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run removes it.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    _remove_leftovers(Path(tempfile.gettempdir()))
+    with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
+
+
+def _remove_leftovers(parent: Path) -> None:
+    """Remove the folders of processes that ended without doing so; other users' cannot be removed, and stay."""
+    for folder in parent.glob(f"{PREFIX}*"):
+        process = folder.name[len(PREFIX) :].split("-")[0]
+        if process.isdigit() and not psutil.pid_exists(int(process)) and not folder.is_symlink():
+            shutil.rmtree(folder, ignore_errors=True)

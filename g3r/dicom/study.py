@@ -1,0 +1,118 @@
+"""The examination that a volume belongs to: what a series of its own has to repeat, and what it refers to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g3r.dicom.headers import ImageHeader, quiet_pydicom, read_images
+from g3r.errors import InputError
+
+if TYPE_CHECKING:
+    from pydicom.dataset import Dataset
+
+PATIENT = (
+    "PatientName",
+    "PatientID",
+    "IssuerOfPatientID",
+    "TypeOfPatientID",
+    "IssuerOfPatientIDQualifiersSequence",
+    "OtherPatientIDsSequence",
+    "PatientBirthDate",
+    "PatientBirthTime",
+    "PatientSex",
+    "PatientIdentityRemoved",
+    "DeidentificationMethod",
+    "DeidentificationMethodCodeSequence",
+)
+"""Of the patient module: who it is, for an archive to put the series in its place. Histories and addresses are not
+needed for that, and stay behind."""
+
+STUDY = (
+    "StudyInstanceUID",
+    "StudyDate",
+    "StudyTime",
+    "StudyID",
+    "StudyDescription",
+    "AccessionNumber",
+    "ReferringPhysicianName",
+    "PatientAge",
+    "PatientSize",
+    "PatientWeight",
+)
+"""Of the study modules, which are the same in every series of an examination."""
+
+EMPTY_IF_ABSENT = (
+    "PatientName",
+    "PatientID",
+    "PatientBirthDate",
+    "PatientSex",
+    "StudyDate",
+    "StudyTime",
+    "StudyID",
+    "AccessionNumber",
+    "ReferringPhysicianName",
+)
+"""Elements that an image must have, with or without a value (type 2)."""
+
+
+@dataclass(frozen=True)
+class SourceStudy:
+    """An examination.
+
+    Args:
+        identity: the elements of `PATIENT` and `STUDY`, with their character set.
+        images: that the volume refers to.
+    """
+
+    identity: Dataset
+    images: tuple[ImageHeader, ...]
+
+    @property
+    def frame_uid(self) -> str | None:
+        """Of the patient's frame, where all images share one."""
+        found = {image.frame_uid for image in self.images}
+        return found.pop() or None if len(found) == 1 else None
+
+
+def study_of(images: Sequence[ImageHeader], named: str | os.PathLike[str]) -> SourceStudy:
+    """The examination of images.
+
+    Args:
+        images: at least one.
+        named: where they are, for messages.
+
+    Raises:
+        InputError: they are of several examinations, or a file has changed since.
+    """
+    n_studies = len({(image.study_uid, image.patient_id) for image in images})
+    if n_studies > 1:
+        raise InputError(f"{named}: holds {n_studies} examinations; expected the one that the volume is to join")
+    from pydicom import dcmread
+    from pydicom.dataset import Dataset
+
+    identity = Dataset()
+    try:
+        with quiet_pydicom():
+            header = dcmread(images[0].path, stop_before_pixels=True)
+            for name in ("SpecificCharacterSet", *PATIENT, *STUDY):
+                if name in header:
+                    identity[name] = header[name]
+                elif name in EMPTY_IF_ABSENT:
+                    setattr(identity, name, "")
+    except Exception:  # pydicom raises whatever damaged bytes make it raise
+        raise InputError(f"{named}: the header of its first image cannot be read; export the images again") from None
+    return SourceStudy(identity, tuple(images))
+
+
+def read_study(folder: str | os.PathLike[str]) -> SourceStudy:
+    """The examination in a folder of DICOM images.
+
+    Raises:
+        InputError: as `read_images` and `study_of`.
+    """
+    images, _ = read_images(Path(folder))
+    return study_of([image for image in images if image.modality == "MR"] or images, folder)
