@@ -1,4 +1,4 @@
-"""The LightningDataModule that trains the mask networks on scans of scenes made on the fly."""
+"""The LightningDataModule that trains the mask network on scans of scenes made on the fly."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class MaskDataModule(SyntheticDataModule):
     """Scans of heads in random surroundings from an atlas folder or the built-in phantom; see `mask_batch`.
 
     Args:
-        coarse_mm: voxel size at which heads are found.
-        coarse_shape: voxels of the coarse image of a scan.
+        wide_mm: pixel size at which heads are found.
+        wide_shape: pixels and slices of an image in which they are.
         pixel_mm: pixel size at which heads are outlined.
         crop_shape: pixels and slices of a crop about a head.
         batch_size: scans per training batch.
@@ -50,8 +50,8 @@ class MaskDataModule(SyntheticDataModule):
 
     def __init__(
         self,
-        coarse_mm: float = 4.0,
-        coarse_shape: tuple[int, int, int] = (80, 80, 24),
+        wide_mm: float = 2.4,
+        wide_shape: tuple[int, int, int] = (128, 128, 12),
         pixel_mm: float = 1.2,
         crop_shape: tuple[int, int, int] = (128, 128, 12),
         batch_size: int = 4,
@@ -68,8 +68,8 @@ class MaskDataModule(SyntheticDataModule):
         h: Any = self.hparams
         train, val = self.subjects(N_VAL_PHANTOMS)
         shapes = {
-            "coarse_mm": h.coarse_mm,
-            "coarse_shape": tuple(h.coarse_shape),
+            "wide_mm": h.wide_mm,
+            "wide_shape": tuple(h.wide_shape),
             "pixel_mm": h.pixel_mm,
             "crop_shape": tuple(h.crop_shape),
         }

@@ -1,4 +1,4 @@
-"""What mask networks learn from: a whole scan on a coarse grid, a finer crop about its head, and their masks."""
+"""What a mask network learns from: slices of a scan in large pixels, a crop about its head in small ones, and masks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from g3r.acquisition.axis_resampling import along_axes, axis_weights
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-LOOK_MM = 2.0
-"""Pixels of which those of the coarse grid are made."""
+N_OVERSAMPLED = 2
+"""Pixels of the wide image are made of so many along each axis, as a resampled stack is."""
 JITTER_MM = 6.0
 """Standard deviation of a crop's centre per axis: as far as a found head may be off."""
 FAR_JITTER_MM = 25.0
@@ -27,8 +27,8 @@ ELSEWHERE_SHARE = 0.25
 """Crops about another place, where the network is to see that there is no head, or one at the rim."""
 BESIDE_SLICES = 3
 MAX_NOISE = 0.08
-COARSE_NOISE = 0.035
-"""Largest standard deviations of the noise; a coarse voxel is the mean of many pixels."""
+WIDE_NOISE = 0.05
+"""Largest standard deviations of the noise; a wide pixel is the mean of several."""
 IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
 """Standard deviations in pixels: from, to, along each axis."""
 WRAP_SHARE = 0.08
@@ -39,14 +39,14 @@ class MaskSample:
     """Images of one scan with the share of brain in each pixel.
 
     Args:
-        coarse_image: [A, B, C] the scan on the coarse isotropic grid.
-        coarse_mask: [A, B, C].
-        image: [H, W, K] some slices about the head; K of the scan's own slices.
+        wide_image: [A, B, K] some slices in large pixels; K of the scan's own slices.
+        wide_mask: [A, B, K].
+        image: [H, W, K] some slices about the head in small pixels.
         mask: [H, W, K].
     """
 
-    coarse_image: Image
-    coarse_mask: Image
+    wide_image: Image
+    wide_mask: Image
     image: Image
     mask: Image
 
@@ -55,8 +55,8 @@ def draw_sample(
     scan: Scan,
     rng: np.random.Generator,
     *,
-    coarse_mm: float,
-    coarse_shape: tuple[int, int, int],
+    wide_mm: float,
+    wide_shape: tuple[int, int, int],
     pixel_mm: float,
     crop_shape: tuple[int, int, int],
 ) -> MaskSample:
@@ -65,37 +65,39 @@ def draw_sample(
     Args:
         scan: of a scene.
         rng: source of randomness.
-        coarse_mm: voxel size of the coarse grid.
-        coarse_shape: its voxels; a random part of a larger scan.
+        wide_mm: of the wide image.
+        wide_shape: its pixels and slices; a random part of a larger scan.
         pixel_mm: of the crop.
         crop_shape: pixels and slices of the crop.
     """
-    coarse_image, coarse_mask = _coarse(scan, rng, coarse_mm, coarse_shape)
+    wide_image, wide_mask = _wide(scan, rng, wide_mm, wide_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
     return MaskSample(
-        coarse_image=with_artefacts(coarse_image, rng, wrap=True, max_noise=COARSE_NOISE),
-        coarse_mask=coarse_mask,
+        wide_image=with_artefacts(wide_image, rng, wrap=True, max_noise=WIDE_NOISE),
+        wide_mask=wide_mask,
         image=with_artefacts(image, rng),
         mask=mask,
     )
 
 
-def _coarse(scan: Scan, rng: np.random.Generator, step_mm: float, shape: tuple[int, int, int]) -> tuple[Image, Image]:
-    n = [int(np.ceil(size * step_mm / LOOK_MM)) for size in shape[:2]]
-    window = np.array(n) * LOOK_MM
-    room = np.maximum(scan.fov_mm - window, 0) / 2
-    middle = rng.uniform(-1, 1, 2) * room
-    first = middle - (np.array(n) - 1) / 2 * LOOK_MM
-    fine = scan.images((float(first[0]), float(first[1])), LOOK_MM, (n[0], n[1]), n_through=1)
-    n_slices = fine[0].shape[2]
-    surplus = n_slices * scan.spacing_mm - shape[2] * step_mm
-    start = rng.uniform(min(surplus, 0), max(surplus, 0)) + (step_mm - scan.spacing_mm) / 2
-    at = [(np.arange(size) + 0.5) * step_mm - LOOK_MM / 2 for size in shape[:2]] + [
-        start + np.arange(shape[2]) * step_mm
+def _wide(scan: Scan, rng: np.random.Generator, pixel_mm: float, shape: tuple[int, int, int]) -> tuple[Image, Image]:
+    small = pixel_mm / N_OVERSAMPLED
+    size = np.array(shape[:2])
+    room = np.maximum(scan.fov_mm - size * pixel_mm, 0) / 2
+    first = rng.uniform(-1, 1, 2) * room - (size * N_OVERSAMPLED - 1) / 2 * small
+    n_slices = len(scan.depth_mm)
+    first_slice = int(rng.integers(max(n_slices - shape[2], 0) + 1))
+    chosen = slice(first_slice, first_slice + shape[2])
+    n = size * N_OVERSAMPLED
+    both = scan.images((float(first[0]), float(first[1])), small, (int(n[0]), int(n[1])), chosen, n_through=2)
+    n_chosen = both[0].shape[2]
+    middle = (N_OVERSAMPLED - 1) / 2 * small
+    weights = [
+        axis_weights(int(m), small, np.arange(k) * pixel_mm + middle, pixel_mm) for m, k in zip(n, size, strict=True)
     ]
-    spacing = (LOOK_MM, LOOK_MM, scan.spacing_mm)
-    weights = [axis_weights(m, mm, where, step_mm) for m, mm, where in zip(fine[0].shape, spacing, at, strict=True)]
-    return along_axes(fine[0], weights), along_axes(fine[1], weights)
+    weights.append(np.eye(n_chosen, dtype=np.float32))
+    image, mask = (np.pad(along_axes(one, weights), [(0, 0), (0, 0), (0, shape[2] - n_chosen)]) for one in both)
+    return image, mask
 
 
 def _crop(scan: Scan, rng: np.random.Generator, pixel_mm: float, shape: tuple[int, int, int]) -> tuple[Image, Image]:

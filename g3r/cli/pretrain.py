@@ -1,4 +1,4 @@
-"""`g3r-pretrain`: train the prior network, the pose network or the mask networks with LightningCLI."""
+"""`g3r-pretrain`: train the prior network, the pose network or the mask network with LightningCLI."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
 
 Train the density-gated prior network, the pose network (lightning_configs/pose.yaml) or the mask
-networks (lightning_configs/mask.yaml). Logs for TensorBoard and checkpoints go to one folder.
+network (lightning_configs/mask.yaml). Logs for TensorBoard and checkpoints go to one folder.
 
   fit, validate            what to do
   --config FILE            settings; every one of them can be overridden on the command line

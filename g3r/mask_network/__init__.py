@@ -1,1 +1,1 @@
-"""The mask networks: one finds the fetal brain in a stack, one outlines it."""
+"""The mask network: it finds the fetal brain in a stack and outlines it."""

@@ -1,4 +1,4 @@
-"""From a stack to the mask of the fetal brain, with trained mask networks."""
+"""From a stack to the mask of the fetal brain, with a trained mask network."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     Args:
         image: [I, J, K] stack in any units, slices along the last axis.
         spacing_mm: [3] of its voxels.
-        model: trained mask networks.
+        model: trained mask network.
     """
     image = np.asarray(image, dtype=np.float32)
     spacing = np.asarray(spacing_mm, dtype=np.float64)
@@ -114,23 +114,23 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     )
 
 
-def likely_places(probability: Image, voxel_mm: float) -> list[NDArray[np.int64]]:
+def likely_places(probability: Image, spacing_mm: Array) -> list[NDArray[np.int64]]:
     """Where a brain may be: voxels [3] about which there is most probability, the likeliest first.
 
     Args:
-        probability: [A, B, C] of brain, isotropic.
-        voxel_mm: its voxel size.
+        probability: [A, B, C] of brain.
+        spacing_mm: [3] of its voxels.
     """
-    left = gaussian_filter(probability, PLACE_MM / voxel_mm, mode="constant")
-    index = np.indices(left.shape)
+    left = gaussian_filter(probability, PLACE_MM / np.asarray(spacing_mm), mode="constant")
+    position = np.indices(left.shape) * np.reshape(spacing_mm, (3, 1, 1, 1))
     places = []
     for _ in range(N_PLACES):
         place = np.array(np.unravel_index(int(left.argmax()), left.shape))
         if left[tuple(place)] < MIN_PLACE:
             break
         places.append(place)
-        off = ((index - place[:, None, None, None]) ** 2).sum(0)
-        left[off < (APART_MM / voxel_mm) ** 2] = 0
+        off = ((position - (place * spacing_mm)[:, None, None, None]) ** 2).sum(0)
+        left[off < APART_MM**2] = 0
     return places
 
 
@@ -193,22 +193,24 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
 
 
 def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> tuple[Image, list[tuple[Array, Array]]]:
-    """Coarse probability on the stack's grid, and boxes where a head may be: two positions [3] (mm) each."""
-    step = network.config.coarse_mm
+    """Probability of brain on the stack's grid from afar, and boxes where a head may be: two positions [3] (mm)."""
+    step = network.config.wide_mm
     at = [
         centred_positions_mm(max(1, round(n * mm / step)), step, n, mm)
-        for n, mm in zip(image.shape, spacing, strict=True)
+        for n, mm in zip(image.shape[:2], spacing[:2], strict=True)
     ]
-    weights = [axis_weights(n, mm, a, step) for n, mm, a in zip(image.shape, spacing, at, strict=True)]
-    probability = _probability(network.find, along_axes(image, weights), FLIPS)
-    places = [np.array([a[k] for a, k in zip(at, place, strict=True)]) for place in likely_places(probability, step)]
+    same = np.eye(image.shape[2], dtype=np.float32)
+    sizes = list(zip(image.shape[:2], spacing[:2], at, strict=True))
+    wide = along_axes(image, [*(axis_weights(n, mm, a, step) for n, mm, a in sizes), same])
+    probability = _probability(network, wide, FLIPS)
+    back = [axis_weights(len(a), step, np.arange(n) * mm - a[0], mm) for n, mm, a in sizes]
     # the crop's size in the plane is never less than `CROP_MM`
     reach = np.array([0.0, 0.0, APART_MM])
-    back = [
-        axis_weights(len(a), step, np.arange(n) * mm - a[0], mm)
-        for n, mm, a in zip(image.shape, spacing, at, strict=True)
-    ]
-    return along_axes(probability, back), [(place - reach, place + reach) for place in places]
+    boxes = []
+    for i, j, k in likely_places(probability, np.array([step, step, spacing[2]])):
+        place = np.array([at[0][i], at[1][j], k * spacing[2]])
+        boxes.append((place - reach, place + reach))
+    return along_axes(probability, [*back, same]), boxes
 
 
 def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
@@ -231,7 +233,7 @@ def _outlined(
     """Probability of brain on the stack's own grid, in a crop about a box.
 
     Args:
-        network: both networks.
+        network: trained.
         image: [I, J, K] stack.
         spacing: [3] of it (mm).
         low: [3] where the box begins along each axis (mm from the first voxel).
@@ -249,7 +251,7 @@ def _outlined(
     part = image[:, :, first:last]
     same = np.eye(last - first, dtype=np.float32)
     weights = [axis_weights(image.shape[a], float(spacing[a]), crop[a], pixel) for a in (0, 1)]
-    found = _probability(network.outline, along_axes(part, [*weights, same]), flips)
+    found = _probability(network, along_axes(part, [*weights, same]), flips)
     # back to the stack's pixels: the crop's first pixel is the origin of its positions
     back = [
         axis_weights(len(crop[a]), pixel, np.arange(image.shape[a]) * spacing[a] - crop[a][0], float(spacing[a]))

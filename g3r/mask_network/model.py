@@ -1,4 +1,4 @@
-"""A trained pair of mask networks and its file."""
+"""A trained mask network and its file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from g3r.mask_network.network import MaskNetwork
 
 @dataclass(frozen=True, kw_only=True)
 class MaskModel(TrainedModel):
-    """The mask networks as they are used. See `TrainedModel` for `load`, `save` and `record`.
+    """The mask network as it is used. See `TrainedModel` for `load`, `save` and `record`.
 
-    Their weights are stored as float16, which changes hardly a pixel.
+    Its weights are stored as float16, which changes hardly a pixel.
     """
 
     network: MaskNetwork
@@ -38,7 +38,7 @@ class MaskModel(TrainedModel):
     def in_words(self) -> str:
         """Both resolutions."""
         config = self.network.config
-        return f"brain masks, found at {config.coarse_mm:g} mm, outlined at {config.pixel_mm:g} mm"
+        return f"brain masks, found at {config.wide_mm:g} mm, outlined at {config.pixel_mm:g} mm"
 
     @staticmethod
     def stored(name: str, value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Two U-Nets made of MONAI's blocks: one looks at a whole stack coarsely, one outlines the brain in its slices."""
+"""A U-Net made of MONAI's blocks that says which pixels of a stack are brain, at either of two pixel sizes."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,16 @@ from g3r.mask_network.config import MaskNetworkConfig
 
 BRIGHT_SHARE = 0.99
 """Quantile of an image that is its unit of intensity."""
-RARE_LOGIT = -4.0
-"""Where the localiser begins: two voxels of a hundred are brain, and many steps would be spent on learning that."""
 N_FLAT_LEVELS = 2
-"""Levels of the outline that look at each slice alone; the deeper ones see neighbouring slices, too."""
+"""Levels that look at each slice alone; the deeper ones see neighbouring slices, too."""
 _NORM = ("INSTANCE", {"affine": True})  # intensities and contrasts differ from scan to scan
 
 
 class MaskNetwork(nn.Module):
-    """Both steps from a stack to the mask of the fetal brain.
+    """The network that finds the fetal brain in a whole stack of large pixels, and outlines it in a crop of small ones.
+
+    One set of weights for both: heads of 38 weeks are twice as large as those of 19, so that the network knows all
+    sizes anyway, and what it learns of the surroundings of heads serves both.
 
     Args:
         config: see `MaskNetworkConfig`.
@@ -29,17 +30,11 @@ class MaskNetwork(nn.Module):
     def __init__(self, config: MaskNetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.finder = SubpixelUNet(config.finder_channels, (2, 2, 2), n_flat=0)
-        self.outliner = SubpixelUNet(config.outline_channels, (2, 2, 1), n_flat=N_FLAT_LEVELS)
-        nn.init.constant_(self.finder.out.conv.conv.bias, RARE_LOGIT)
+        self.unet = SubpixelUNet(config.channels, (2, 2, 1), N_FLAT_LEVELS)
 
-    def find(self, image: Tensor) -> Tensor:
-        """Logits of brain in whole stacks [B, 1, I, J, K], isotropic at `coarse_mm`, in any units."""
-        return self.finder(normalised(image))
-
-    def outline(self, image: Tensor) -> Tensor:
-        """Logits of brain in crops about heads [B, 1, I, J, K] at `pixel_mm`, K slices, in any units."""
-        return self.outliner(normalised(image))
+    def forward(self, image: Tensor) -> Tensor:
+        """Logits of brain in stacks or crops [B, 1, I, J, K] of K slices, in any units."""
+        return self.unet(normalised(image))
 
 
 class SubpixelUNet(nn.Module):

@@ -1,4 +1,4 @@
-"""Training of the mask networks."""
+"""Training of the mask network."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,30 +11,29 @@ from torch import Tensor
 
 from g3r.errors import InputError
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import APART_MM, likely_places
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork, normalised
 from g3r.training.annealed_module import AnnealedModule
 
 Batch = Mapping[str, Tensor]
-"""`coarse_image` and `coarse_mask` [B, 1, A, B, C] of whole stacks, `image` and `mask` [B, 1, H, W, K] of crops;
-masks are shares of a pixel, 0 to 1."""
+"""`wide_image` and `wide_mask` [B, 1, A, B, K] in large pixels, `image` and `mask` [B, 1, H, W, K] of crops in small
+ones; masks are shares of a pixel, 0 to 1."""
 
 DEFAULT_NETWORK = MaskNetworkConfig()
-MIN_TRUE_ML = 5.0
-"""Images that hold less brain are not scored by their Dice."""
+MIN_TRUE_MM2 = 3000.0
+"""Images that hold less brain, summed over their slices, are not scored by their Dice."""
 N_PANEL_SLICES = 6
 
 
 class MaskModule(AnnealedModule):
-    """Supervised training of both mask networks: Dice and cross entropy, of a batch as a whole.
+    """Supervised training of the mask network at both pixel sizes: Dice and cross entropy, of a batch as a whole.
 
     Args:
         network: see `MaskNetworkConfig`.
         learning_rate: peak rate of AdamW.
         weight_decay: of AdamW.
         warmup_steps: steps of linear warm-up.
-        finder_weight: of the localiser's loss relative to the outline's; they share no weights.
+        wide_weight: of the loss in large pixels relative to that in small ones.
         start_from: training checkpoint whose weights to begin with.
 
     Raises:
@@ -47,17 +46,17 @@ class MaskModule(AnnealedModule):
     def __init__(
         self,
         network: MaskNetworkConfig = DEFAULT_NETWORK,
-        learning_rate: float = 4e-3,
+        learning_rate: float = 3e-3,
         weight_decay: float = 1e-4,
         warmup_steps: int = 50,
-        finder_weight: float = 1.0,
+        wide_weight: float = 1.0,
         start_from: str | None = None,
     ) -> None:
         super().__init__(learning_rate, weight_decay, warmup_steps)
-        if not finder_weight > 0:
-            raise ValueError(f"got {finder_weight=}")
+        if not wide_weight > 0:
+            raise ValueError(f"got {wide_weight=}")
         self.keep_hyperparameters(network)
-        self.finder_weight = finder_weight
+        self.wide_weight = wide_weight
         self.network = MaskNetwork(network)
         if start_from is not None:
             self._take_weights(start_from)
@@ -71,12 +70,12 @@ class MaskModule(AnnealedModule):
         return len(batch["image"])
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss of one batch, and log that of each network."""
+        """Return the loss of one batch, and log both its parts."""
         find, outline = self._losses(batch)
         n_samples = self.n_samples(batch)
         self.log("train/find_loss", find, prog_bar=True, batch_size=n_samples)
         self.log("train/outline_loss", outline, prog_bar=True, batch_size=n_samples)
-        return self.finder_weight * find + outline
+        return self.wide_weight * find + outline
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last epoch's scores."""
@@ -84,9 +83,9 @@ class MaskModule(AnnealedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score one stack."""
-        coarse = torch.sigmoid(self.network.find(batch["coarse_image"]))
-        fine = torch.sigmoid(self.network.outline(batch["image"]))
-        self._scores.append(scores_of(coarse, fine, batch, self.network.config))
+        wide = torch.sigmoid(self.network(batch["wide_image"]))
+        fine = torch.sigmoid(self.network(batch["image"]))
+        self._scores.append(scores_of(wide, fine, batch, self.network.config))
         if batch_idx == 0:
             self._panel = panel(fine, batch)
 
@@ -110,7 +109,7 @@ class MaskModule(AnnealedModule):
             InputError: they differ.
         """
         settings = self.describe_data()
-        for name in ("coarse_mm", "pixel_mm"):
+        for name in ("wide_mm", "pixel_mm"):
             mine, theirs = getattr(self.network.config, name), settings.get(name)
             if theirs is not None and theirs != mine:
                 raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
@@ -120,8 +119,8 @@ class MaskModule(AnnealedModule):
         return {}
 
     def _losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        find = self._loss(self.network.find(batch["coarse_image"]), batch["coarse_mask"])
-        outline = self._loss(self.network.outline(batch["image"]), batch["mask"])
+        find = self._loss(self.network(batch["wide_image"]), batch["wide_mask"])
+        outline = self._loss(self.network(batch["image"]), batch["mask"])
         return find, outline
 
     def _take_weights(self, path: str) -> None:
@@ -133,7 +132,7 @@ class MaskModule(AnnealedModule):
         except Exception as error:  # torch.load says "damaged" in many types
             raise InputError(
                 f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
-                "checkpoint of these mask networks"
+                "checkpoint of this mask network"
             ) from error
 
 
@@ -143,46 +142,30 @@ def dice(predicted: Tensor, true: Tensor) -> float:
     return 2 * both / max(float(predicted.sum() + true.sum()), 1.0)
 
 
-def scores_of(coarse: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkConfig) -> dict[str, float]:
-    """Dice of both networks, and whether and how near the head was found; where there is none, what they take for it.
-
-    `found` is whether one of the places that would be looked at is near the head, `centre_mm` the error of the first.
-    `false_find` and `false_outline` are volumes in ml, the slices taken to be as thick as a pixel is wide.
+def scores_of(wide: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkConfig) -> dict[str, float]:
+    """Dice where there is a head; what is taken for one elsewhere, in square centimetres over all slices.
 
     Args:
-        coarse: [1, 1, A, B, C] probabilities of the localiser.
-        fine: [1, 1, H, W, K] probabilities of the outline.
+        wide: [1, 1, A, B, K] probabilities in large pixels.
+        fine: [1, 1, H, W, K] probabilities in small ones.
         batch: one stack.
-        config: of the networks.
+        config: of the network.
     """
-    voxel_ml = config.coarse_mm**3 / 1000
-    places = likely_places(coarse[0, 0].float().cpu().numpy(), config.coarse_mm)
-    true = batch["coarse_mask"][0, 0].cpu() > 0.5
     result = {}
-    if not bool((batch["coarse_mask"] > 0).any()):
-        elsewhere = {"find": (coarse, config.coarse_mm**3), "outline": (fine, config.pixel_mm**3)}
-        return {f"false_{name}": float((p > 0.5).sum()) * mm3 / 1000 for name, (p, mm3) in elsewhere.items()}
-    if float(true.sum()) * voxel_ml > 2 * MIN_TRUE_ML:
-        result["find_dice"] = dice(coarse[0, 0].cpu() > 0.5, true)
-        middle = np.argwhere(true.numpy()).mean(0)
-        off_mm = [float(np.linalg.norm(place - middle)) * config.coarse_mm for place in places]
-        result["found"] = float(min(off_mm, default=np.inf) < APART_MM)
-        if off_mm:
-            result["centre_mm"] = off_mm[0]
-    outlined = batch["mask"] > 0.5
-    if float(outlined.sum()) * config.pixel_mm**3 / 1000 > MIN_TRUE_ML:
-        result["outline_dice"] = dice(fine > 0.5, outlined)
+    images = {"find": (wide, "wide_mask", config.wide_mm), "outline": (fine, "mask", config.pixel_mm)}
+    for name, (probability, mask, pixel_mm) in images.items():
+        true = batch[mask] > 0.5
+        if float(true.sum()) * pixel_mm**2 > MIN_TRUE_MM2:
+            result[f"{name}_dice"] = dice(probability > 0.5, true)
+        elif not bool((batch[mask] > 0).any()):
+            result[f"false_{name}_cm2"] = float((probability > 0.5).sum()) * pixel_mm**2 / 100
     return result
 
 
 def summary(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Means over the stacks that have a score, and the median of the centres' errors."""
-    result = {}
-    for name in ("outline_dice", "find_dice", "found", "centre_mm", "false_find", "false_outline"):
-        values = [one[name] for one in scores if name in one]
-        if values:
-            result[name] = float(np.median(values) if name == "centre_mm" else np.mean(values))
-    return result
+    """Means over the stacks that have a score."""
+    names = sorted({name for one in scores for name in one})
+    return {name: float(np.mean([one[name] for one in scores if name in one])) for name in names}
 
 
 def panel(probability: Tensor, batch: Batch) -> Tensor:

@@ -1,4 +1,4 @@
-"""Batches for the mask networks, and that every sample can be made again."""
+"""Batches for the mask network, and that every sample can be made again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from data_synth.heads import PhantomSubject
 from data_synth.mask_data import MaskDataModule, MaskSamples
 from data_synth.mask_head import filled_head
 
-SHAPES = {"coarse_mm": 4.0, "coarse_shape": (48, 48, 16), "pixel_mm": 2.4, "crop_shape": (48, 48, 4)}
+SHAPES = {"wide_mm": 4.0, "wide_shape": (64, 64, 40), "pixel_mm": 2.4, "crop_shape": (48, 48, 4)}
 
 
 def samples(head: TruthVolume, **options: bool) -> MaskSamples:
@@ -39,18 +39,18 @@ def test_scenes_of_another_epoch_are_forgotten(centred_head: TruthVolume) -> Non
 def test_every_fifth_validation_scan_has_no_head(centred_head: TruthVolume) -> None:
     made = samples(centred_head, in_order=True)
     assert (made[4].mask > 0.5).mean() < 0.01
-    assert made[3].coarse_mask.max() > 0.5
+    assert made[3].wide_mask.max() > 0.5
 
 
 def test_batches(centred_head: TruthVolume) -> None:
     data = MaskDataModule(
-        coarse_shape=(48, 48, 16), crop_shape=(48, 48, 4), samples_per_epoch=4, batch_size=2, val_samples=1
+        wide_shape=(48, 48, 4), crop_shape=(48, 48, 4), samples_per_epoch=4, batch_size=2, val_samples=1
     )
     data.setup()
     for one in (data.train_set, data.val_set):
         assert one is not None
         one._volumes = dict.fromkeys(range(len(one.subjects)), filled_head(centred_head))
     batch = next(iter(data.train_dataloader()))
-    assert batch["coarse_image"].shape == batch["coarse_mask"].shape == (2, 1, 48, 48, 16)
+    assert batch["wide_image"].shape == batch["wide_mask"].shape == (2, 1, 48, 48, 4)
     assert batch["image"].shape == batch["mask"].shape == (2, 1, 48, 48, 4)
     assert len(data.val_dataloader()) == 1

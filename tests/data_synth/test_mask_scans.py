@@ -14,7 +14,7 @@ from data_synth.mask_data import new_scene
 from data_synth.mask_samples import draw_sample, full_stack, with_artefacts
 from data_synth.mask_scans import Scan, Scene, draw_scan
 
-SHAPES = {"coarse_mm": 4.0, "coarse_shape": (64, 64, 16), "pixel_mm": 2.4, "crop_shape": (64, 64, 6)}
+SHAPES = {"wide_mm": 4.0, "wide_shape": (64, 64, 6), "pixel_mm": 2.4, "crop_shape": (64, 64, 6)}
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +67,9 @@ def test_a_part_of_a_scan_is_the_same_part_of_the_whole(scene: Scene) -> None:
 def test_samples(scene: Scene) -> None:
     rng = np.random.default_rng(4)
     sample = draw_sample(draw_scan(scene, rng, negative=False), rng, **SHAPES)  # type: ignore[arg-type]
-    assert sample.coarse_image.shape == sample.coarse_mask.shape == (64, 64, 16)
+    assert sample.wide_image.shape == sample.wide_mask.shape == (64, 64, 6)
     assert sample.image.shape == sample.mask.shape == (64, 64, 6)
-    for image in (sample.image, sample.coarse_image):
+    for image in (sample.image, sample.wide_image):
         assert np.isfinite(image).all()
         assert image.dtype == np.float32
     # the crop is about the head

@@ -1,4 +1,4 @@
-"""From a stack to a mask: the way there and back, with networks that take bright for brain; and refusals."""
+"""From a stack to a mask: the way there and back, with a network that takes bright for brain; and refusals."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from g3r.mask_network.network import MaskNetwork
 SPACING_MM = (1.1, 1.3, 3.5)
 
 
-def bright_is_brain(image: torch.Tensor) -> torch.Tensor:
-    return (image - 0.5) * 40
+class BrightIsBrain(torch.nn.Module):
+    config = MaskNetworkConfig()
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return (image - 0.5) * 40
 
 
 @pytest.fixture
 def stub() -> Any:
-    network = SimpleNamespace(config=MaskNetworkConfig(), find=bright_is_brain, outline=bright_is_brain)
-    return SimpleNamespace(network=network)
+    return SimpleNamespace(network=BrightIsBrain())
 
 
 def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
@@ -80,10 +82,10 @@ def test_impossible_spacings_are_refused(stub: Any) -> None:
         assert "spacing" in find_brain(np.random.default_rng(0).random((9, 9, 9)), spacing, stub).reason
 
 
-def test_untrained_networks_find_no_head_in_noise(rng: np.random.Generator) -> None:
+def test_an_untrained_network_finds_no_head_in_noise(rng: np.random.Generator) -> None:
     torch.manual_seed(0)
-    network = MaskNetwork(MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8))).eval()
-    network.finder.out.conv.conv.bias.data.fill_(-4.0)
+    network = MaskNetwork(MaskNetworkConfig(channels=(4, 8))).eval()
+    network.unet.out.conv.conv.bias.data.fill_(-4.0)
     model = MaskModel(network=network, training_data="nothing")
     assert not find_brain(rng.random((64, 60, 10)), (2.0, 2.0, 4.0), model).found
 
@@ -92,11 +94,11 @@ def test_places_have_most_probability_about_them_and_are_apart() -> None:
     probability = np.zeros((40, 40, 20), np.float32)
     probability[6:14, 6:14, 6:14] = 0.6
     probability[28:34, 28:34, 8:14] = 0.9
-    first, second, *others = likely_places(probability, 4.0)
+    first, second, *others = likely_places(probability, np.full(3, 4.0))
     assert np.abs(first - [9.5, 9.5, 9.5]).max() <= 1
     assert np.abs(second - [30.5, 30.5, 10.5]).max() <= 1
     assert len(others) <= N_PLACES - 2
-    assert likely_places(np.zeros((3, 3, 3), np.float32), 4.0) == []
+    assert likely_places(np.zeros((3, 3, 3), np.float32), np.full(3, 4.0)) == []
 
 
 def test_parts_of_a_moving_head_stay_and_holes_are_filled() -> None:

@@ -1,4 +1,4 @@
-"""Shapes, sizes and invariances of the mask networks."""
+"""Shapes, sizes and invariances of the mask network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from g3r.checkpoints.plain_values import config_from_plain
 from g3r.mask_network.config import MaskNetworkConfig
 from g3r.mask_network.network import MaskNetwork, SubpixelUNet, normalised, to_channels, to_pixels
 
-SMALL = MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8, 8))
+SMALL = MaskNetworkConfig(channels=(4, 8, 8))
 MAX_WEIGHTS = 3_000_000
 
 
@@ -26,14 +26,14 @@ def network() -> MaskNetwork:
 
 def test_any_size_works(network: MaskNetwork) -> None:
     with torch.inference_mode():
-        assert network.find(torch.rand(1, 1, 21, 18, 5)).shape == (1, 1, 21, 18, 5)
-        assert network.outline(torch.rand(2, 1, 33, 30, 3)).shape == (2, 1, 33, 30, 3)
+        assert network(torch.rand(1, 1, 21, 18, 5)).shape == (1, 1, 21, 18, 5)
+        assert network(torch.rand(2, 1, 33, 30, 3)).shape == (2, 1, 33, 30, 3)
 
 
 def test_units_of_intensity_do_not_matter(network: MaskNetwork) -> None:
     image = torch.rand(1, 1, 16, 16, 8)
     with torch.inference_mode():
-        torch.testing.assert_close(network.find(image), network.find(image * 4096), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(network(image), network(image * 4096), rtol=1e-4, atol=1e-4)
 
 
 def test_normalised_is_safe_for_black_images() -> None:
@@ -59,7 +59,7 @@ def test_flat_levels_do_not_see_other_slices() -> None:
     assert deep.state_dict()["down.0.conv1.conv.weight"].shape[2:] == (3, 3, 3)
 
 
-def test_the_trained_networks_are_small() -> None:
+def test_the_trained_network_is_small() -> None:
     settings = yaml.safe_load(Path("lightning_configs/mask.yaml").read_text(encoding="utf-8"))
     given = settings["model"]["init_args"]["network"]
     config = config_from_plain(MaskNetworkConfig, {**asdict(MaskNetworkConfig()), **given})
@@ -67,9 +67,7 @@ def test_the_trained_networks_are_small() -> None:
     assert config.min_values() < n < MAX_WEIGHTS
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"coarse_mm": 0.0}, {"pixel_mm": np.inf}, {"finder_channels": ()}, {"outline_channels": (0,)}]
-)
+@pytest.mark.parametrize("wrong", [{"wide_mm": 0.0}, {"pixel_mm": np.inf}, {"channels": ()}, {"channels": (0,)}])
 def test_impossible_arguments_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="no mask network"):
         MaskNetworkConfig(**wrong)

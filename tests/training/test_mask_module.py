@@ -1,4 +1,4 @@
-"""Training of the mask networks, its logs, and the way to a file."""
+"""Training of the mask network, its logs, and the way to a file."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from torch.utils.data import DataLoader
 from g3r.training.mask_module import MaskModule, dice, scores_of, summary
 from tests.training.small_runs import in_memory, logged, trainer
 
-NETWORK = MaskNetworkConfig(finder_channels=(4, 8), outline_channels=(4, 8))
+NETWORK = MaskNetworkConfig(channels=(4, 8))
 
 
 def sample(seed: int, *, head: bool = True) -> dict[str, torch.Tensor]:
     """A bright ball in noise."""
     generator = torch.Generator().manual_seed(seed)
     made = {}
-    for name, shape in {"coarse_": (24, 24, 16), "": (48, 48, 6)}.items():
+    for name, shape in {"wide_": (32, 32, 6), "": (48, 48, 6)}.items():
         at = torch.stack(torch.meshgrid(*(torch.arange(n) - n / 2 for n in shape), indexing="ij"), -1)
         mask = ((at - torch.tensor([2.0, -3.0, 0.0])).norm(dim=-1) < shape[0] / 3).float() * head
         image = 0.3 * torch.rand(shape, generator=generator) + 0.7 * mask
@@ -40,7 +40,7 @@ def sample(seed: int, *, head: bool = True) -> dict[str, torch.Tensor]:
 class TinyData(lightning.LightningDataModule):
     """A few stacks in memory."""
 
-    def __init__(self, coarse_mm: float = 4.0, pixel_mm: float = 1.2, source: str = "/some/where/atlas") -> None:
+    def __init__(self, wide_mm: float = 2.4, pixel_mm: float = 1.2, source: str = "/some/where/atlas") -> None:
         super().__init__()
         self.save_hyperparameters()
 
@@ -70,7 +70,7 @@ def test_the_loss_falls(trained: tuple[Path, Path, MaskModule]) -> None:
         values = [point.value for point in board.Scalars(name)]
         assert values[-1] < 0.6 * values[0], name
     names = set(board.Tags()["scalars"])
-    assert {"val/outline_dice", "val/find_dice", "val/false_find", "train/samples_per_second"} <= names
+    assert {"val/outline_dice", "val/find_dice", "val/false_find_cm2", "train/samples_per_second"} <= names
     assert board.Tags()["images"]
 
 
@@ -86,7 +86,7 @@ def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path)
     module.eval()
     with torch.inference_mode():
         torch.testing.assert_close(
-            torch.sigmoid(model.network.outline(image)), torch.sigmoid(module.network.outline(image)), atol=0.02, rtol=0
+            torch.sigmoid(model.network(image)), torch.sigmoid(module.network(image)), atol=0.02, rtol=0
         )
     with pytest.raises(InputError, match="not a prior checkpoint"):
         Prior.load(file)
@@ -107,20 +107,19 @@ def test_data_of_another_resolution_is_refused(tmp_path: Path) -> None:
 
 def test_scores() -> None:
     batch = sample(1)
-    found = scores_of(batch["coarse_mask"], batch["mask"], batch, MaskNetworkConfig(pixel_mm=4.0))
-    assert found.pop("centre_mm") < 4.0
-    assert found == {"found": 1.0, "find_dice": 1.0, "outline_dice": 1.0}
+    config = MaskNetworkConfig(wide_mm=4.0, pixel_mm=4.0)
+    assert scores_of(batch["wide_mask"], batch["mask"], batch, config) == {"find_dice": 1.0, "outline_dice": 1.0}
     none = sample(1, head=False)
-    assert scores_of(none["coarse_mask"], none["mask"], none, NETWORK) == {"false_find": 0.0, "false_outline": 0.0}
-    false = scores_of(batch["coarse_mask"], batch["mask"], none, NETWORK)
-    assert false["false_find"] == pytest.approx(float(batch["coarse_mask"].sum()) * 0.064)
-    assert summary([found, {"false_find": 1.0}])["false_find"] == 1.0
+    assert scores_of(none["wide_mask"], none["mask"], none, config) == {"false_find_cm2": 0.0, "false_outline_cm2": 0.0}
+    false = scores_of(batch["wide_mask"], batch["mask"], none, config)
+    assert false["false_find_cm2"] == pytest.approx(float(batch["wide_mask"].sum()) * 0.16)
+    assert summary([{"find_dice": 1.0}, {"find_dice": 0.5}, false])["find_dice"] == 0.75
     assert dice(torch.tensor([True, False]), torch.tensor([True, True])) == pytest.approx(2 / 3)
 
 
 def test_impossible_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="finder_weight"):
-        MaskModule(network=NETWORK, finder_weight=0.0)
+    with pytest.raises(ValueError, match="wide_weight"):
+        MaskModule(network=NETWORK, wide_weight=0.0)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # jsonargparse's, of its own
@@ -128,12 +127,12 @@ def test_the_command_reads_the_config(pytestconfig: pytest.Config, capsys: pytes
     """Settings are read and shown, and the data module takes them."""
     path = pytestconfig.rootpath / "lightning_configs" / "mask.yaml"
     with pytest.raises(SystemExit) as done:
-        pretrain.main(["fit", "--config", str(path), "--model.network.coarse_mm", "5", "--print_config"])
+        pretrain.main(["fit", "--config", str(path), "--model.network.wide_mm", "5", "--print_config"])
     assert done.value.code == 0
     shown = yaml.safe_load(capsys.readouterr().out)
     network = shown["model"]["init_args"]["network"]
-    assert network["coarse_mm"] == 5
-    assert network["finder_channels"] == [24, 48, 96]  # the rest is kept
+    assert network["wide_mm"] == 5
+    assert network["channels"] == [24, 48, 96, 128]  # the rest is kept
     from data_synth.mask_data import MaskDataModule
 
     MaskDataModule(**shown["data"]["init_args"])
