@@ -278,7 +278,7 @@ def _record(
         prior=found.prior_record,
         pose_network=found.pose_record,
         stacks=stack_records(found.stacks, found.registration, qualities, fit.weight),
-        registration=RegistrationRecord.of(found.registration, qualities),
+        registration=RegistrationRecord.of(found.registration, qualities, fit.slices),
         bias_field=fit.bias_field,
         common_bias_rms=found.prior.volumes.field_rms,
         n_gaussians=len(fit.cloud),

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from g3r._version import __version__
+from g3r.acquisition.images import Space
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
@@ -23,6 +24,7 @@ from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
 from g3r.registration import Registration
+from g3r.registration.atlas_frame import motion_to_headers
 from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
@@ -43,6 +45,8 @@ class RegistrationRecord:
         held_out_correlation: of each initialisation, stack by stack.
         space: "standard" or "scanner".
         correlation_with_template: of the head with the atlas template; None in scanner space.
+        standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
+            robust mean. None in scanner space.
         rounds: figures of each round.
     """
 
@@ -50,13 +54,20 @@ class RegistrationRecord:
     summary: str
     initialisation: str
     held_out_correlation: dict[str, list[float]]
-    space: str
+    space: Space
     correlation_with_template: float | None
+    standard_from_scanner: list[list[float]] | None
     rounds: list[dict[str, float]]
 
     @classmethod
-    def of(cls, registration: Registration, qualities: Sequence[StackQuality]) -> RegistrationRecord:
-        """The record of a registration."""
+    def of(cls, registration: Registration, qualities: Sequence[StackQuality], slices: Slices) -> RegistrationRecord:
+        """The record of a registration.
+
+        Args:
+            registration: of all stacks.
+            qualities: one per stack.
+            slices: in their last poses.
+        """
         orientation = registration.orientation
         return cls(
             reliable=registration_reliable(qualities),
@@ -65,8 +76,16 @@ class RegistrationRecord:
             held_out_correlation=registration.initialisations,
             space="scanner" if orientation is None else "standard",
             correlation_with_template=None if orientation is None else orientation.correlation,
+            standard_from_scanner=None if orientation is None else _standard_from_scanner(slices),
             rounds=registration.history,
         )
+
+
+def _standard_from_scanner(slices: Slices) -> list[list[float]]:
+    matrix = np.eye(4)
+    motion = motion_to_headers(slices).inverse()
+    matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
+    return [[round(float(x), 9) for x in row] for row in matrix]
 
 
 @dataclass(frozen=True)
