@@ -32,8 +32,6 @@ SPEAKER = "g3r-infer: "
 
 MAX_REASON = 500
 
-Say = Callable[[str], None]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
@@ -70,7 +68,7 @@ class Work:
             return False
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Cohort:
     """How sessions are reconstructed.
 
@@ -85,6 +83,7 @@ class Cohort:
         n_threads: of each process; None where the options say it.
         keep_work: whether all of g3r-infer's files stay in the work folder.
         command: that makes a result.
+        say: called with a line for each session that starts or ends.
     """
 
     bids_dir: Path
@@ -97,68 +96,36 @@ class Cohort:
     n_threads: int | None = 1
     keep_work: bool = False
     command: tuple[str, ...] = field(default_factory=lambda: INFER)
+    say: Callable[[str], None] = lambda line: None
+    _started_s: dict[str, float] = field(default_factory=dict, init=False)
 
-    def run(self, sessions: Sequence[Session], n_jobs: int, say: Say) -> list[Session]:
-        """Reconstruct what is not done yet; returns the sessions that failed.
+    def run(self, sessions: Sequence[Session], n_jobs: int) -> None:
+        """Reconstruct what is not done yet.
 
         Args:
             sessions: of the data set.
             n_jobs: processes at once.
-            say: called with a line for each session that ends.
 
         Raises:
-            KeyboardInterrupt: a stop was requested.
+            KeyboardInterrupt: a stop was requested; no process is left.
         """
-        failed: list[Session] = []
-        works: list[Work] = []
-        started_s: dict[str, float] = {}
-
-        def fails(session: Session, reason: str) -> None:
-            failed.append(session)
-            line = " ".join(reason.split())[:MAX_REASON]
-            with suppress(OSError):  # the disk is full: then it is said, at least
-                write_failure(
-                    session, self.out_dir, line, time.monotonic() - started_s.get(session.stem, time.monotonic())
-                )
-            say(f"{session.stem}: failed: {line}")
-
-        def finish(work: Work) -> None:
-            try:
-                self._finish(work)
-            except (InputError, OSError) as error:
-                fails(work.session, str(error))
-                return
-            say(f"{work.session.stem}: done")
-
-        def start(work: Work) -> subprocess.Popen[bytes]:
-            started_s[work.session.stem] = time.monotonic()
-            failure_path(work.session, self.out_dir).unlink(missing_ok=True)
-            say(f"{work.session.stem}: started")
-            return self._start(work)
-
-        def ended(number: int, code: int) -> None:
-            work = works[number]
-            if code == 0:
-                finish(work)
-            else:
-                fails(work.session, _reason(log_path(work.session, self.out_dir), code))
-
+        works = []
         for session in sessions:
             if record_path(session, self.out_dir).exists() and not self.force:
                 failure_path(session, self.out_dir).unlink(missing_ok=True)  # of a try to replace it
-                say(f"{session.stem}: was done before")
+                self.say(f"{session.stem}: was done before")
                 continue
             try:
                 work = self._work(session)
             except (InputError, OSError) as error:
-                fails(session, str(error))
+                self._failed(session, str(error))
                 continue
             if work.is_done() and not self.force:
-                finish(work)
+                self._finish(work)
             else:
                 works.append(work)
-        run_all([functools.partial(start, work) for work in works], ended, n_jobs)
-        return failed
+        starts = [functools.partial(self._start, work) for work in works]
+        run_all(starts, lambda number, code: self._ended(works[number], code), n_jobs)
 
     def _work(self, session: Session) -> Work:
         """The command of a session.
@@ -178,10 +145,14 @@ class Cohort:
 
     def _start(self, work: Work) -> subprocess.Popen[bytes]:
         """Start its process; what it says goes to its log."""
-        path = log_path(work.session, self.out_dir)
+        session = work.session
+        self._started_s[session.stem] = time.monotonic()
+        failure_path(session, self.out_dir).unlink(missing_ok=True)
+        path = log_path(session, self.out_dir)
         for folder in (path.parent, work.folder):
             folder.mkdir(parents=True, exist_ok=True)
         work.note.write_text(json.dumps(work.words), encoding="utf-8")
+        self.say(f"{session.stem}: started")
         with path.open("wb") as log:
             log.write(f"{shlex.join(work.words)}\n".encode(errors="surrogateescape"))
             log.flush()
@@ -194,19 +165,34 @@ class Cohort:
                 start_new_session=True,  # Ctrl-C comes from us, once: a second one would end it without a trace
             )
 
-    def _finish(self, work: Work) -> None:
-        """Make the derivative of a session, and forget the work.
+    def _ended(self, work: Work, code: int) -> None:
+        if code == 0:
+            self._finish(work)
+        else:
+            self._failed(work.session, _reason(log_path(work.session, self.out_dir), code))
 
-        Raises:
-            InputError, OSError: it cannot be made.
-        """
+    def _finish(self, work: Work) -> None:
+        """Make the derivative of a session, and forget the work."""
         session, staging = work.session, work.folder / "derivative"
-        make_derivative(session, work.result, work.inputs, self.bids_dir, self.out_dir, staging)
-        failure_path(session, self.out_dir).unlink(missing_ok=True)
+        try:
+            make_derivative(session, work.result, work.inputs, self.bids_dir, self.out_dir, staging)
+            failure_path(session, self.out_dir).unlink(missing_ok=True)
+        except (InputError, OSError) as error:
+            self._failed(session, str(error))
+            return
         if not self.keep_work:
             shutil.rmtree(work.folder, ignore_errors=True)
             with suppress(OSError):
                 work.folder.parent.rmdir()  # only where empty
+        self.say(f"{session.stem}: done")
+
+    def _failed(self, session: Session, reason: str) -> None:
+        """Say and keep why a session failed; the others go on."""
+        line = " ".join(reason.split())[:MAX_REASON]
+        now_s = time.monotonic()
+        with suppress(OSError):  # the disk is full: then it is said, at least
+            write_failure(session, self.out_dir, line, now_s - self._started_s.get(session.stem, now_s))
+        self.say(f"{session.stem}: failed: {line}")
 
 
 def _reason(log: Path, code: int) -> str:

@@ -23,7 +23,7 @@ DESCRIPTION, README, IGNORED = "dataset_description.json", "README.md", ".bidsig
 LOGS, WORK = "logs", ".g3r"
 """Folders for what each process said, and for what is not finished."""
 
-PASSED_BY = f"{LOGS}/\n{WORK}/\n**/figures/\n*_run.json\n*_slices.tsv\n*_xfm.txt\nparticipants_g3r.*\n"
+PASSED_BY = f"{LOGS}/\n{WORK}/\nfigures\n*_run.json\n*_slices.tsv\n*_xfm.txt\nparticipants_g3r.*\n"
 
 TEXT = """# Fetal brain volumes by g3r
 
@@ -80,9 +80,8 @@ def write_data_set(bids_dir: Path, out_dir: Path, command: str) -> None:
         "Name": "Fetal brain volumes by g3r",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "derivative",
-        "License": "as the source data set",
         "GeneratedBy": [{"Name": NAME, "Version": __version__, "Description": f"Command: {command}"}],
-        "SourceDatasets": [_source(bids_dir, out_dir)],
+        "SourceDatasets": [_source(bids_dir)],
         "DatasetLinks": {SOURCE: relative_url(bids_dir, out_dir)},
     }
     try:
@@ -124,11 +123,11 @@ def as_json(value: dict[str, Any]) -> str:
     return json.dumps(value, indent=2) + "\n"
 
 
-def _source(bids_dir: Path, out_dir: Path) -> dict[str, str]:
-    """The input in the words of `SourceDatasets`: its DOI where it says one."""
+def _source(bids_dir: Path) -> dict[str, str]:
+    """The input in the words of `SourceDatasets`: a URI that `DatasetLinks` explains, and its DOI where it has one."""
     path = bids_dir / DESCRIPTION
     described = read_object(path) if path.exists() else {}
-    found = {"URL": relative_url(bids_dir, out_dir)}
+    found = {"URL": f"bids:{SOURCE}:"}
     if isinstance(described.get("DatasetDOI"), str):
         found["DOI"] = described["DatasetDOI"]
     return found

@@ -43,12 +43,17 @@ class Outcome:
 
 def log_path(session: Session, out_dir: Path) -> Path:
     """What its last run said."""
-    return out_dir / LOGS / f"{session.stem}.log"
+    return out_dir / LOGS / f"{_plain(session)}.log"
 
 
 def failure_path(session: Session, out_dir: Path) -> Path:
     """Why its last run failed; absent where it did not."""
-    return out_dir / LOGS / f"{session.stem}_failure.json"
+    return out_dir / LOGS / f"{_plain(session)}.failure.json"
+
+
+def _plain(session: Session) -> str:
+    """A name that readers of BIDS do not take for a file of the session: who failed is not in the data set."""
+    return f"g3r-{session.stem.replace('_', '-')}"
 
 
 def write_failure(session: Session, out_dir: Path, reason: str, seconds: float) -> None:

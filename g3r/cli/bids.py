@@ -116,9 +116,10 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
         mask_derivative=options.mask_derivative,
         n_threads=None if infer.threads else threads_each(n_jobs),
         keep_work=options.keep_work,
+        say=lambda line: print(line, flush=True),
     )
     try:
-        cohort.run(sessions, n_jobs, lambda line: print(line, flush=True))
+        cohort.run(sessions, n_jobs)
     finally:
         exit_code = _table(options, sessions)
     return exit_code
