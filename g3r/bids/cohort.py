@@ -20,6 +20,7 @@ from g3r.bids.derivative import RECORD, make_derivative, record_path
 from g3r.bids.description import WORK, read_object
 from g3r.bids.outcome import failure_path, log_path, write_failure
 from g3r.bids.pool import run_all
+from g3r.bids.sidecars import inherited, with_sidecar
 from g3r.errors import InputError
 
 INFER = (sys.executable, "-m", "g3r.cli.infer")
@@ -131,17 +132,23 @@ class Cohort:
         """The command of a session.
 
         Raises:
-            InputError: its masks cannot be told.
+            InputError: its masks cannot be told, or a sidecar cannot be read.
         """
         folder = self.out_dir / WORK / session.stem
         masks = [] if self.whole_image else find_masks(session, self.bids_dir, self.out_dir, self.mask_derivative)
-        words = [*self.command, "--stacks", *map(str, session.stacks)]
+        stacks = [self._with_inherited(stack, folder / "stacks") for stack in session.stacks]
+        words = [*self.command, "--stacks", *map(str, stacks)]
         words += ["--masks", *(str(mask or AUTO) for mask in masks)] if masks else []
         words += [*self.options, "--output", str(folder / "result"), "--force"]
         words += ["--threads", str(self.n_threads)] if self.n_threads else []
         words += ["--resume"] if self.resumes and not self.force else []
         inputs = (*session.stacks, *(mask for mask in masks if mask))
         return Work(session=session, inputs=inputs, words=tuple(words), folder=folder)
+
+    def _with_inherited(self, stack: Path, folder: Path) -> Path:
+        """The stack, or a link to it beside which its sidecar is whole."""
+        keys = inherited(stack, self.bids_dir)
+        return stack if keys is None else with_sidecar(stack, keys, folder)
 
     def _start(self, work: Work) -> subprocess.Popen[bytes]:
         """Start its process; what it says goes to its log."""

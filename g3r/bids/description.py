@@ -108,7 +108,8 @@ def read_object(path: Path) -> dict[str, Any]:
         InputError: it cannot be read or holds something else.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        # as sidecars are read: free text in them may be in any 8-bit code
+        found = json.loads(path.read_bytes().decode("utf-8-sig", errors="replace"), strict=False)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     except (ValueError, RecursionError):

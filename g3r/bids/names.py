@@ -41,11 +41,16 @@ class BidsName:
 def parsed_name(path: Path) -> BidsName | None:
     """The parts of the name of a NIfTI file; None where it is not named as BIDS wants it."""
     ending = next((one for one in NIFTI_ENDINGS if path.name.endswith(one)), None)
-    if ending is None:
-        return None
+    name = None if ending is None else parsed_stem(path.name.removesuffix(ending))
+    return name if name is not None and "sub" in name.entities else None
+
+
+def parsed_stem(stem: str) -> BidsName | None:
+    """The parts of a name without its ending, which need not name a participant; None where it ends in no suffix."""
     entities: dict[str, str] = {}
     words = []
-    for part in path.name.removesuffix(ending).split("_"):
+    parts = stem.split("_")
+    for part in parts:
         found = ENTITY.fullmatch(part)
         if found and found[1] in entities:
             return None
@@ -53,5 +58,4 @@ def parsed_name(path: Path) -> BidsName | None:
             entities[found[1]] = found[2]
         else:
             words.append(part)
-    is_named = "sub" in entities and words and path.name.endswith(f"_{words[-1]}{ending}")
-    return BidsName(entities, tuple(words)) if is_named else None
+    return BidsName(entities, tuple(words)) if words and words[-1] == parts[-1] else None

@@ -33,7 +33,7 @@ def test_never_more_than_allowed_and_all_are_reported(n_jobs: int) -> None:
 
 
 def test_an_interrupt_ends_every_process() -> None:
-    alive = []
+    alive: list[subprocess.Popen[bytes]] = []
 
     def start() -> subprocess.Popen[bytes]:
         if len(alive) == 2:
