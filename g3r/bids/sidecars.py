@@ -7,14 +7,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from g3r.acquisition.sidecar import READ_KEYS
 from g3r.bids.description import as_json, read_object
 from g3r.bids.names import parsed_name, parsed_stem
 
 
 def inherited(stack: Path, bids_dir: Path) -> dict[str, Any] | None:
-    """All keys that hold for a stack, those of nearer files over those above; None where no file above has any.
+    """The keys that g3r reads and that hold for a stack, nearer files first; None where no file above has any.
 
-    g3r-infer reads the file beside a stack by itself.
+    g3r-infer reads the file beside a stack by itself. Other keys may name the patient, and are not carried on.
 
     Args:
         stack: in the data set.
@@ -35,8 +36,9 @@ def inherited(stack: Path, bids_dir: Path) -> dict[str, Any] | None:
             if other and other.words == name.words and other.entities.items() <= name.entities.items():
                 found.append((len(other.entities), path))
         for n_entities, path in sorted(found):
-            keys |= read_object(path)
-            is_inherited |= folder != stack.parent or n_entities < len(name.entities)
+            own = {key: value for key, value in read_object(path).items() if key in READ_KEYS}
+            keys |= own
+            is_inherited |= bool(own) and (folder != stack.parent or n_entities < len(name.entities))
     return keys if is_inherited else None
 
 

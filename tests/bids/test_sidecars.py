@@ -27,15 +27,16 @@ def raw(tmp_path: Path) -> Path:
 def test_nearer_files_win_and_others_do_not_count(raw: Path) -> None:
     axial, coronal = find_sessions(raw)[0].stacks
     assert inherited(axial, raw) is None
-    write(axial.with_name("sub-01_ses-1_acq-ax_run-1_T2w.json"), EchoTime=0.1)
+    write(axial.with_name("sub-01_ses-1_acq-ax_run-1_T2w.json"), PhaseResolution=0.7)
     assert inherited(axial, raw) is None  # g3r-infer reads that one itself
-    write(raw / "T2w.json", SliceThickness=4, EchoTime=0.2, RepetitionTime=1)
+    write(raw / "T2w.json", SliceThickness=4, PhaseResolution=0.5, SpacingBetweenSlices=5, PatientName="x")
     write(raw / "acq-ax_T2w.json", SliceThickness=3.5)
     write(raw / "acq-sag_T2w.json", SliceThickness=9)
+    write(raw / "acq-cor_T2w.json", PatientName="x")
     write(raw / "T1w.json", SliceThickness=9)
-    write(raw / "sub-01" / "ses-1" / "sub-01_ses-1_T2w.json", RepetitionTime=2)
-    assert inherited(axial, raw) == {"SliceThickness": 3.5, "EchoTime": 0.1, "RepetitionTime": 2}
-    assert inherited(coronal, raw) == {"SliceThickness": 4, "EchoTime": 0.2, "RepetitionTime": 2}
+    write(raw / "sub-01" / "ses-1" / "sub-01_ses-1_T2w.json", SpacingBetweenSlices=4)
+    assert inherited(axial, raw) == {"SliceThickness": 3.5, "PhaseResolution": 0.7, "SpacingBetweenSlices": 4}
+    assert inherited(coronal, raw) == {"SliceThickness": 4, "PhaseResolution": 0.5, "SpacingBetweenSlices": 4}
 
 
 def test_the_link_has_all_keys_beside_it(raw: Path, tmp_path: Path) -> None:
@@ -55,3 +56,8 @@ def test_a_file_that_is_no_json_is_named(raw: Path) -> None:
     (raw / "T2w.json").write_text("{")
     with pytest.raises(InputError, match=r"T2w\.json: is not JSON"):
         inherited(find_sessions(raw)[0].stacks[0], raw)
+
+
+def test_keys_that_are_not_read_are_not_carried_on(raw: Path) -> None:
+    write(raw / "T2w.json", PatientName="x", EchoTime=0.1)
+    assert inherited(find_sessions(raw)[0].stacks[0], raw) is None
