@@ -96,9 +96,7 @@ def make_derivative(
             (anat / f"{begin}_{image.end}.json").write_text(as_json(keys | {"Sources": sources}), encoding="utf-8")
     _copy_found_masks(session, result, record, bids_dir, anat)
     shutil.copyfile(result / "slices.tsv", anat / f"{begin}_slices.tsv")
-    motion = (record.get("registration") or {}).get("standard_from_scanner")
-    if motion is not None:
-        (anat / f"{session.stem}_{XFM}").write_text(itk_text(motion), encoding="ascii")
+    _write_transforms(session, record, anat)
     for name, end in FIGURES.items():
         if (result / name).is_file():
             shutil.copyfile(result / name, figures / f"{begin}_{end}")
@@ -132,6 +130,16 @@ def _sidecar(path: Path, image: Image, where: str, volume: str) -> dict[str, Any
     }
 
 
+def _write_transforms(session: Session, record: dict[str, Any], anat: Path) -> None:
+    """The way from the scanner, of all slices and of those of each stack; none from scanner space."""
+    motions = {f"{session.stem}_{REC}": (record.get("registration") or {}).get("standard_from_scanner")}
+    for one in record.get("stacks", []):
+        motions[_scan(str(one.get("name")))] = one.get("standard_from_scanner")
+    for begin, motion in motions.items():
+        if motion is not None:
+            (anat / f"{begin}_{XFM}").write_text(itk_text(motion), encoding="ascii")
+
+
 def _copy_found_masks(session: Session, result: Path, record: dict[str, Any], bids_dir: Path, anat: Path) -> None:
     """Masks that were found are derivatives of their stacks, on the stacks' grids."""
     stacks = {path.name: path for path in session.stacks}
@@ -139,8 +147,7 @@ def _copy_found_masks(session: Session, result: Path, record: dict[str, Any], bi
         path, stack = result / f"brain-mask-{n}.nii.gz", stacks.get(one.get("name"))
         if stack is None or not path.is_file():
             continue
-        ending = next(one for one in NIFTI_ENDINGS if stack.name.endswith(one))
-        begin = f"{stack.name.removesuffix(ending).removesuffix('_T2w')}_desc-brain_mask"
+        begin = f"{_scan(stack.name)}_desc-brain_mask"
         shutil.copyfile(path, anat / f"{begin}.nii.gz")
         keys = {
             "Type": "Brain",
@@ -177,6 +184,12 @@ def _put_back(staging: Path, target: Path) -> None:
         earlier = staging / f"earlier-{name}"
         if earlier.exists() and not (target / name).exists():
             os.rename(earlier, target / name)
+
+
+def _scan(name: str) -> str:
+    """The name of a stack's file without suffix and ending: its entities."""
+    ending = next((one for one in NIFTI_ENDINGS if name.endswith(one)), "")
+    return name.removesuffix(ending).removesuffix("_T2w")
 
 
 def _uri(path: Path, bids_dir: Path) -> str:

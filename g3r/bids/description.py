@@ -36,7 +36,7 @@ One volume for each session, reconstructed from stacks of thick slices. For rese
 - `*_rec-g3r_desc-unseen_mask`: brain that no slice saw.
 - `*_rec-g3r_run.json`, `*_rec-g3r_slices.tsv`: settings and figures of the run; a row for each slice.
 - `*_from-scanner_to-standard_mode-image_xfm.txt`: for ITK and ANTs, to resample images in scanner space onto the
-  volume. Every slice moved by itself: this is their robust mean.
+  volume. Every slice moved by itself: this is the robust mean of a stack's slices, or of all (`rec-g3r`).
 - `figures/`: look at these first. `participants_g3r.tsv`: a row for each session. `logs/`: what each run said.
 
 A query for volumes should ask for files without `desc`.

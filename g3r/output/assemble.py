@@ -277,7 +277,7 @@ def _record(
         time_budget=plan.record(),
         prior=found.prior_record,
         pose_network=found.pose_record,
-        stacks=stack_records(found.stacks, found.registration, qualities, fit.weight),
+        stacks=stack_records(found.stacks, found.registration, qualities, fit.weight, fit.slices),
         registration=RegistrationRecord.of(found.registration, qualities, fit.slices),
         bias_field=fit.bias_field,
         common_bias_rms=found.prior.volumes.field_rms,

@@ -19,12 +19,11 @@ from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.pose_rounds import PoseRounds
-from g3r.output.stack_record import StackRecord
+from g3r.output.stack_record import StackRecord, mean_motion
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
 from g3r.registration import Registration
-from g3r.registration.atlas_frame import motion_to_headers
 from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
@@ -46,7 +45,7 @@ class RegistrationRecord:
         space: "standard" or "scanner".
         correlation_with_template: of the head with the atlas template; None in scanner space.
         standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
-            robust mean. None in scanner space.
+            robust mean, and near the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.
     """
 
@@ -76,16 +75,9 @@ class RegistrationRecord:
             held_out_correlation=registration.initialisations,
             space="scanner" if orientation is None else "standard",
             correlation_with_template=None if orientation is None else orientation.correlation,
-            standard_from_scanner=None if orientation is None else _standard_from_scanner(slices),
+            standard_from_scanner=None if orientation is None else mean_motion(slices),
             rounds=registration.history,
         )
-
-
-def _standard_from_scanner(slices: Slices) -> list[list[float]]:
-    matrix = np.eye(4)
-    motion = motion_to_headers(slices).inverse()
-    matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
-    return [[round(float(x), 9) for x in row] for row in matrix]
 
 
 @dataclass(frozen=True)

@@ -33,13 +33,15 @@ def test_motion_to_headers_ignores_a_stray() -> None:
 def test_form_codes_and_the_way_from_the_scanner(subject: Path, tmp_path: Path, space: str) -> None:
     out = tmp_path / "out"
     assert main([*map(str, inputs(subject)), *QUICK, "--space", space, "--output", str(out)]) == 0
-    record = json.loads((out / "run.json").read_text())["registration"]
+    whole = json.loads((out / "run.json").read_text())
+    record = whole["registration"]
     for path in out.glob("*.nii.gz"):
         header = nib.Nifti1Image.from_filename(path).header
         assert {int(header["sform_code"]), int(header["qform_code"])} == {CODES[record["space"]]}, path.name
     assert record["space"] == space
     if space == "scanner":
         assert record["standard_from_scanner"] is None
+        assert all(stack["standard_from_scanner"] is None for stack in whole["stacks"])
         return
     matrix = np.array(record["standard_from_scanner"])
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
@@ -55,6 +57,10 @@ def test_form_codes_and_the_way_from_the_scanner(subject: Path, tmp_path: Path, 
     there = poses.apply(np.broadcast_to(points, (len(poses), *points.shape)))
     apart_mm = np.linalg.norm(there - common, axis=2).mean(1)
     assert np.median(apart_mm) < 3
+    for n, stack in enumerate(whole["stacks"]):
+        own = np.array(stack["standard_from_scanner"])
+        there = poses.take([int(row["stack"]) == n for row in rows]).apply(points[None])
+        assert np.median(np.linalg.norm(there - (points @ own[:3, :3].T + own[:3, 3]), axis=2)) < 1.5
     # the head stands where the volume shows it
     mask = nib.Nifti1Image.from_filename(out / "mask.nii.gz")
     inside = nib.affines.apply_affine(mask.affine, np.argwhere(np.asarray(mask.dataobj) > 0))
