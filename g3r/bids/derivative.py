@@ -60,6 +60,11 @@ def record_path(session: Session, out_dir: Path) -> Path:
     return out_dir / session.folder / "anat" / f"{session.stem}_{REC}_run.json"
 
 
+def figure_path(session: Session, out_dir: Path) -> Path:
+    """The picture of the volume's sections."""
+    return out_dir / session.folder / "figures" / f"{session.stem}_{REC}_{FIGURES['sections.png']}"
+
+
 def make_derivative(
     session: Session, result: Path, inputs: Sequence[Path], bids_dir: Path, out_dir: Path, staging: Path
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from g3r._version import __version__
-from g3r.errors import InputError, cannot_be_written
+from g3r.errors import InputError
 from g3r.run.atomic_file import write_text
 
 BIDS_VERSION = "1.10.0"
@@ -23,7 +23,7 @@ DESCRIPTION, README, IGNORED = "dataset_description.json", "README.md", ".bidsig
 LOGS, WORK = "logs", ".g3r"
 """Folders for what each process said, and for what is not finished."""
 
-PASSED_BY = f"{LOGS}/\n{WORK}/\nfigures\n*_run.json\n*_slices.tsv\n*_xfm.txt\nparticipants_g3r.*\n"
+PASSED_BY = f"{LOGS}/\n{WORK}/\nfigures\n*_run.json\n*_slices.tsv\n*_xfm.txt\nparticipants_g3r.*\nindex.html\n"
 
 TEXT = """# Fetal brain volumes by g3r
 
@@ -37,7 +37,8 @@ One volume for each session, reconstructed from stacks of thick slices. For rese
 - `*_rec-g3r_run.json`, `*_rec-g3r_slices.tsv`: settings and figures of the run; a row for each slice.
 - `*_from-scanner_to-standard_mode-image_xfm.txt`: for ITK and ANTs, to resample images in scanner space onto the
   volume. Every slice moved by itself: this is the robust mean of a stack's slices, or of all (`rec-g3r`).
-- `figures/`: look at these first. `participants_g3r.tsv`: a row for each session. `logs/`: what each run said.
+- `figures/`: look at these first; `index.html` shows all of them, the worst first.
+- `participants_g3r.tsv`: a row for each session. `logs/`: what each run said.
 
 A query for volumes should ask for files without `desc`.
 """
@@ -90,7 +91,7 @@ def write_data_set(bids_dir: Path, out_dir: Path, command: str) -> None:
         write_text(out_dir / README, TEXT)
         write_text(out_dir / IGNORED, PASSED_BY)
     except OSError as error:
-        raise cannot_be_written(out_dir, error) from None
+        raise InputError(f"{out_dir}: cannot be written ({error.strerror}); choose another OUT_DIR") from None
 
 
 def relative_url(bids_dir: Path, out_dir: Path) -> str:

@@ -39,7 +39,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("out_dir", type=Path, metavar="OUT_DIR", help="derivative data set to write")
     parser.add_argument(
-        "level", choices=("participant", "group"), help="reconstruct, or only write participants_g3r.tsv anew"
+        "level",
+        choices=("participant", "group"),
+        help="reconstruct, or only write participants_g3r.tsv and index.html anew",
     )
     parser.add_argument("--participant-label", nargs="+", metavar="LABEL", help="without sub- (default: all)")
     parser.add_argument("--session-label", nargs="+", metavar="LABEL", help="without ses- (default: all)")
@@ -128,12 +130,14 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
 def _table(options: argparse.Namespace, sessions: list[Session]) -> int:
     """Write the table of all sessions; the exit code tells of those that were asked for."""
     from g3r.bids.dataset import find_sessions
+    from g3r.bids.index_page import write_index
     from g3r.bids.outcome import FAILED as FAILED_VERDICT
     from g3r.bids.outcome import outcome_of
     from g3r.bids.table import write_table
 
     outcomes = [outcome_of(session, options.out_dir) for session in find_sessions(options.bids_dir)]
     path = write_table(outcomes, options.out_dir)
+    write_index(outcomes, options.out_dir)
     asked = {session.stem for session in sessions}
     of_asked = [one.verdict for one in outcomes if one.session.stem in asked]
     counts = ", ".join(f"{of_asked.count(verdict)} {verdict}" for verdict in dict.fromkeys(sorted(of_asked)))
