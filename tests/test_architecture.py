@@ -124,7 +124,9 @@ def test_the_pipeline_needs_no_training_packages() -> None:
     assert modules_after("import g3r.reconstruct", "lightning", "torchio", "pytorch_lightning") == set()
 
 
-COMMANDS = [f"g3r.cli.{name}" for name in ("infer", "evaluate", "pretrain", "export", "bench")] + ["data_synth.cli"]
+COMMANDS = [f"g3r.cli.{name}" for name in ("infer", "bids", "evaluate", "pretrain", "export", "bench")] + [
+    "data_synth.cli"
+]
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import nibabel as nib
 import numpy as np
@@ -15,6 +16,11 @@ from g3r.acquisition.nifti import checked_grid, open_nifti, orientation_remarks,
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
 from g3r.run.atomic_file import atomic_path
+
+Space = Literal["scanner", "standard"]
+
+FORM_CODES: dict[Space, str] = {"scanner": "scanner", "standard": "aligned"}
+"""What a NIfTI header says of the space that its affine leads to; "aligned" is aligned to anything else."""
 
 MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 """Masks are drawn on copies whose headers lost digits: corners may differ by this much."""
@@ -103,6 +109,7 @@ def save_volume(
     data: NDArray[np.generic],
     affine: NDArray[np.float64],
     header_text: HeaderText | None = None,
+    space: Space = "scanner",
 ) -> None:
     """Write a volume as NIfTI, whole or not at all: float32, or uint8 for masks; int16 stays.
 
@@ -111,6 +118,7 @@ def save_volume(
         data: [I, J, K].
         affine: [4, 4] RAS+ mm from index.
         header_text: free text for the header; none when None.
+        space: that the affine leads to; the scanner's, or the standard orientation of a result.
 
     Raises:
         InputError: the folder cannot be written.
@@ -123,8 +131,8 @@ def save_volume(
         array = array.astype(np.float32)
     image = nib.Nifti1Image(array, affine)
     image.header.set_xyzt_units("mm")
-    image.set_sform(affine, code="scanner")
-    image.set_qform(affine, code="scanner")
+    image.set_sform(affine, code=FORM_CODES[space])
+    image.set_qform(affine, code=FORM_CODES[space])
     if header_text is not None:
         header_text.put_into(image)
     try:

@@ -31,6 +31,9 @@ DIRECTION_KEYS = ("PhaseEncodingDirection", "PhaseEncodingAxis")
 
 DICOM_KEY = "InPlanePhaseEncodingDirectionDICOM"
 
+READ_KEYS = ("SliceThickness", "SpacingBetweenSlices", "PhaseResolution", *DIRECTION_KEYS, DICOM_KEY)
+"""All that is read."""
+
 Axis = Literal["i", "j", "k"]
 
 AXES: tuple[Axis, ...] = ("i", "j", "k")

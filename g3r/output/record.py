@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from g3r._version import __version__
+from g3r.acquisition.images import Space
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.pose_rounds import PoseRounds
-from g3r.output.stack_record import StackRecord
+from g3r.output.stack_record import StackRecord, mean_motion
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
@@ -43,6 +44,8 @@ class RegistrationRecord:
         held_out_correlation: of each initialisation, stack by stack.
         space: "standard" or "scanner".
         correlation_with_template: of the head with the atlas template; None in scanner space.
+        standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
+            robust mean, and near the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.
     """
 
@@ -50,13 +53,20 @@ class RegistrationRecord:
     summary: str
     initialisation: str
     held_out_correlation: dict[str, list[float]]
-    space: str
+    space: Space
     correlation_with_template: float | None
+    standard_from_scanner: list[list[float]] | None
     rounds: list[dict[str, float]]
 
     @classmethod
-    def of(cls, registration: Registration, qualities: Sequence[StackQuality]) -> RegistrationRecord:
-        """The record of a registration."""
+    def of(cls, registration: Registration, qualities: Sequence[StackQuality], slices: Slices) -> RegistrationRecord:
+        """The record of a registration.
+
+        Args:
+            registration: of all stacks.
+            qualities: one per stack.
+            slices: in their last poses.
+        """
         orientation = registration.orientation
         return cls(
             reliable=registration_reliable(qualities),
@@ -65,6 +75,7 @@ class RegistrationRecord:
             held_out_correlation=registration.initialisations,
             space="scanner" if orientation is None else "standard",
             correlation_with_template=None if orientation is None else orientation.correlation,
+            standard_from_scanner=None if orientation is None else mean_motion(slices),
             rounds=registration.history,
         )
 

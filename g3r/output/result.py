@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.header_text import HeaderText
-from g3r.acquisition.images import save_volume
+from g3r.acquisition.images import Space, save_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, cannot_be_written
@@ -118,9 +118,10 @@ class ReconstructionResult:
     def _write(self, folder: Path) -> None:
         maps = {name: self.grid for name in ("volume", "mask", "unseen", "uncertainty", "prior_share")}
         maps |= {name: self.prior_grid for name in ("prior", "coarse", "density")}
+        space: Space = self.record.registration.space if self.record.registration else "scanner"
         with ThreadPoolExecutor() as pool:  # compression runs while the sections are drawn
             saved = [
-                pool.submit(save_volume, folder / f"{name}.nii.gz", data, grid.affine, self.header_text)
+                pool.submit(save_volume, folder / f"{name}.nii.gz", data, grid.affine, self.header_text, space)
                 for name, grid in maps.items()
                 if (data := getattr(self, name)) is not None
             ]

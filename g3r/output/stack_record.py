@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from g3r.acquisition.brain_mask import MaskSource
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.sidecar import Axis
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile, ThicknessSource
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.registration import Registration
+from g3r.registration.atlas_frame import motion_to_headers
 from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality
 
 
@@ -30,6 +32,8 @@ class StackRecord:
         mask_from, mask_detail: who made the mask, and with what.
         mask_ml: what is marked.
         quality, interleave, n_segments: None where the stack had no slices.
+        standard_from_scanner: [4, 4] robust mean motion (RAS, mm) of its slices, from where its header puts them; None
+            in scanner space, and where the stack had no slices.
     """
 
     name: str
@@ -47,6 +51,7 @@ class StackRecord:
     interleave: int | None = None
     n_segments: int | None = None
     n_downweighted_slices: int = 0
+    standard_from_scanner: list[list[float]] | None = None
 
     def profile(self) -> SliceProfile:
         """The PSF, to take the same one again.
@@ -66,8 +71,19 @@ class StackRecord:
         )
 
 
+def mean_motion(slices: Slices) -> list[list[float]]:
+    """The rigid motion [4, 4] (RAS, mm) that takes points by the headers to where slices are, on robust average."""
+    matrix, motion = np.eye(4), motion_to_headers(slices).inverse()
+    matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
+    return [[round(float(x), 9) for x in row] for row in matrix]
+
+
 def stack_records(
-    stacks: Sequence[Stack], registration: Registration, qualities: Sequence[StackQuality], weight: np.ndarray
+    stacks: Sequence[Stack],
+    registration: Registration,
+    qualities: Sequence[StackQuality],
+    weight: np.ndarray,
+    slices: Slices,
 ) -> list[StackRecord]:
     """One record for each stack that was given.
 
@@ -76,8 +92,10 @@ def stack_records(
         registration: has an entry for each stack that has slices, which not every given one need have.
         qualities: one per stack.
         weight: [K] slice weights at the end of the fit.
+        slices: [K] in their last poses.
     """
     stack_id = registration.slices.stack_id
+    moved = registration.orientation is not None
     place = {int(stack): k for k, stack in enumerate(np.unique(stack_id))}
     return [
         StackRecord(
@@ -94,6 +112,7 @@ def stack_records(
             interleave=registration.interleave[place[n]] if n in place else None,
             n_segments=registration.n_segments[place[n]] if n in place else None,
             n_downweighted_slices=int((weight[stack_id == n] < DOWNWEIGHTED_BELOW).sum()),
+            standard_from_scanner=mean_motion(slices.take(slices.stack_id == n)) if moved and n in place else None,
         )
         for n, stack in enumerate(stacks)
     ]

@@ -87,9 +87,14 @@ def centred_on_headers(slices: Slices) -> Slices:
     Poses are determined up to one rigid motion of the whole head. This choice keeps the volume where the
     scanner's coordinates put it, on (robust) average over all slices.
     """
+    return slices.with_pose(motion_to_headers(slices) @ slices.planes.pose)
+
+
+def motion_to_headers(slices: Slices) -> RigidPose:
+    """The one motion that takes all slices back to their headers, on robust average: few strays hardly count."""
     corners = slices.planes.corners_mm()
     here = slices.planes.pose.apply(corners).reshape(-1, 3)
     header = slices.header_pose.apply(corners).reshape(-1, 3)
     area = np.repeat((slices.planes.shape * slices.planes.spacing_mm).prod(1), corners.shape[1])
     back, _ = fit_rigid_robust(here, header, scale_mm=HEADER_REACH_MM, n_rounds=10, weight=area)
-    return slices.with_pose(back @ slices.planes.pose)
+    return back

@@ -1,0 +1,216 @@
+"""Sessions of a data set, one process of g3r-infer each, and what becomes of them."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from g3r.bids.dataset import Session, find_masks
+from g3r.bids.derivative import RECORD, make_derivative, record_path
+from g3r.bids.description import WORK, read_object
+from g3r.bids.outcome import failure_path, log_path, write_failure
+from g3r.bids.pool import run_all
+from g3r.bids.sidecars import inherited, with_sidecar
+from g3r.errors import InputError
+
+INFER = (sys.executable, "-m", "g3r.cli.infer")
+
+AUTO = "auto"
+"""In place of a mask's file: g3r-infer is to find it."""
+
+SPEAKER = "g3r-infer: "
+"""How the lines of the command begin."""
+
+MAX_REASON = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What is to be done for a session.
+
+    Attributes:
+        session: to reconstruct.
+        inputs: stacks and masks.
+        words: the command line.
+        folder: what is not finished.
+    """
+
+    session: Session
+    inputs: tuple[Path, ...]
+    words: tuple[str, ...]
+    folder: Path
+
+    @property
+    def result(self) -> Path:
+        """Folder that the command writes."""
+        return self.folder / "result"
+
+    @property
+    def note(self) -> Path:
+        """File with the command line of the last run."""
+        return self.folder / "command.json"
+
+    def is_done(self) -> bool:
+        """Whether this very command has written its whole result."""
+        try:
+            words = json.loads(self.note.read_text(encoding="utf-8"))
+            return words == list(self.words) and not read_object(self.result / RECORD).get("partial", True)
+        except (OSError, ValueError, InputError):
+            return False
+
+
+@dataclass(kw_only=True)
+class Cohort:
+    """How sessions are reconstructed.
+
+    Args:
+        bids_dir: the data set.
+        out_dir: the derivative data set.
+        options: of g3r-infer, for all sessions.
+        whole_image: whether they say that no mask is needed.
+        resumes: whether a run that was cut short is gone on with.
+        force: whether what is done is done again.
+        mask_derivative: folder of `derivatives/` that the masks are in; None for any.
+        n_threads: of each process; None where the options say it.
+        keep_work: whether all of g3r-infer's files stay in the work folder.
+        command: that makes a result.
+        say: called with a line for each session that starts or ends.
+    """
+
+    bids_dir: Path
+    out_dir: Path
+    options: tuple[str, ...] = ()
+    whole_image: bool = False
+    resumes: bool = True
+    force: bool = False
+    mask_derivative: str | None = None
+    n_threads: int | None = 1
+    keep_work: bool = False
+    command: tuple[str, ...] = field(default_factory=lambda: INFER)
+    say: Callable[[str], None] = lambda line: None
+    _started_s: dict[str, float] = field(default_factory=dict, init=False)
+
+    def run(self, sessions: Sequence[Session], n_jobs: int) -> None:
+        """Reconstruct what is not done yet.
+
+        Args:
+            sessions: of the data set.
+            n_jobs: processes at once.
+
+        Raises:
+            KeyboardInterrupt: a stop was requested; no process is left.
+        """
+        works = []
+        for session in sessions:
+            if record_path(session, self.out_dir).exists() and not self.force:
+                failure_path(session, self.out_dir).unlink(missing_ok=True)  # of a try to replace it
+                self.say(f"{session.stem}: was done before")
+                continue
+            try:
+                work = self._work(session)
+            except (InputError, OSError) as error:
+                self._failed(session, str(error))
+                continue
+            if work.is_done() and not self.force:
+                self._finish(work)
+            else:
+                works.append(work)
+        starts = [functools.partial(self._start, work) for work in works]
+        run_all(starts, lambda number, code: self._ended(works[number], code), n_jobs)
+
+    def _work(self, session: Session) -> Work:
+        """The command of a session.
+
+        Raises:
+            InputError: its masks cannot be told, or a sidecar cannot be read.
+        """
+        folder = self.out_dir / WORK / session.stem
+        masks = [] if self.whole_image else find_masks(session, self.bids_dir, self.out_dir, self.mask_derivative)
+        stacks = [self._with_inherited(stack, folder / "stacks") for stack in session.stacks]
+        words = [*self.command, "--stacks", *map(str, stacks)]
+        words += ["--masks", *(str(mask or AUTO) for mask in masks)] if masks else []
+        words += [*self.options, "--output", str(folder / "result"), "--force"]
+        words += ["--threads", str(self.n_threads)] if self.n_threads else []
+        words += ["--resume"] if self.resumes and not self.force else []
+        inputs = (*session.stacks, *(mask for mask in masks if mask))
+        return Work(session=session, inputs=inputs, words=tuple(words), folder=folder)
+
+    def _with_inherited(self, stack: Path, folder: Path) -> Path:
+        """The stack, or a link to it beside which its sidecar is whole."""
+        keys = inherited(stack, self.bids_dir)
+        return stack if keys is None else with_sidecar(stack, keys, folder)
+
+    def _start(self, work: Work) -> subprocess.Popen[bytes]:
+        """Start its process; what it says goes to its log."""
+        session = work.session
+        self._started_s[session.stem] = time.monotonic()
+        failure_path(session, self.out_dir).unlink(missing_ok=True)
+        path = log_path(session, self.out_dir)
+        for folder in (path.parent, work.folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        work.note.write_text(json.dumps(work.words), encoding="utf-8")
+        self.say(f"{session.stem}: started")
+        with path.open("wb") as log:
+            log.write(f"{shlex.join(work.words)}\n".encode(errors="surrogateescape"))
+            log.flush()
+            return subprocess.Popen(
+                work.words,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+                start_new_session=True,  # Ctrl-C comes from us, once: a second one would end it without a trace
+            )
+
+    def _ended(self, work: Work, code: int) -> None:
+        if code == 0:
+            self._finish(work)
+        else:
+            self._failed(work.session, _reason(log_path(work.session, self.out_dir), code))
+
+    def _finish(self, work: Work) -> None:
+        """Make the derivative of a session, and forget the work."""
+        session, staging = work.session, work.folder / "derivative"
+        try:
+            make_derivative(session, work.result, work.inputs, self.bids_dir, self.out_dir, staging)
+            failure_path(session, self.out_dir).unlink(missing_ok=True)
+        except (InputError, OSError) as error:
+            self._failed(session, str(error))
+            return
+        if not self.keep_work:
+            shutil.rmtree(work.folder, ignore_errors=True)
+            with suppress(OSError):
+                work.folder.parent.rmdir()  # only where empty
+        self.say(f"{session.stem}: done")
+
+    def _failed(self, session: Session, reason: str) -> None:
+        """Say and keep why a session failed; the others go on."""
+        line = " ".join(reason.split())[:MAX_REASON]
+        now_s = time.monotonic()
+        with suppress(OSError):  # the disk is full: then it is said, at least
+            write_failure(session, self.out_dir, line, now_s - self._started_s.get(session.stem, now_s))
+        self.say(f"{session.stem}: failed: {line}")
+
+
+def _reason(log: Path, code: int) -> str:
+    """Why a process failed, in one line, from what it said last."""
+    if code < 0:
+        return (
+            f"g3r-infer was ended by signal {-code} (9: perhaps for lack of memory; try fewer --jobs); see {log.name}"
+        )
+    try:
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    except OSError:
+        lines = []
+    said = [line for line in lines if line.startswith(SPEAKER)] or lines[-1:]
+    return said[-1].removeprefix(SPEAKER) if said else f"g3r-infer ended with exit code {code} and said nothing"

@@ -1,0 +1,135 @@
+"""Files at the top of the derivative data set: what it is, who made it, what validators pass by."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from g3r._version import __version__
+from g3r.errors import InputError
+from g3r.run.atomic_file import write_text
+
+BIDS_VERSION = "1.10.0"
+
+NAME = "g3r"
+
+SOURCE = "raw"
+"""Name of the input data set in BIDS URIs (`bids:raw:sub-01/...`)."""
+
+DESCRIPTION, README, IGNORED = "dataset_description.json", "README.md", ".bidsignore"
+
+LOGS, WORK = "logs", ".g3r"
+"""Folders for what each process said, and for what is not finished."""
+
+PASSED_BY = f"{LOGS}/\n{WORK}/\nfigures\n*_run.json\n*_slices.tsv\n*_xfm.txt\nparticipants_g3r.*\nindex.html\n"
+
+TEXT = """# Fetal brain volumes by g3r
+
+One volume for each session, reconstructed from stacks of thick slices. For research only, not for diagnosis.
+
+- `*_rec-g3r_T2w`: the volume. `*_rec-g3r_desc-brain_mask`: the brain in it.
+- `*_rec-g3r_desc-uncertainty_T2w`: expected absolute error of each voxel, in the volume's units.
+- `*_rec-g3r_desc-priorshare_T2w`: how far a voxel rests on the prior, 0 (slices) to 1 (prior alone).
+- `*_rec-g3r_desc-coverage_T2w`: how often slices covered it; 1 is one stack without gaps.
+- `*_rec-g3r_desc-unseen_mask`: brain that no slice saw.
+- `*_rec-g3r_run.json`, `*_rec-g3r_slices.tsv`: settings and figures of the run; a row for each slice.
+- `*_from-scanner_to-standard_mode-image_xfm.txt`: for ITK and ANTs, to resample images in scanner space onto the
+  volume. Every slice moved by itself: this is the robust mean of a stack's slices, or of all (`rec-g3r`).
+- `figures/`: look at these first; `index.html` shows all of them, the worst first.
+- `participants_g3r.tsv`: a row for each session. `logs/`: what each run said.
+
+A query for volumes should ask for files without `desc`.
+"""
+
+
+def check_data_set(bids_dir: Path, out_dir: Path) -> None:
+    """Refuse an output that is the input, or a data set of somebody else's.
+
+    Raises:
+        InputError: see above.
+    """
+    if out_dir.resolve() == bids_dir.resolve():
+        raise InputError(f"{out_dir}: is the input, too; pass another folder, such as derivatives/{NAME} in it")
+    if out_dir.exists() and not out_dir.is_dir():
+        raise InputError(f"{out_dir}: is a file; expected a folder, choose another")
+    path = out_dir / DESCRIPTION
+    if not path.exists():
+        if out_dir.is_dir() and any(out_dir.glob("sub-*")):
+            raise InputError(f"{out_dir}: holds sub-* and no {DESCRIPTION} of {NAME}; choose another folder")
+        return
+    described = read_object(path)
+    makers = described.get("GeneratedBy")
+    names = [one.get("Name") for one in makers if isinstance(one, dict)] if isinstance(makers, list) else []
+    if NAME not in names:
+        raise InputError(f"{path}: is of a data set that {NAME} did not make; choose another folder for the output")
+
+
+def write_data_set(bids_dir: Path, out_dir: Path, command: str) -> None:
+    """Write the files that every derivative data set has; those that are there are brought up to date.
+
+    Args:
+        bids_dir: the input.
+        out_dir: to write.
+        command: as it was given.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    description = {
+        "Name": "Fetal brain volumes by g3r",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
+        "GeneratedBy": [{"Name": NAME, "Version": __version__, "Description": f"Command: {command}"}],
+        "SourceDatasets": [_source(bids_dir)],
+        "DatasetLinks": {SOURCE: relative_url(bids_dir, out_dir)},
+    }
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        write_text(out_dir / DESCRIPTION, as_json(description))
+        write_text(out_dir / README, TEXT)
+        write_text(out_dir / IGNORED, PASSED_BY)
+    except OSError as error:
+        raise InputError(f"{out_dir}: cannot be written ({error.strerror}); choose another OUT_DIR") from None
+
+
+def relative_url(bids_dir: Path, out_dir: Path) -> str:
+    """The way from one folder to the other, so that both can be moved together and no folder above is named."""
+    try:
+        return Path(os.path.relpath(bids_dir.resolve(), out_dir.resolve())).as_posix()
+    except ValueError:  # on another drive of Windows
+        return bids_dir.resolve().as_uri()
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        InputError: it cannot be read or holds something else.
+    """
+    try:
+        # as sidecars are read: free text in them may be in any 8-bit code
+        found = json.loads(path.read_bytes().decode("utf-8-sig", errors="replace"), strict=False)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{path}: is not JSON; mend or remove it") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: holds no object {{...}}; mend or remove it")
+    return found
+
+
+def as_json(value: dict[str, Any]) -> str:
+    """The text of a JSON file."""
+    return json.dumps(value, indent=2) + "\n"
+
+
+def _source(bids_dir: Path) -> dict[str, str]:
+    """The input in the words of `SourceDatasets`: a URI that `DatasetLinks` explains, and its DOI where it has one."""
+    path = bids_dir / DESCRIPTION
+    described = read_object(path) if path.exists() else {}
+    found = {"URL": f"bids:{SOURCE}:"}
+    if isinstance(described.get("DatasetDOI"), str):
+        found["DOI"] = described["DatasetDOI"]
+    return found

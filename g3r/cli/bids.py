@@ -1,0 +1,154 @@
+"""`g3r-bids`: every session of a BIDS data set to a derivative data set, as BIDS Apps are called."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g3r._version import __version__
+from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.infer_options import parsed_options
+
+if TYPE_CHECKING:
+    from g3r.bids.dataset import Session
+
+FAILED = 1
+"""Exit code where a session failed; the others are done."""
+
+OURS = ("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard")
+"""Options of g3r-infer that this command decides itself, or that make no sense for many."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(
+        prog="g3r-bids",
+        description="Reconstruct every session of a BIDS data set, one process of g3r-infer each, and write a "
+        "derivative data set. Sessions that are done are not done again; runs that were cut short go on. For research "
+        "only, not for diagnosis.",
+        usage="%(prog)s BIDS_DIR OUT_DIR {participant,group} [options] [-- options of g3r-infer]",
+        epilog="exit codes: 0 done, 1 a session failed (the others are done), 2 usage, 3 bad input or output, "
+        "130 interrupted",
+    )
+    parser.add_argument(
+        "bids_dir", type=Path, metavar="BIDS_DIR", help="data set; masks are looked for in derivatives/*"
+    )
+    parser.add_argument("out_dir", type=Path, metavar="OUT_DIR", help="derivative data set to write")
+    parser.add_argument(
+        "level",
+        choices=("participant", "group"),
+        help="reconstruct, or only write participants_g3r.tsv and index.html anew",
+    )
+    parser.add_argument("--participant-label", nargs="+", metavar="LABEL", help="without sub- (default: all)")
+    parser.add_argument("--session-label", nargs="+", metavar="LABEL", help="without ses- (default: all)")
+    parser.add_argument("--mask-derivative", metavar="NAME", help="take masks from derivatives/NAME alone")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="processes at once (default: half the cores, as far as memory is free)"
+    )
+    parser.add_argument("--force", action="store_true", help="do what is done again, and replace it")
+    parser.add_argument("--keep-work", action="store_true", help="keep all files of g3r-infer in OUT_DIR/.g3r")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    cut = words.index("--") if "--" in words else len(words)
+    parser = build_parser()
+    options = parser.parse_args(words[:cut])
+    if options.jobs is not None and options.jobs < 1:
+        parser.error(f"--jobs {options.jobs}; expected at least 1")
+    infer = _infer_options(parser, words[cut + 1 :])
+    from g3r.run.stop_request import StopRequest
+
+    stop_request = StopRequest()
+    try:
+        with stop_request:
+            return _run(options, infer, tuple(words[cut + 1 :]), _command(options, words))
+    except KeyboardInterrupt:
+        return _said("interrupted; what was done stays, and the same command goes on", stop_request.exit_code)
+    except EXPECTED as error:
+        return _said(*line_and_code(error))
+
+
+def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
+    """The options for g3r-infer; ends the program with 2 where one cannot be."""
+    before = {"stacks": ["STACK"], "output": "DIR"}
+    infer = parsed_options(["--stacks", "STACK", "--output", "DIR", *words])
+    decided = [name for name in OURS if getattr(infer, name) and getattr(infer, name) != before.get(name)]
+    if decided:
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in decided)
+        parser.error(f"{named} after --: g3r-bids decides that for each session; leave it out")
+    return infer
+
+
+def _command(options: argparse.Namespace, words: Sequence[str]) -> str:
+    """The command line with names of folders alone."""
+    folders = {str(path): path.resolve().name for path in (options.bids_dir, options.out_dir)}
+    return shlex.join(["g3r-bids", *(folders.get(word, word) for word in words)])
+
+
+def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tuple[str, ...], command: str) -> int:
+    from g3r.bids.cohort import Cohort
+    from g3r.bids.dataset import find_sessions
+    from g3r.bids.description import check_data_set, write_data_set
+    from g3r.bids.pool import NEEDED_BYTES, default_jobs, threads_each
+
+    sessions = find_sessions(options.bids_dir, options.participant_label, options.session_label)
+    check_data_set(options.bids_dir, options.out_dir)
+    write_data_set(options.bids_dir, options.out_dir, command)
+    if options.level == "group":
+        return _table(options, sessions)
+    for session in sessions:
+        if session.left_out:
+            print(f"{session.stem}: not read: {', '.join(session.left_out)} (only acq- and run- are, beside ses-)")
+    n_jobs = options.jobs or default_jobs(infer.max_memory or NEEDED_BYTES)
+    cohort = Cohort(
+        bids_dir=options.bids_dir,
+        out_dir=options.out_dir,
+        options=infer_words,
+        whole_image=infer.whole_image,
+        resumes=infer.time_budget is None,
+        force=options.force,
+        mask_derivative=options.mask_derivative,
+        n_threads=None if infer.threads else threads_each(n_jobs),
+        keep_work=options.keep_work,
+        say=lambda line: print(line, flush=True),
+    )
+    try:
+        cohort.run(sessions, n_jobs)
+    finally:
+        exit_code = _table(options, sessions)
+    return exit_code
+
+
+def _table(options: argparse.Namespace, sessions: list[Session]) -> int:
+    """Write the table of all sessions; the exit code tells of those that were asked for."""
+    from g3r.bids.dataset import find_sessions
+    from g3r.bids.index_page import write_index
+    from g3r.bids.outcome import FAILED as FAILED_VERDICT
+    from g3r.bids.outcome import outcome_of
+    from g3r.bids.table import write_table
+
+    outcomes = [outcome_of(session, options.out_dir) for session in find_sessions(options.bids_dir)]
+    path = write_table(outcomes, options.out_dir)
+    write_index(outcomes, options.out_dir)
+    asked = {session.stem for session in sessions}
+    of_asked = [one.verdict for one in outcomes if one.session.stem in asked]
+    counts = ", ".join(f"{of_asked.count(verdict)} {verdict}" for verdict in dict.fromkeys(sorted(of_asked)))
+    print(f"{path}: {counts}")
+    return FAILED if FAILED_VERDICT in of_asked else 0
+
+
+def _said(line: str, exit_code: int) -> int:
+    print(f"g3r-bids: {line}", file=sys.stderr)
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

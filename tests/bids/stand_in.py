@@ -1,0 +1,20 @@
+"""In place of g3r-infer: copies a ready result, after some time, and notes when it ran."""
+
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+
+result, events, seconds = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])
+words = sys.argv[4:]
+output = Path(words[words.index("--output") + 1])
+stack = Path(words[words.index("--stacks") + 1])
+note = events / f"{stack.name}.{time.time_ns()}.json"
+note.write_text(json.dumps({"words": words, "began": time.time(), "ended": None}))
+if stack.read_bytes().startswith(b"broken"):
+    print(f"g3r-infer: {stack.name}: not a readable NIfTI file (it is broken); copy or export it again")
+    raise SystemExit(3)
+time.sleep(seconds)
+shutil.copytree(result, output)
+note.write_text(json.dumps({**json.loads(note.read_text()), "ended": time.time()}))

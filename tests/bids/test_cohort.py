@@ -1,0 +1,194 @@
+"""Many sessions with a stand-in for g3r-infer: what is made, what is not made again, what fails."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from g3r.bids import cohort
+from g3r.cli.bids import main
+from tests.bids.data_sets import BROKEN, add_session, ready_result, stand_in
+
+N = 6
+
+Use = Callable[..., tuple[str, ...]]
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Six participants with masks, the fourth broken."""
+    for n in range(1, N + 1):
+        stacks = [(f"run-{k}", BROKEN if n == 4 else b"image", b"mask") for k in (1, 2)]
+        add_session(tmp_path / "raw", f"0{n}", "1" if n % 2 else None, stacks)
+    return tmp_path / "raw"
+
+
+@pytest.fixture
+def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
+    """Puts the stand-in in place of g3r-infer."""
+    result = ready_result(tmp_path / "ready")
+
+    def put(seconds: float = 0.0) -> tuple[str, ...]:
+        command = stand_in(result, tmp_path / "events", seconds)
+        monkeypatch.setattr(cohort, "INFER", command)
+        return command
+
+    return put
+
+
+def events(tmp_path: Path) -> list[dict[str, Any]]:
+    return [json.loads(path.read_text()) for path in sorted((tmp_path / "events").iterdir())]
+
+
+def rows(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "participants_g3r.tsv").open() as file:
+        return {row["participant_id"]: row for row in csv.DictReader(file, delimiter="\t")}
+
+
+def volumes(out: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in out.glob("sub-*/**/*_rec-g3r_T2w.nii.gz")}
+
+
+def test_one_bad_subject_stops_nobody_and_what_is_done_stays(
+    raw: Path, use: Use, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use()
+    out = tmp_path / "out"
+    line = [str(raw), str(out), "participant", "--jobs", "2"]
+    assert main(line) == 1
+    made = volumes(out)
+    assert len(made) == N - 1
+    table = rows(out)
+    assert table["sub-04"]["verdict"] == "failed"
+    assert table["sub-04"]["reason"].startswith("sub-04_run-1_T2w.nii.gz: not a readable NIfTI file")
+    assert table["sub-01"] | {"seconds": ""} == {
+        "participant_id": "sub-01", "session_id": "ses-1", "verdict": "trusted", "seconds": "", "stacks": "1",
+        "slices_used": "7", "slices": "9", "unseen_share": "0.0125", "warnings": "n/a", "reason": "n/a"
+    }  # fmt: skip
+    assert table["sub-01"]["seconds"] == "3.5"
+    assert "4 trusted" not in capsys.readouterr().err
+    assert not list(out.glob(".g3r/sub-01*"))
+    assert "not a readable" in (out / "logs" / "g3r-sub-04.log").read_text()
+
+    assert main(line) == 1  # only the broken one is tried
+    assert volumes(out) == made
+    assert len(events(tmp_path)) == N + 1
+    for path in (raw / "sub-04").rglob("*_T2w.nii.gz"):
+        path.write_bytes(b"mended")
+    assert main([str(raw), str(out), "group"]) == 1
+    assert main(line) == 0
+    assert len(volumes(out)) == N
+    assert made.items() <= volumes(out).items()
+    assert main([str(raw), str(out), "group"]) == 0
+    assert rows(out)["sub-04"]["verdict"] == "trusted"
+
+
+def test_force_replaces_and_keeps_what_others_put_there(raw: Path, use: Use, tmp_path: Path) -> None:
+    use()
+    out = tmp_path / "out"
+    line = [str(raw), str(out), "participant", "--participant-label", "01", "sub-02"]
+    assert main(line) == 0
+    made = volumes(out)
+    assert len(made) == 2
+    other = out / "sub-01" / "ses-1" / "anat" / "sub-01_ses-1_rec-g3r_dseg.nii.gz"
+    other.write_bytes(b"of another tool")
+    assert main([*line, "--force"]) == 0
+    again = volumes(out)
+    assert all(again[name] > made[name] for name in made)
+    assert other.read_bytes() == b"of another tool"
+    assert rows(out)["sub-03"]["verdict"] == "not run"
+
+
+def test_never_more_processes_than_jobs(raw: Path, use: Use, tmp_path: Path) -> None:
+    use(0.3)
+    assert main([str(raw), str(tmp_path / "out"), "participant", "--jobs", "2"]) == 1
+    spans = [(one["began"], one["ended"]) for one in events(tmp_path) if one["ended"]]
+    assert len(spans) == N - 1
+    at_once = [sum(begin <= moment < end for begin, end in spans) for moment, _ in spans]
+    assert max(at_once) == 2
+
+
+def has_ended(process: psutil.Process, within_s: float = 10.0) -> bool:
+    """Whether a process ends in time; it may wait for its parent to take notice."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                time.sleep(0.02)
+                continue
+        return True
+    return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_run_that_was_cut_short_goes_on(raw: Path, use: Use, tmp_path: Path, number: signal.Signals) -> None:
+    """Its children end with it; what it had made is not made again."""
+    command, out = use(1.0), tmp_path / "out"
+    line = [str(raw), str(out), "participant", "--jobs", "2"]
+    code = f"import sys; from g3r.bids import cohort; cohort.INFER = {command!r}\n"
+    code += f"from g3r.cli.bids import main; sys.exit(main({line!r}))"
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as run:
+        until = time.monotonic() + 60
+        while not volumes(out) and time.monotonic() < until:
+            time.sleep(0.02)
+        time.sleep(0.2)
+        children = psutil.Process(run.pid).children()
+        assert 1 <= len(children) <= 2
+        run.send_signal(number)
+        if number == signal.SIGKILL:  # nobody is left to end them
+            for child in children:
+                child.kill()
+        _, said = run.communicate(timeout=60)
+        assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[number]
+        assert all(has_ended(child) for child in children)
+        assert "Traceback" not in said
+    if number != signal.SIGKILL:
+        assert said == "g3r-bids: interrupted; what was done stays, and the same command goes on\n"
+        assert "not run" in {row["verdict"] for row in rows(out).values()}
+    made = volumes(out)
+    assert 1 <= len(made) < N - 1
+    use()
+    assert main(line) == 1
+    assert len(volumes(out)) == N - 1
+    assert made.items() <= volumes(out).items()
+
+
+def test_a_result_that_only_lacks_its_derivative_is_not_computed_again(raw: Path, use: Use, tmp_path: Path) -> None:
+    use()
+    out = tmp_path / "out"
+    line = [str(raw), str(out), "participant", "--participant-label", "01", "--keep-work"]
+    assert main(line) == 0
+    assert (out / ".g3r" / "sub-01_ses-1" / "result" / "volume.nii.gz").exists()
+    (out / "sub-01" / "ses-1" / "anat" / "sub-01_ses-1_rec-g3r_run.json").unlink()
+    assert main(line) == 0
+    assert len(events(tmp_path)) == 1
+    assert len(volumes(out)) == 1
+
+
+def test_what_each_process_is_told(raw: Path, use: Use, tmp_path: Path) -> None:
+    use()
+    mask = next((raw / "derivatives").rglob("sub-03*run-2*"))
+    mask.unlink()
+    line = [str(raw), str(tmp_path / "out"), "participant", "--participant-label", "03"]
+    assert main([*line, "--jobs", "1", "--", "--preset", "fast", "--threads", "1"]) == 0
+    (event,) = events(tmp_path)
+    words = event["words"]
+    masks = words[words.index("--masks") + 1 :][:2]
+    assert masks[0].endswith("sub-03_ses-1_run-1_desc-brain_mask.nii.gz")
+    assert masks[1] == "auto"
+    assert "--resume" in words
+    assert words.count("--threads") == 1
+    assert main([*line, "--force", "--", "--time-budget", "30", "--whole-image"]) == 0
+    words = events(tmp_path)[-1]["words"]
+    assert not {"--masks", "--resume"} & set(words)

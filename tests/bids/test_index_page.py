@@ -1,0 +1,38 @@
+"""The page of a cohort: the worst first, and nothing in it that could be run or fetched."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from g3r.bids.dataset import Session
+from g3r.bids.derivative import figure_path
+from g3r.bids.index_page import write_index
+from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome
+
+
+def test_the_worst_come_first_and_text_is_escaped(tmp_path: Path) -> None:
+    verdicts = [TRUSTED, CHECK, FAILED, NOT_RUN, DO_NOT_USE]
+    outcomes = [
+        Outcome(
+            session=Session(participant=f"0{n}", session="1", stacks=()),
+            verdict=verdict,
+            n_slices=9,
+            n_used=7,
+            unseen_share=0.012,
+            reason="<script>alert(1)</script> & more" if verdict == FAILED else None,
+        )
+        for n, verdict in enumerate(verdicts)
+    ]
+    picture = figure_path(outcomes[0].session, tmp_path)
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(b"picture")
+    write_index(outcomes, tmp_path)
+    page = (tmp_path / "index.html").read_text()
+    assert re.findall(r"<td>(sub-\d\d)_ses-1", page) == ["sub-02", "sub-04", "sub-01", "sub-03", "sub-00"]
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
+    assert "http" not in page.replace("http-equiv", "")
+    links = re.findall(r'src="([^"]+)"', page)
+    assert [tmp_path / link for link in links] == [picture]
+    assert "1 failed, 1 do not use, 1 check, 1 not run, 1 trusted" in page
