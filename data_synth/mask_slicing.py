@@ -6,6 +6,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from data_synth.slice_sampling import trilinear
 from g3r.geometry import RigidPose
 
 Array = NDArray[np.float64]
@@ -100,23 +101,7 @@ def _slices(head, axes, origin, behind, behind_axes, behind_origin, first, pixel
                         x += behind_axes[s, 0, 2] * w
                         y += behind_axes[s, 1, 2] * w
                         z += behind_axes[s, 2, 2] * w
-                        total += (np.float32(1) - opacity) * _trilinear(behind, x, y, z)
+                        total += (np.float32(1) - opacity) * trilinear(behind, x, y, z)
                 image[i, j, s] = total * share
                 inside[i, j, s] = mask * share
     return image, inside
-
-
-@nb.njit(cache=True, fastmath=True)
-def _trilinear(volume, x, y, z):
-    if x < 0 or y < 0 or z < 0:
-        return np.float32(0)
-    i, j, k = int(x), int(y), int(z)
-    if i + 1 >= volume.shape[0] or j + 1 >= volume.shape[1] or k + 1 >= volume.shape[2]:
-        return np.float32(0)
-    a, b, c = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    one = np.float32(1)
-    low = (one - b) * ((one - c) * volume[i, j, k] + c * volume[i, j, k + 1])
-    low += b * ((one - c) * volume[i, j + 1, k] + c * volume[i, j + 1, k + 1])
-    high = (one - b) * ((one - c) * volume[i + 1, j, k] + c * volume[i + 1, j, k + 1])
-    high += b * ((one - c) * volume[i + 1, j + 1, k] + c * volume[i + 1, j + 1, k + 1])
-    return (one - a) * low + a * high

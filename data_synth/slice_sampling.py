@@ -116,13 +116,14 @@ def _sample_mask(soft_mask, axes, origin, pixel, size, threshold):
                 x = origin[s, 0] + axes[s, 0, 0] * u + axes[s, 0, 1] * v
                 y = origin[s, 1] + axes[s, 1, 0] * u + axes[s, 1, 1] * v
                 z = origin[s, 2] + axes[s, 2, 0] * u + axes[s, 2, 1] * v
-                if _trilinear(soft_mask, x, y, z) > threshold:
+                if trilinear(soft_mask, x, y, z) > threshold:
                     inside[s, i, j] = 1.0
     return inside
 
 
 @nb.njit(cache=True, fastmath=True)
-def _trilinear(volume, x, y, z):
+def trilinear(volume, x, y, z):
+    """Value of a volume at an index between voxels, in compiled code; zero outside."""
     if x < 0 or y < 0 or z < 0:
         return np.float32(0)
     i, j, k = int(x), int(y), int(z)
@@ -154,13 +155,13 @@ def _sample(data, soft_mask, axes, origin, thickness, pixel, size, threshold, in
                         x = origin[s, 0] + axes[s, 0, 0] * u + axes[s, 0, 1] * v
                         y = origin[s, 1] + axes[s, 1, 0] * u + axes[s, 1, 1] * v
                         z = origin[s, 2] + axes[s, 2, 0] * u + axes[s, 2, 1] * v
-                        if _trilinear(soft_mask, x, y, z) <= threshold:
+                        if trilinear(soft_mask, x, y, z) <= threshold:
                             continue
                         inside[s, i, j] += share
                         total = np.float32(0)
                         for t in through:
                             w = t * thickness[s]
-                            total += _trilinear(
+                            total += trilinear(
                                 data, x + axes[s, 0, 2] * w, y + axes[s, 1, 2] * w, z + axes[s, 2, 2] * w
                             )
                         image[s, i, j] += share * total / np.float32(through.size)

@@ -18,7 +18,7 @@ MaskSource = Literal["file", "empty background", "whole image", "automatic", "co
 """Who says what is brain: the user's file, zeros around it, the user by word, the network, or the user's masker."""
 
 MIN_ZERO_SHARE = 0.4
-"""A stack that was masked before is zero in most of its voxels; real stacks have 5 to 21 % zeros."""
+"""A stack that was masked before is zero in most of its voxels; real ones have far fewer zeros."""
 
 BRAIN_RANGE_ML = (20.0, 900.0)
 """A fetal or neonatal brain is not smaller or larger; what a whole field of view holds is ten times as large."""

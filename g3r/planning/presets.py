@@ -92,6 +92,10 @@ class ReconstructionSettings:
 
 _BALANCED = ReconstructionSettings()
 
+_QUICK_SEARCH = replace(
+    _BALANCED.registration, n_candidates=800, network_as_reserve=True, stacks=False, attempts=1, steps_per_round=4
+)
+
 PRESETS: dict[str, ReconstructionSettings] = {
     "preview": replace(
         _BALANCED,
@@ -102,17 +106,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         prior_weight=0.45,
         prior_views=1,
         share_probes=1,
-        registration=replace(
-            _BALANCED.registration,
-            n_candidates=800,
-            network_as_reserve=True,
-            stacks=False,
-            attempts=1,
-            n_rounds=3,
-            steps_per_round=4,
-            finest_voxel_mm=1.6,
-            max_pixels=100_000,
-        ),
+        registration=replace(_QUICK_SEARCH, n_rounds=3, finest_voxel_mm=1.6, max_pixels=100_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=6),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=32),
     ),
@@ -122,17 +116,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         held_out=None,
         prior_views=1,
         share_probes=1,
-        registration=replace(
-            _BALANCED.registration,
-            n_candidates=800,
-            network_as_reserve=True,
-            stacks=False,
-            attempts=1,
-            n_rounds=5,
-            steps_per_round=4,
-            finest_voxel_mm=1.4,
-            max_pixels=200_000,
-        ),
+        registration=replace(_QUICK_SEARCH, n_rounds=5, finest_voxel_mm=1.4, max_pixels=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=70),
     ),
