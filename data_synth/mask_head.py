@@ -96,7 +96,7 @@ def scene_head(volume: TruthVolume, rng: np.random.Generator) -> SceneHead:
     low = low[low[:, 2] <= low[:, 2].min() + 8 / spacing]
     base = low.mean(0) * spacing + affine[:3, 3]
 
-    labels = _face_and_neck(points, base, radius, lattice_noise(mask.shape, 5.0, rng), rng)
+    labels = _face_and_neck(points, base, radius, lattice_noise(mask.shape, float(rng.uniform(3, 8)), rng), rng)
     # extra fluid, skull and scalp; thicker at places
     fluid = np.float32(rng.choice([0.0, rng.uniform(0, 2.5)]))
     uneven = np.float32(rng.uniform(0, 0.5)) * lattice_noise(mask.shape, 12.0, rng)
@@ -143,11 +143,16 @@ def _face_and_neck(
     neck = tube(points, [tuple(base), tuple(end)], [thick, thick])
     labels = np.zeros(np.broadcast_shapes(*(p.shape for p in points)), np.uint8)
     both = (face > 0) | (neck > 0) | (jaw > 0)
+    # some heads have a face of patches, others one of little but muscle
+    bone, muscle, fat = np.cumsum([rng.uniform(-1.6, -0.6), rng.uniform(0.4, 2.2), rng.uniform(0.4, 1.4)])
     labels[both] = np.select(
-        [mosaic[both] < -0.8, mosaic[both] < 0.1, mosaic[both] < 1.2],
+        [mosaic[both] < bone, mosaic[both] < muscle, mosaic[both] < fat],
         [Tissue.BONE, Tissue.FACE_MUSCLE, Tissue.FACE_FAT],
         Tissue.FETAL_FLUID,
     )
+    # muscles about the spine are as round as a head, and the canal in them as bright as a ventricle
+    inner = tube(points, [tuple(base), tuple(end)], [0.8 * thick, 0.8 * thick])
+    labels[(inner > 0) & (mosaic > bone)] = Tissue.FACE_MUSCLE
     canal = tube(points, [tuple(base + np.array([0, 0, 10])), tuple(end)], [6.0, 5.0])
     labels[canal > -2.5] = Tissue.BONE
     labels[canal > 0] = Tissue.FETAL_FLUID

@@ -23,9 +23,10 @@ JITTER_MM = 6.0
 """Standard deviation of a crop's centre per axis: as far as a found head may be off."""
 FAR_JITTER_MM = 25.0
 """That of some crops: a head is not to be known by being in the middle."""
-ELSEWHERE_SHARE = 0.25
+ELSEWHERE_SHARE = 0.3
 """Crops about another place, where the network is to see that there is no head, or one at the rim."""
-BESIDE_SLICES = 3
+BESIDE_SLICES = 7
+"""A crop's middle slice is at most so many from the head: face and neck are to be known as well as brain."""
 MAX_NOISE = 0.08
 WIDE_NOISE = 0.05
 """Largest standard deviations of the noise; a wide pixel is the mean of several."""
@@ -115,7 +116,9 @@ def _crop(scan: Scan, rng: np.random.Generator, pixel_mm: float, shape: tuple[in
         low, high = (int(shown[0]), int(shown[-1])) if len(shown) else (0, n_slices - 1)
         middle = int(rng.integers(low - BESIDE_SLICES, high + BESIDE_SLICES + 1))
         if rng.random() < ELSEWHERE_SHARE:
-            aside = scan.trunk_mm() if rng.random() < 0.4 else np.append(centre, 0) + rng.uniform(-90, 90, 3)
+            aside = scan.below_head_mm(float(rng.uniform(0.8, 1.6))) if rng.random() < 0.4 else scan.trunk_mm()
+            if rng.random() < 0.4:
+                aside = np.append(centre, 0) + rng.uniform(-90, 90, 3)
             centre, middle = aside[:2], int(np.abs(scan.depth_mm - aside[2]).argmin())
         centre = centre + rng.normal(0, JITTER_MM if rng.random() < 0.7 else FAR_JITTER_MM, 2)
     else:

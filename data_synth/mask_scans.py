@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 LEVEL_SHARE = {"none": 0.2, "mild": 0.4, "moderate": 0.25, "severe": 0.15}
 BLACK_SHARE = 0.05
 """Scans in which all but the brain is black already."""
-NEGATIVE_SHARE = 0.15
+NEGATIVE_SHARE = 0.2
 """Scans without a head."""
 PLANNED_SHARE = 0.65
 CUT_SHARE = 0.2
@@ -73,8 +73,18 @@ class Scan:
 
     def trunk_mm(self) -> Array:
         """Centre of the fetal trunk from the middle of the field of view, along rows, columns and slices [3]."""
-        along = self.scene.around.trunk_mm @ self.scan_pose.rotation[0]
-        return along + self.centre_mm
+        return self._seen_at(self.scene.around.trunk_mm)
+
+    def below_head_mm(self, share: float) -> Array:
+        """A place on the way from the head's centre to where the neck begins and beyond, as `trunk_mm` gives it.
+
+        Args:
+            share: of that way; 1 where the neck begins.
+        """
+        return self._seen_at(share * self.scene.head.base_mm)
+
+    def _seen_at(self, place_mm: Array) -> Array:
+        return place_mm @ self.scan_pose.rotation[0] + self.centre_mm
 
     def images(
         self,
