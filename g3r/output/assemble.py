@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
-from g3r.acquisition.coverage import UNSEEN_BELOW, UNSEEN_POWER
 from g3r.acquisition.foreground import foreground
-from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
 from g3r.fitting.held_out_slices import HeldOutChoice
@@ -23,9 +20,10 @@ from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
-from g3r.gaussians import GaussianCloud, render
+from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
+from g3r.output.mixture import Mixture
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
@@ -42,9 +40,6 @@ from g3r.uncertainty.prior_share import estimate_prior_share
 from g3r.uncertainty.unseen import UnseenPart
 
 logger = logging.getLogger(__name__)
-
-LEAST_WEIGHT = 0.01
-"""Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 
@@ -97,12 +92,21 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.clock(Stage.VOLUME):
         mask, support = _masks_on(grid, found.prior, fit)
-        density = on_grid(volumes.density, volumes.grid, grid, outside=0.0)
         least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
-        left_to_prior = _left_to_prior(density, least)
-        shown = support | (settings.use_prior & _margin(support, settings.prior_rim_mm, grid))
-        volume = _volume(found, shown, np.where(support, left_to_prior, 1), grid, settings)
-        unseen = mask & (density < UNSEEN_BELOW)
+        mixture = Mixture(
+            grid=grid,
+            support=support,
+            prior=found.prior.values,
+            density=volumes.density,
+            prior_grid=volumes.grid,
+            least_weight=least,
+            rim_mm=settings.prior_rim_mm if settings.use_prior else 0.0,
+            cutoff_sigma=settings.slice_stage.cutoff_sigma,
+        )
+        volume, left_to_prior, seen = mixture.volume(fit.cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
+        if not np.isfinite(volume).all():
+            raise NumericalError("the volume holds values that are not finite; lower the step sizes")
+        unseen = mask & ~seen
         unseen_part = UnseenPart.of(
             unseen,
             mask,
@@ -152,12 +156,13 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         uncertainty, uncertainty_record = estimated.expected_error, estimated.record
     intensity = np.float32(found.intensity)
     if not settings.fill_unseen:
-        volume, mask = volume * (density >= UNSEEN_BELOW), mask & ~unseen
+        volume, mask = volume * seen, mask & ~unseen
         uncertainty = None if uncertainty is None else uncertainty * ~unseen
     return ReconstructionResult(
         volume=volume * intensity,
         mask=mask,
         unseen=unseen,
+        support=support,
         grid=grid,
         prior=found.prior.values * intensity,
         coarse=volumes.coarse * intensity,
@@ -173,9 +178,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         prior_share=prior_share,
         stacks=tuple(found.stacks),
         record=replace(
-            _record(found, fit, qualities, plan, run, uncertainty_record),
-            unseen=unseen_part,
-            prior_weight=round(least, 3),
+            _record(found, fit, qualities, plan, run, uncertainty_record), unseen=unseen_part, prior_weight=least
         ),
     )
 
@@ -219,40 +222,6 @@ def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSetti
         run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
         return 1.0
     return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
-
-
-def _left_to_prior(density: NDArray[np.float32], least: float) -> NDArray[np.float32]:
-    """Weight [I, J, K] of the prior in the written volume: 1 where no slice looked, `least` where slices are dense.
-
-    Nothing holds Gaussians that no slice sees but what they have to explain elsewhere.
-    """
-    weight = np.exp(-UNSEEN_POWER * density)
-    return np.where(weight < LEAST_WEIGHT, 0, weight).clip(least, 1).astype(np.float32)
-
-
-def _margin(inside: NDArray[np.bool_], margin_mm: float, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Voxels [I, J, K] outside a region that are within a distance of it, in whole voxels along the axes."""
-    n_voxels = round(margin_mm / float(grid.spacing_mm.mean()))
-    return binary_dilation(inside, iterations=n_voxels) & ~inside if n_voxels else np.zeros_like(inside)
-
-
-def _volume(
-    found: StageResults,
-    shown: NDArray[np.bool_],
-    left_to_prior: NDArray[np.float32],
-    grid: VolumeGrid,
-    settings: ReconstructionSettings,
-) -> NDArray[np.float32]:
-    """The Gaussians on the output grid, and the prior where no slice looked; the prior alone before there are any."""
-    prior = on_grid(found.prior.values, found.prior.volumes.grid, grid, outside=0.0)
-    if found.fit is None:
-        return prior * shown
-    pixels = render(found.fit.cloud, volume_planes(grid), cutoff_sigma=settings.slice_stage.cutoff_sigma).numpy()
-    fitted = volume_from_pixels(pixels, grid)
-    volume = (fitted + left_to_prior * (prior - fitted)) * shown
-    if not np.isfinite(volume).all():
-        raise NumericalError("the volume holds values that are not finite; lower the step sizes")
-    return volume
 
 
 def _record(

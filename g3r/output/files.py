@@ -9,6 +9,9 @@ from g3r.acquisition.planes import Slices
 
 MASK_PICTURE = "masks.png"
 
+REUSE_NAME = "reuse.npz"
+"""Numbers that other commands need of a finished run; see `ReuseRecord`."""
+
 MASK_NAMES = (MASK_PICTURE, *(f"brain-mask-{n}.nii.gz" for n in range(32)))
 """Of masks that were found, by the number of the stack in slices.tsv; not written for the user's own."""
 
@@ -22,6 +25,7 @@ OUTPUT_NAMES = (
     "prior_share.nii.gz",
     "unseen.nii.gz",
     "gaussians.npz",
+    REUSE_NAME,
     "slices.tsv",
     "run.json",
     "sections.png",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,9 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError, cannot_be_written
 from g3r.geometry import VolumeGrid
-from g3r.output.files import MASK_PICTURE, OUTPUT_NAMES, slice_table
+from g3r.output.files import MASK_PICTURE, OUTPUT_NAMES, REUSE_NAME, slice_table
 from g3r.output.record import RunRecord
+from g3r.output.reuse_record import ReuseRecord, StackGrid
 from g3r.run.output_folder import OutputFolder, check_output_folder
 
 if TYPE_CHECKING:  # torch takes seconds to import, and a refusal should not wait for it
@@ -44,6 +45,7 @@ class ReconstructionResult:
     Attributes:
         volume, mask: [I, J, K] on `grid`.
         unseen: [I, J, K] on `grid`, the part of the brain that no slice saw; inside the mask if it is shown at all.
+        support: [I, J, K] on `grid`, where Gaussians were fitted.
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
@@ -60,6 +62,7 @@ class ReconstructionResult:
     volume: NDArray[np.float32]
     mask: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
+    support: NDArray[np.bool_]
     grid: VolumeGrid
     prior: NDArray[np.float32]
     coarse: NDArray[np.float32]
@@ -141,6 +144,7 @@ class ReconstructionResult:
 
         self.cloud.save(folder / "gaussians.npz")
         table = slice_table(self.slices, self.gain, self.weight, self.ncc)
+        self.reuse_record().save(folder / REUSE_NAME)
         (folder / "slices.tsv").write_text(table, encoding="utf-8")
         (folder / "run.json").write_text(self.record.to_json(), encoding="utf-8")
         rows, ranges = {"volume": self.volume}, dict(RANGES)
@@ -168,6 +172,19 @@ class ReconstructionResult:
 
         if found := self._found_masks():
             save_mask_picture(folder / MASK_PICTURE, [stack for _, stack in found])
+
+    def reuse_record(self) -> ReuseRecord:
+        """What other commands need of this result beside its other files."""
+        return ReuseRecord(
+            grid=self.grid,
+            support=self.support,
+            prior_grid=self.prior_grid,
+            intensity_scale=self.intensity_scale,
+            stacks=tuple(StackGrid.of(stack) for stack in self.stacks),
+            slices=replace(self.slices, value=np.zeros_like(self.slices.value), view=None),
+            gain=self.gain,
+            weight=self.weight,
+        )
 
     def _found_masks(self) -> list[tuple[int, Stack]]:
         """Stacks whose masks are not the user's files, with their numbers."""

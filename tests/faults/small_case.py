@@ -30,6 +30,7 @@ WHOLE = {
     "uncertainty.nii.gz",
     "unseen.nii.gz",
     "gaussians.npz",
+    "reuse.npz",
     "slices.tsv",
     "run.json",
     "sections.png",

@@ -1,0 +1,96 @@
+"""The written volume as a mixture of Gaussians and prior volume, on any grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from g3r.acquisition.coverage import UNSEEN_BELOW, UNSEEN_POWER
+from g3r.acquisition.planes import volume_from_pixels, volume_planes
+from g3r.gaussians import GaussianCloud, render
+from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
+
+LEAST_WEIGHT = 0.01
+"""Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
+
+INSIDE = 0.5
+"""A region of one grid holds a point of another where its interpolated share is at least this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mixture:
+    """What makes the written volume: V = [V_G + w (V_prior - V_G)] where it is shown, 0 elsewhere.
+
+    V_G are the Gaussians, rendered. The weight w of V_prior is 1 where no slice looked and outside the support of the
+    Gaussians, and falls with the density to its least value. All intensities are those of the fit.
+
+    Attributes:
+        grid: of `support`: that of the run's volume.
+        support: [I, J, K] where Gaussians were fitted.
+        prior: V_prior [I, J, K] on `prior_grid`.
+        density: M_rho [I, J, K] on `prior_grid`.
+        prior_grid: of these two.
+        least_weight: of V_prior, where slices are dense.
+        rim_mm: how far beyond the support V_prior is shown.
+        cutoff_sigma: where a Gaussian ends.
+    """
+
+    grid: VolumeGrid
+    support: NDArray[np.bool_]
+    prior: NDArray[np.float32]
+    density: NDArray[np.float32]
+    prior_grid: VolumeGrid
+    least_weight: float
+    rim_mm: float
+    cutoff_sigma: float
+
+    def density_on(self, grid: VolumeGrid) -> NDArray[np.float32]:
+        """M_rho [I, J, K] on a grid; 0 where the prior's grid does not reach."""
+        return on_grid(self.density, self.prior_grid, grid, outside=0.0)
+
+    def left_to_prior(self, grid: VolumeGrid) -> NDArray[np.float32]:
+        """Weight [I, J, K] of the prior by the density alone: 1 where no slice looked, the least where it is dense.
+
+        Nothing holds Gaussians that no slice sees but what they have to explain elsewhere.
+        """
+        weight = np.exp(-UNSEEN_POWER * self.density_on(grid))
+        return np.where(weight < LEAST_WEIGHT, 0, weight).clip(self.least_weight, 1).astype(np.float32)
+
+    def seen(self, grid: VolumeGrid) -> NDArray[np.bool_]:
+        """Where [I, J, K] slices looked."""
+        return self.density_on(grid) >= UNSEEN_BELOW
+
+    def volume(self, cloud: GaussianCloud, grid: VolumeGrid) -> NDArray[np.float32]:
+        """The volume [I, J, K] on a grid; the prior alone where the cloud is empty, before there is a fit.
+
+        On the run's own grid this is the run's volume. On another one the Gaussians are evaluated at its points, and
+        V_prior, density, support and rim are interpolated from their grids.
+
+        Args:
+            cloud: the Gaussians.
+            grid: with orthogonal axes.
+
+        Raises:
+            ValueError: a grid with sheared axes.
+        """
+        shown = self._region(self.support | _margin(self.support, self.rim_mm, self.grid), grid)
+        prior = on_grid(self.prior, self.prior_grid, grid, outside=0.0)
+        if not len(cloud):
+            return prior * shown
+        weight = np.where(self._region(self.support, grid), self.left_to_prior(grid), 1)
+        fitted = volume_from_pixels(render(cloud, volume_planes(grid), cutoff_sigma=self.cutoff_sigma).numpy(), grid)
+        return (fitted + weight * (prior - fitted)) * shown
+
+    def _region(self, inside: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.bool_]:
+        """A region of the run's grid on another one."""
+        return on_grid(inside.astype(np.float32), self.grid, grid, outside=0.0) >= INSIDE
+
+
+def _margin(inside: NDArray[np.bool_], margin_mm: float, grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Voxels [I, J, K] outside a region that are within a distance of it, in whole voxels along the axes."""
+    n_voxels = round(margin_mm / float(grid.spacing_mm.mean()))
+    return binary_dilation(inside, iterations=n_voxels) & ~inside if n_voxels else np.zeros_like(inside)

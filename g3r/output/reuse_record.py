@@ -1,0 +1,165 @@
+"""reuse.npz: the numbers of a finished run that its images and tables hold only rounded, or not at all."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Planes, Slices
+from g3r.acquisition.stacks import Stack
+from g3r.errors import InputError
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.run.atomic_file import atomic_path
+
+PLANE_FIELDS = ("rotation", "center_mm", "spacing_mm", "shape", "psf_var_mm2")
+SLICE_FIELDS = ("stack_id", "slice_index", "thickness_mm")
+
+
+@dataclass(frozen=True)
+class StackGrid:
+    """The voxels of a stack.
+
+    Attributes:
+        grid: with the slices along the third axis.
+        slice_axis: axis of the file's image that became the third one.
+    """
+
+    grid: VolumeGrid
+    slice_axis: int
+
+    @classmethod
+    def of(cls, stack: Stack) -> StackGrid:
+        """Those of a stack that was read."""
+        return cls(stack.grid, stack.slice_axis)
+
+    def in_file(self) -> VolumeGrid:
+        """The grid with the axes of the file."""
+        order = [axis for axis in range(3) if axis != self.slice_axis] + [self.slice_axis]
+        affine, shape = self.grid.affine.copy(), np.empty(3, int)
+        affine[:3, order], shape[order] = self.grid.affine[:3, :3], self.grid.shape
+        return VolumeGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReuseRecord:
+    """Geometry of a result to the last digit, without pixels.
+
+    Attributes:
+        grid: of the volume.
+        support: [I, J, K] on it, where Gaussians were fitted.
+        prior_grid: of V_prior and density.
+        intensity_scale: what an intensity of 1 in the fit is in the stacks.
+        stacks: one per stack.
+        slices: [K] in their last poses, with their masks and the PSF of the fit; all values are zero.
+        gain, weight: [K] intensity factor and weight of each slice.
+    """
+
+    grid: VolumeGrid
+    support: NDArray[np.bool_]
+    prior_grid: VolumeGrid
+    intensity_scale: float
+    stacks: tuple[StackGrid, ...]
+    slices: Slices
+    gain: NDArray[np.float64]
+    weight: NDArray[np.float64]
+
+    def first_pixel(self) -> NDArray[np.int64]:
+        """Index [K, 2] in its stack of each slice's first pixel: slices are cut to their masks."""
+        header, half = self.slices.header_pose.translation_mm, (self.slices.planes.shape - 1) / 2
+        middle = [self.stacks[s].grid.index(header[k])[:2] for k, s in enumerate(self.slices.stack_id)]
+        return np.rint(np.reshape(middle, (-1, 2)) - half).astype(np.int64)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the .npz, whole or not at all; masks as bits.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        slices, header = self.slices, self.slices.header_pose
+        arrays: dict[str, Any] = {
+            "grid_shape": np.array(self.grid.shape),
+            "grid_affine": self.grid.affine,
+            "support": np.packbits(self.support),
+            "prior_grid_shape": np.array(self.prior_grid.shape),
+            "prior_grid_affine": self.prior_grid.affine,
+            "intensity_scale": np.float64(self.intensity_scale),
+            "stack_shape": np.array([one.grid.shape for one in self.stacks]).reshape(-1, 3),
+            "stack_affine": np.array([one.grid.affine for one in self.stacks]).reshape(-1, 4, 4),
+            "stack_slice_axis": np.array([one.slice_axis for one in self.stacks], dtype=np.int64),
+            "mask": np.packbits(slices.mask),
+            "header_rotation": header.rotation,
+            "header_center_mm": header.translation_mm,
+            "gain": self.gain,
+            "weight": self.weight,
+        }
+        arrays |= {name: getattr(slices.planes, name) for name in PLANE_FIELDS}
+        arrays |= {name: getattr(slices, name) for name in SLICE_FIELDS}
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> ReuseRecord:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: not such a file.
+        """
+        try:
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+                return _record({name: data[name] for name in data.files})
+        except FileNotFoundError:
+            raise InputError(
+                f"{path}: no such file; pass the output folder of a g3r-infer that writes it, or run that again"
+            ) from None
+        except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: was not written by g3r ({error}); run g3r-infer again") from None
+
+
+def _record(data: dict[str, NDArray[Any]]) -> ReuseRecord:
+    planes = Planes(**{name: data[name] for name in PLANE_FIELDS})
+    grid = _grid(data["grid_shape"], data["grid_affine"])
+    slices = Slices(
+        planes=planes,
+        value=np.zeros(planes.n_pixels, np.float32),
+        mask=_bits(data["mask"], planes.n_pixels),
+        header_pose=RigidPose(data["header_rotation"], data["header_center_mm"]),
+        **{name: data[name] for name in SLICE_FIELDS},
+    )
+    stacks = zip(data["stack_shape"], data["stack_affine"], data["stack_slice_axis"], strict=True)
+    return ReuseRecord(
+        grid=grid,
+        support=_bits(data["support"], math.prod(grid.shape)).reshape(grid.shape),
+        prior_grid=_grid(data["prior_grid_shape"], data["prior_grid_affine"]),
+        intensity_scale=float(data["intensity_scale"]),
+        stacks=tuple(StackGrid(_grid(shape, affine), int(axis)) for shape, affine, axis in stacks),
+        slices=slices,
+        gain=data["gain"],
+        weight=data["weight"],
+    )
+
+
+def _grid(shape: NDArray[Any], affine: NDArray[Any]) -> VolumeGrid:
+    n_i, n_j, n_k = (int(n) for n in shape)
+    return VolumeGrid((n_i, n_j, n_k), affine)
+
+
+def _bits(packed: NDArray[Any], count: int) -> NDArray[np.bool_]:
+    """`count` booleans of bits that fit them.
+
+    Raises:
+        ValueError: another number of bits.
+    """
+    if len(packed) != -(-count // 8):
+        raise ValueError(f"a mask has {8 * len(packed)} bits; expected {count}")
+    return np.unpackbits(packed, count=count).astype(bool)
