@@ -34,12 +34,13 @@ MAY_IMPORT = {
     "uncertainty": "geometry acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
+    "reuse": "geometry acquisition gaussians output",
     "bids": "run acquisition",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (
         "run acquisition dicom checkpoints prior pose_network mask_network masking training planning evaluation output "
-        "bids "
+        "bids reuse "
         "reconstruct"
     ),
 }

@@ -72,23 +72,36 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
             voxel away), or an empty one, or an image.
     """
     mask = load_volume(path)
-    if mask.data.shape != reference.data.shape:
-        raise InputError(
-            f"{mask.name}: mask grid {mask.data.shape} differs from that of {reference.name} "
-            f"{reference.data.shape}; resample the mask or pass the matching file"
-        )
-    corners = reference.grid.corner_index
-    offset = reference.grid.index(mask.grid.world(corners)) - corners
-    if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
-        raise InputError(
-            f"{mask.name}: mask is up to {np.abs(offset).max():.2g} voxels off {reference.name} by its "
-            "header; resample the mask or pass the matching file"
-        )
+    check_grid(mask, reference.grid, f"that of {reference.name}", "mask")
     _check_mask_values(mask)
     inside = np.nan_to_num(mask.data) > 0.5
     if not inside.any():
         raise InputError(f"{mask.name}: mask is empty; expected the brain to be marked with 1")
     return inside
+
+
+def check_grid(found: Volume, expected: VolumeGrid, of: str, kind: str) -> None:
+    """Raise `InputError` for an image on another grid: other shape, or corners more than half a voxel away.
+
+    Args:
+        found: that was read.
+        expected: where it should be.
+        of: whose grid that is, in words: "that of stack.nii.gz".
+        kind: of image, in one word.
+    """
+    if found.data.shape != expected.shape:
+        raise InputError(
+            f"{found.name}: {kind} grid {found.data.shape} differs from {of} {expected.shape}; "
+            f"resample the {kind} or pass the matching file"
+        )
+    corners = expected.corner_index
+    offset = expected.index(found.grid.world(corners)) - corners
+    if np.abs(offset).max() > MASK_SHIFT_TOLERANCE_VOXELS:
+        name = of.removeprefix("that of ")
+        raise InputError(
+            f"{found.name}: {kind} is up to {np.abs(offset).max():.2g} voxels off {name} by its "
+            f"header; resample the {kind} or pass the matching file"
+        )
 
 
 def _check_mask_values(mask: Volume) -> None:

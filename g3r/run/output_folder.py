@@ -105,8 +105,9 @@ class OutputFolder:
         try:
             self._new.mkdir()
             yield self._new
-            for path in self._new.iterdir():  # a full disk may be reported only now
-                sync(path)
+            for path in self._new.rglob("*"):  # a full disk may be reported only now
+                if path.is_file():
+                    sync(path)
             if self.is_mount:
                 self._half_backup.mkdir()
                 _move_files(self.output, self._half_backup, self.names)

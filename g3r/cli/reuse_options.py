@@ -1,0 +1,87 @@
+"""What the commands on a finished run share: the folder they read, the file they write, failures as one line."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from g3r._version import __version__
+from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.errors import InputError
+
+IMAGE_ENDINGS = (".nii", ".nii.gz")
+
+EPILOG = "exit codes: 0 done, 2 usage, 3 bad input or output, 4 out of memory, 130 interrupted"
+
+
+def reuse_parser(prog: str, description: str) -> argparse.ArgumentParser:
+    """A parser with what all these commands take."""
+    parser = argparse.ArgumentParser(
+        prog=prog, description=f"{description} For research only, not for diagnosis.", epilog=EPILOG
+    )
+    parser.add_argument("run", metavar="DIR", type=Path, help="output folder of a finished g3r-infer")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def add_file_options(parser: argparse.ArgumentParser) -> None:
+    """Options of the commands that write one image."""
+    parser.add_argument("--output", required=True, type=Path, metavar="FILE", help="to write, .nii.gz or .nii")
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+
+
+def check_output_file(options: argparse.Namespace, inputs: Sequence[str | Path] = ()) -> None:
+    """Refuse an output that cannot be written, or must not be, before any work.
+
+    Args:
+        options: with `run`, `output` and `force`.
+        inputs: files that are read.
+
+    Raises:
+        InputError: another ending, no folder for it, a file that exists (without --force), or one that is read.
+    """
+    path: Path = options.output
+    if not path.name.endswith(IMAGE_ENDINGS):
+        raise InputError(f"{path}: expected a name that ends in .nii.gz or .nii; choose another --output")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; make it or choose another --output")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; choose another --output")
+    own = path.exists() and path.parent.resolve() == options.run.resolve()
+    if own and (options.run / "run.json").exists() and _is_of_a_run(path.name):
+        raise InputError(f"{path}: is a file of the run; choose another --output")
+    if any(Path(one).resolve() == path.resolve() for one in inputs):
+        raise InputError(f"{path}: is an input; choose another --output")
+    if path.exists() and not options.force:
+        raise InputError(f"{path}: exists already; pass --force to replace it, or choose another --output")
+
+
+def _is_of_a_run(name: str) -> bool:
+    from g3r.output.files import OUTPUT_NAMES
+
+    return name in OUTPUT_NAMES
+
+
+def told(prog: str, work: Callable[[], str]) -> int:
+    """Do the work and print what it says, or why it failed; returns the exit code.
+
+    Args:
+        prog: the command's name.
+        work: returns the line to print.
+    """
+    logging.basicConfig(level=logging.WARNING, format=f"{prog}: %(message)s", stream=sys.stderr)
+    try:
+        print(work())
+    except KeyboardInterrupt:
+        return _failed(prog, "interrupted; nothing was written", 130)
+    except EXPECTED as error:
+        return _failed(prog, *line_and_code(error))
+    return 0
+
+
+def _failed(prog: str, line: str, exit_code: int) -> int:
+    print(f"{prog}: {line}", file=sys.stderr)
+    return exit_code
