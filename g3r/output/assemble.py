@@ -20,6 +20,7 @@ from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
+from g3r.fitting.volume_check import VolumeCheck, check_volume
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
@@ -106,6 +107,10 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         volume, left_to_prior, seen = mixture.volume(fit.cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
         if not np.isfinite(volume).all():
             raise NumericalError("the volume holds values that are not finite; lower the step sizes")
+        check = _check(volume, mixture, found, fit) if settings.use_prior else None
+        if check is not None and check.falls_back:
+            mixture = replace(mixture, least_weight=1.0)
+            volume, left_to_prior = mixture.volume(fit.cloud, grid), mixture.left_to_prior(grid)
         unseen = mask & ~seen
         unseen_part = UnseenPart.of(
             unseen,
@@ -114,9 +119,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             shown=_shown_unseen(found.prior, settings),
             extent_known=_extent_known(found),
         )
-    line = unseen_part.line()
-    if line:
-        run.warnings.append(line)
+    run.warnings += [line for line in (check.line() if check else "", unseen_part.line()) if line]
     if run.stopped_at:
         run.notes.append(PARTIAL_NOTE)
     else:
@@ -178,7 +181,10 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         prior_share=prior_share,
         stacks=tuple(found.stacks),
         record=replace(
-            _record(found, fit, qualities, plan, run, uncertainty_record), unseen=unseen_part, prior_weight=least
+            _record(found, fit, qualities, plan, run, uncertainty_record),
+            unseen=unseen_part,
+            prior_weight=mixture.least_weight,
+            volume_check=check,
         ),
     )
 
@@ -222,6 +228,21 @@ def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSetti
         run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
         return 1.0
     return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
+
+
+def _check(volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit) -> VolumeCheck:
+    """The volume beside those before the fit."""
+    before, grid, none = found.prior.volumes, mixture.grid, _no_fit(found).cloud
+    return check_volume(
+        volume,
+        mixture.volume(none, grid),
+        replace(mixture, prior=before.coarse).volume(none, grid),
+        support=mixture.support,
+        grid=grid,
+        slices=fit.slices,
+        slices_before=before.slices,
+        weight=fit.weight,
+    )
 
 
 def _record(

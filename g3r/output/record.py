@@ -19,6 +19,7 @@ from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.pose_rounds import PoseRounds
+from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.stack_record import StackRecord, mean_motion
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
@@ -153,6 +154,7 @@ class RunRecord:
         pose_rounds: what rounds of poses and volume did; None where there was none.
         held_out: what held-out slices chose; None where they were not asked.
         prior_weight: least weight of V_prior in the volume.
+        volume_check: how well volume, V_prior and V_coarse explain the slices; None without V_prior.
         gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
@@ -179,6 +181,7 @@ class RunRecord:
     pose_rounds: PoseRounds | None = None
     held_out: HeldOutChoice | None = None
     prior_weight: float = 0.0
+    volume_check: VolumeCheck | None = None
     gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)

@@ -1,0 +1,110 @@
+"""Whether a finished volume explains the slices at least as well as the volumes that it was made from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import VolumeGrid
+
+INSIDE = 0.99
+"""Share of a pixel in the brain from which on it counts."""
+MAX_PIXELS = 400_000
+"""Pixels that are asked at most; more do not change the third digit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeCheck:
+    """How well volumes explain the slices of a subject.
+
+    Attributes:
+        volume, prior, coarse: root mean square error of the masked pixels that the finished volume, V_prior and
+            V_coarse predict, as a share of their own root mean square.
+    """
+
+    volume: float
+    prior: float
+    coarse: float
+
+    @property
+    def falls_back(self) -> bool:
+        """Whether V_prior is to be written in place of the finished volume."""
+        return self.prior < self.volume
+
+    def line(self) -> str:
+        """What a user reads where the fit made things worse; empty where it did not."""
+        if self.falls_back:
+            return (
+                f"the fit made the volume worse: it explains the slices with a residual of {self.volume:.3f}, the "
+                f"prior volume with {self.prior:.3f}, which is written in its place; look at the registration"
+            )
+        if self.coarse < self.volume:
+            return (
+                f"the mean of the slices explains them better (residual {self.coarse:.3f}) than the volume does "
+                f"({self.volume:.3f}); look at the registration"
+            )
+        return ""
+
+
+def check_volume(
+    volume: NDArray[np.float32],
+    prior: NDArray[np.float32],
+    coarse: NDArray[np.float32],
+    *,
+    support: NDArray[np.bool_],
+    grid: VolumeGrid,
+    slices: Slices,
+    slices_before: Slices,
+    weight: NDArray[np.float64],
+) -> VolumeCheck:
+    """Compare the finished volume with those that it started from, by the slices that all of them have seen.
+
+    Slices that were held out of the fit alone would not be fair to it: V_prior and V_coarse have seen them.
+
+    Args:
+        volume: the finished one [I, J, K].
+        prior: V_prior as it would be written [I, J, K].
+        coarse: V_coarse [I, J, K].
+        support: [I, J, K] of the brain; pixels that reach out of it do not count, since what lies there is not shown.
+        grid: of all these.
+        slices: K slices in their last poses.
+        slices_before: in the poses that V_prior and V_coarse were made with.
+        weight: [K] slice weights.
+    """
+    return VolumeCheck(
+        volume=_residual(volume, support, grid, slices, weight),
+        prior=_residual(prior, support, grid, slices_before, weight),
+        coarse=_residual(coarse, support, grid, slices_before, weight),
+    )
+
+
+def _residual(
+    volume: NDArray[np.float32],
+    support: NDArray[np.bool_],
+    grid: VolumeGrid,
+    slices: Slices,
+    weight: NDArray[np.float64],
+) -> float:
+    """Weighted error after one gain a slice, relative to the intensities; 0 where no pixel counts. See `check_volume`.
+
+    Args:
+        volume: [I, J, K].
+        support: [I, J, K].
+        grid: of both.
+        slices: K slices.
+        weight: [K].
+    """
+    index = slices.pixel_index[:: 1 + len(slices.pixel_index) // MAX_PIXELS]
+    operator = VoxelOperator(slices.planes, grid, index)
+    number, measured = operator.plane, slices.value[index].astype(np.float64)
+    counts = weight[number] * (operator.forward(support.astype(np.float32)) > INSIDE)
+    predicted = operator.forward(volume).astype(np.float64)
+    across, own = (np.bincount(number, counts * predicted * one, len(slices)) for one in (measured, predicted))
+    gain = np.divide(across, own, where=own > 0, out=np.zeros_like(own))
+    error, all_of_it = counts @ (gain[number] * predicted - measured) ** 2, counts @ measured**2
+    return round(math.sqrt(error / all_of_it), 4) if all_of_it > 0 else 0.0
