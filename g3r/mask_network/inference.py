@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_fill_holes, gaussian_filter, label
+from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
+from g3r.mask_network.mask_shape import as_people_draw, cleaned, without_tongues
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,8 +41,6 @@ AROUND_MM = 20.0
 """In the plane on each side of what was found."""
 BESIDE_MM = 14.0
 """Further slices on each side of what was found."""
-JOIN_MM = 6.0
-"""Parts of a mask no further from each other belong together: a head moves between slices."""
 FLIPS: tuple[tuple[int, ...], ...] = ((), (2, 3))
 """Axes of a tensor along which the images are mirrored for further estimates."""
 
@@ -51,9 +50,9 @@ class BrainMask:
     """The fetal brain in a stack.
 
     Args:
-        mask: [I, J, K]; empty where no head was found.
+        mask: [I, J, K] with the rim of `as_people_draw`; empty where no head was found.
         probability: [I, J, K] float32 of brain; zero outside the crop.
-        presence: 0 to 1, mean probability in the mask; 0 without.
+        presence: 0 to 1, mean probability in the mask without its rim; 0 without.
         centre_mm: [3] of the mask along the stack's axes, from the middle of its first voxel; NaN without.
         volume_ml: of the mask.
         reason: why there is none; empty where a head was found.
@@ -96,7 +95,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     best, _ = tried[int(np.argmax(scores))]
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
-    mask = cleaned(probability > 0.5, spacing)
+    mask = without_tongues(cleaned(probability > 0.5, spacing), spacing)
     volume_ml = float(mask.sum() * spacing.prod() / 1000)
     presence = float(probability[mask].mean()) if mask.any() else 0.0
     if volume_ml < MIN_VOLUME_ML or presence < MIN_PRESENCE:
@@ -105,12 +104,13 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
             f"no head found: what looks most like a brain has {volume_ml:.0f} ml and a probability of {presence:.2f}; "
             f"expected at least {MIN_VOLUME_ML:g} ml and {MIN_PRESENCE:g}",
         )
+    drawn = as_people_draw(mask, spacing)
     return BrainMask(
-        mask=mask,
+        mask=drawn,
         probability=probability,
         presence=presence,
         centre_mm=np.argwhere(mask).mean(0) * spacing,
-        volume_ml=volume_ml,
+        volume_ml=float(drawn.sum() * spacing.prod() / 1000),
     )
 
 
@@ -132,40 +132,6 @@ def likely_places(probability: Image, spacing_mm: Array) -> list[NDArray[np.int6
         off = ((position - (place * spacing_mm)[:, None, None, None]) ** 2).sum(0)
         left[off < APART_MM**2] = 0
     return places
-
-
-def cleaned(mask: NDArray[np.bool_], spacing_mm: Array) -> NDArray[np.bool_]:
-    """The largest part of a mask with its holes filled; parts that nearly touch, also in the next slice, are one.
-
-    Args:
-        mask: [I, J, K].
-        spacing_mm: [3].
-    """
-    index = np.argwhere(mask)
-    if not len(index):
-        return mask
-    reach = np.maximum(np.round(JOIN_MM / 2 / spacing_mm[:2]).astype(int), 1)
-    low, high = index.min(0), index.max(0) + 1
-    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    result = np.zeros_like(mask)
-    result[part] = _joined(mask[part], reach)
-    return result
-
-
-def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The largest part of a mask that is not empty, see `cleaned`.
-
-    Args:
-        mask: [I, J, K].
-        reach: pixels by which parts are widened along both axes of the plane.
-    """
-    element = np.ones((2 * reach[0] + 1, 2 * reach[1] + 1, 1), dtype=bool)
-    near = np.stack([np.any(mask[:, :, max(k - 1, 0) : k + 1], 2) for k in range(mask.shape[2])], 2)
-    parts, n = label(binary_dilation(near, element))
-    size = np.bincount(parts[mask], minlength=n + 1)
-    size[0] = 0
-    kept = mask & (parts == int(size.argmax()))
-    return np.stack([binary_fill_holes(kept[:, :, k]) for k in range(kept.shape[2])], axis=2)
 
 
 def _refusal(image: Image, spacing: Array) -> str:
