@@ -32,6 +32,12 @@ LATE_S = 60.0
 SIGNAL_BEFORE_S = 90
 """Slurm's signal comes this long before the limit of time: enough to end a step and write what there is."""
 
+SIGNALLED = 128
+"""Exit codes above it say that a signal ended a process."""
+
+TOLD = ("TIMEOUT", "OUT_OF_MEMORY", "CANCELLED")
+"""States in which Slurm ends a process, and that say more than its exit code."""
+
 MORE_MEMORY = "pass more: --slurm ...,mem=SIZE"
 
 
@@ -149,9 +155,15 @@ class SlurmArrays:
         if self.cluster == "slurm" and not job.paths.result_pickle.exists():
             return None if waits and job.state in ("COMPLETED", "FAILED", GONE) else self._lost(job, job.state)
         error = job.exception()
-        if error is None:
-            return job.result()
-        return self._lost(job, "TIMEOUT" if "timed-out" in str(error) else "FAILED")
+        if error is not None:
+            return self._lost(job, "TIMEOUT" if "timed-out" in str(error) else "FAILED")
+        how: Ended = job.result()
+        if self.cluster == "slurm" and (how.code is None or how.code > SIGNALLED):
+            state = job.watcher.get_state(job.job_id, mode="force")
+            if state == "RUNNING" and waits:  # Slurm has not yet said why it ended the process
+                return None
+            return self._lost(job, state) if state in TOLD else how
+        return how
 
     def _lost(self, job: Any, state: str) -> Ended:
         """A job without a result, by what Slurm says of it.

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from g3r._version import __version__
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
-from g3r.errors import InputError
 from g3r.cli.infer_options import parsed_options
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.bids.dataset import Session

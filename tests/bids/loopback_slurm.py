@@ -38,6 +38,7 @@ SchedulerParameters=sched_interval=1,batch_sched_delay=0
 SelectType=select/cons_tres
 SelectTypeParameters=CR_Core_Memory
 ReturnToService=2
+SlurmdParameters=config_overrides
 KillWait=5
 NodeName=localhost NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory_mb} State=UNKNOWN
 PartitionName=quick Nodes=localhost Default=YES MaxTime=60 State=UP
@@ -73,7 +74,11 @@ def loopback_slurm(folder: Path, cores: int = 2, memory_mb: int = 4000) -> Itera
         patch.setenv("SLURM_CONF", str(conf))
         munge = ["munged", "--foreground", "--force", f"--socket={folder}/munge.socket", f"--key-file={key}"]
         munge += [f"--{kind}-file={folder}/munge.{kind}" for kind in ("pid", "log", "seed")]
-        lines = [munge, ["slurmctld", "-D", "-c", "-f", str(conf)], ["slurmd", "-D", "-N", "localhost", "-f", str(conf)]]
+        lines = [
+            munge,
+            ["slurmctld", "-D", "-c", "-f", str(conf)],
+            ["slurmd", "-D", "-N", "localhost", "-f", str(conf)],
+        ]
         try:
             for line in lines:
                 daemons.append(subprocess.Popen(line, stdout=log, stderr=log))
