@@ -32,6 +32,9 @@ LATE_S = 60.0
 SIGNAL_BEFORE_S = 90
 """Slurm's signal comes this long before the limit of time: enough to end a step and write what there is."""
 
+BESIDE_BYTES = 200_000_000
+"""Of the process of submitit's that waits beside that of a session."""
+
 SIGNALLED = 128
 """Exit codes above it say that a signal ended a process."""
 
@@ -118,7 +121,8 @@ class SlurmArrays:
 
     def _parameters(self, n_tasks: int) -> dict[str, Any]:
         """What submitit and sbatch are told of an array."""
-        resources = {"cpus-per-task": str(self.n_cores), "mem": f"{math.ceil(self.needed_bytes / 2**20)}M"}
+        mebibytes = math.ceil((self.needed_bytes + BESIDE_BYTES) / 2**20)
+        resources = {"cpus-per-task": str(self.n_cores), "mem": f"{mebibytes}M"}
         return {
             "name": "g3r-bids",
             "timeout_min": self.request.minutes,

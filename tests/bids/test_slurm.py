@@ -69,7 +69,7 @@ def test_what_sbatch_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         time=parameters["timeout_min"],
         **{name.removeprefix("slurm_"): value for name, value in parameters.items() if name.startswith("slurm_")},
     )
-    for word in ("cpus-per-task=4", "mem=2048M", "time=120", "array=0-299%20", "partition=quick", "qos=low"):
+    for word in ("cpus-per-task=4", "mem=2239M", "time=120", "array=0-299%20", "partition=quick", "qos=low"):
         assert f"#SBATCH --{word}\n" in said
     assert "--cpus-per-task=4" in said.split("srun")[-1]
 
