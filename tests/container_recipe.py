@@ -30,7 +30,7 @@ def directives(path: Path = DOCKERFILE) -> list[Directive]:
 def environment(path: Path = DOCKERFILE) -> dict[str, str]:
     """What ENV sets, in the last stage."""
     words = [word for one in directives(path) if one.word == "ENV" for word in one.text.split()]
-    return dict(word.split("=", 1) for word in words)  # type: ignore[misc]
+    return dict(word.split("=", 1) for word in words)
 
 
 def argument(name: str, path: Path = DOCKERFILE) -> str:

@@ -47,8 +47,9 @@ class Ended:
 class Executor(Protocol):
     """Runs processes, some of them at once."""
 
-    begun: str
-    """What is said of a job that it has taken: started, submitted."""
+    @property
+    def begun(self) -> str:
+        """What is said of a job that it has taken: started, submitted."""
 
     def run_all(self, jobs: Sequence[Job], begin: Callable[[int], None], ended: Callable[[int, Ended], None]) -> None:
         """Run jobs in order until all have ended.

@@ -11,8 +11,7 @@ import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
 
-from submitit.core.core import InfoWatcher
-from submitit.slurm.slurm import SlurmJob
+from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
 GONE = "GONE"
 """State of a job that squeue does not know any more."""
@@ -25,7 +24,7 @@ LONGEST_WAIT_S = 30
 """Between two calls of squeue; the first ones follow each other more closely."""
 
 
-class QueueWatcher(InfoWatcher):
+class QueueWatcher(SlurmInfoWatcher):
     """States of all jobs by one call."""
 
     def _make_command(self) -> list[str] | None:
@@ -38,12 +37,12 @@ class QueueWatcher(InfoWatcher):
         return {job_id: {"State": states.get(job_id, GONE)} for job_id in self._registered - self._finished}
 
     def get_state(self, job_id: str, mode: str = "standard") -> str:
-        """The state of a job, see `InfoWatcher`."""
+        """The state of a job, see `SlurmInfoWatcher`."""
         state = self.get_info(job_id, mode=mode).get("State", "UNKNOWN")
         return "RUNNING" if state in ACTIVE else state
 
 
-class QueueJob(SlurmJob):  # type: ignore[misc, type-arg]
+class QueueJob(SlurmJob):
     """A job, or one task of an array."""
 
     watcher = QueueWatcher(delay_s=LONGEST_WAIT_S)
@@ -73,4 +72,4 @@ def active_among(array_ids: Iterable[str]) -> list[str]:
 
 def _states(text: str) -> dict[str, str]:
     """States by job in what squeue printed."""
-    return dict(line.strip().split("|", 1) for line in text.splitlines() if "|" in line)  # type: ignore[misc]
+    return dict(line.strip().split("|", 1) for line in text.splitlines() if "|" in line)

@@ -63,7 +63,7 @@ def test_a_process_that_is_killed_has_a_reason(tmp_path: Path) -> None:
 
 def test_an_interrupt_ends_every_process(tmp_path: Path) -> None:
     jobs = [sleeper(tmp_path, 60) for _ in range(3)]
-    processes = []
+    processes: list[psutil.Process | None] = []
 
     def begin(number: int) -> None:
         if number == 2:
@@ -81,7 +81,7 @@ def test_an_interrupt_ends_every_process(tmp_path: Path) -> None:
 def test_a_process_that_does_not_listen_is_killed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(executor, "GRACE_S", 0.3)
     deaf = sleeper(tmp_path, 60, "signal.signal(signal.SIGTERM, signal.SIG_IGN)")
-    processes = []
+    processes: list[psutil.Process | None] = []
 
     def begin(number: int) -> None:
         if number == 1:
