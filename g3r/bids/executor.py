@@ -49,7 +49,7 @@ class Executor(Protocol):
 
     @property
     def begun(self) -> str:
-        """What is said of a job that it has taken: started, submitted."""
+        """What is said of a job that it takes."""
 
     def run_all(self, jobs: Sequence[Job], begin: Callable[[int], None], ended: Callable[[int, Ended], None]) -> None:
         """Run jobs in order until all have ended.

@@ -63,7 +63,7 @@ class SlurmArrays:
     n_cores: int
     needed_bytes: int
     cluster: str = "slurm"
-    begun: str = "submitted"
+    begun: str = "goes to Slurm"
 
     def run_all(self, jobs: Sequence[Job], begin: Callable[[int], None], ended: Callable[[int, Ended], None]) -> None:
         """Run jobs array by array, see `Executor`."""
