@@ -1,4 +1,4 @@
-"""The example for Snakemake, run with a stand-in for g3r-infer; skipped where Snakemake is not installed."""
+"""The example for Snakemake, run with a stand-in for g3r-infer; skipped where it is not installed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from pathlib import Path
 
 import pytest
 
+from g3r.bids.pool import NEEDED_BYTES
+from g3r.bids.slurm_request import CORES, MINUTES
 from tests.bids.cohorts import rows, volumes
 from tests.bids.data_sets import BROKEN, add_session, ready_result, stand_in
 from tests.rooms import REPOSITORY
 
 SNAKEMAKE = shutil.which("snakemake", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
 
-pytestmark = pytest.mark.skipif(
+SNAKEFILE = REPOSITORY / "examples" / "Snakefile"
+
+needs_snakemake = pytest.mark.skipif(
     SNAKEMAKE is None, reason="snakemake is not on the PATH (it asks for older packages than g3r is tested with)"
 )
 
@@ -44,12 +48,20 @@ def g3r(tmp_path: Path) -> Path:
 
 
 def snakemake(tmp_path: Path, raw: Path, g3r: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    line = [str(SNAKEMAKE), "--snakefile", str(REPOSITORY / "examples" / "Snakefile"), "--directory", str(tmp_path)]
+    line = [str(SNAKEMAKE), "--snakefile", str(SNAKEFILE), "--directory", str(tmp_path)]
     line += [*words, "--cores", "2", "--config", f"bids={raw}", f"out={tmp_path / 'out'}", f"g3r={g3r}"]
     said = dict(os.environ, XDG_CACHE_HOME=str(tmp_path / "cache"))
     return subprocess.run(line, env=said, capture_output=True, text=True, check=False)
 
 
+def test_it_states_what_g3r_bids_reckons_with() -> None:
+    text = SNAKEFILE.read_text(encoding="utf-8")
+    assert f"mem_mb={NEEDED_BYTES // 1_000_000}," in text
+    assert f"runtime={MINUTES}," in text
+    assert f"threads: {CORES}" in text
+
+
+@needs_snakemake
 def test_a_job_for_each_participant_and_one_at_the_end(tmp_path: Path, raw: Path, g3r: Path) -> None:
     done = snakemake(tmp_path, raw, g3r, "--dry-run")
     assert done.returncode == 0, done.stderr
@@ -60,6 +72,7 @@ def test_a_job_for_each_participant_and_one_at_the_end(tmp_path: Path, raw: Path
     assert not (tmp_path / "out").exists()
 
 
+@needs_snakemake
 def test_what_failed_is_in_the_table_and_is_tried_again(tmp_path: Path, raw: Path, g3r: Path) -> None:
     assert snakemake(tmp_path, raw, g3r, "--keep-going").returncode == 1
     out = tmp_path / "out"
