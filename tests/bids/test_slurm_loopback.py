@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from g3r.bids import slurm
 from g3r.cli.bids import main
 from tests.bids.cohorts import rows, volumes
 from tests.bids.data_sets import BROKEN, ENDLESS, HUNGRY, add_session, ready_result, stand_in
@@ -33,8 +33,8 @@ def running_slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slurm, "POLL_S", 0.2)
-    monkeypatch.setattr(slurm, "SIGNAL_BEFORE_S", 0)
+    monkeypatch.setattr("g3r.bids.slurm.POLL_S", 0.2)
+    monkeypatch.setattr("g3r.bids.slurm.SIGNAL_BEFORE_S", 0)
 
 
 def data_set(folder: Path, contents: dict[str, bytes]) -> Path:
@@ -103,13 +103,30 @@ def test_tasks_that_slurm_ends(
 
 def test_slurms_signal_comes_before_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The process is asked to stop while there is time, and its log is whole."""
-    monkeypatch.setattr(slurm, "SIGNAL_BEFORE_S", 90)
+    monkeypatch.setattr("g3r.bids.slurm.SIGNAL_BEFORE_S", 90)
     raw = data_set(tmp_path / "raw", {"01": ENDLESS})
     use(tmp_path, monkeypatch)
     began_s = time.monotonic()
     assert main([str(raw), str(tmp_path / "out"), "participant", *SLURM]) == 1
     assert time.monotonic() - began_s < 55
     assert "took longer than 1 min" in rows(tmp_path / "out")["sub-01"]["reason"]
+
+
+def test_a_task_that_somebody_cancels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw, out = data_set(tmp_path / "raw", {"01": ENDLESS, "02": ENDLESS}), tmp_path / "out"
+    use(tmp_path, monkeypatch)
+
+    def cancel_all() -> None:
+        until_s = time.monotonic() + 60
+        while len(list((tmp_path / "events").iterdir())) < 2 and time.monotonic() < until_s:
+            time.sleep(0.1)
+        subprocess.run(["scancel", "--user=root"], check=True)
+
+    somebody = threading.Thread(target=cancel_all)
+    somebody.start()
+    assert main([str(raw), str(out), "participant", *SLURM]) == 1
+    somebody.join()
+    assert all("was cancelled in Slurm" in row["reason"] for row in rows(out).values())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
