@@ -31,14 +31,11 @@ def test_on_its_own_grid_it_is_the_volume(finished: Path, run: FinishedRun) -> N
     assert largest_difference(finished) < 1e-6
 
 
-@pytest.mark.parametrize(
-    "options", [("--no-prior", "--space", "scanner", "--resolution", "1.5"), ("--unseen", "blank")]
-)
-def test_so_it_is_without_a_prior_and_with_blank_unseen_parts(
-    subject: Path, tmp_path: Path, options: tuple[str, ...]
-) -> None:
-    reconstruct(subject, tmp_path / "run", *options)
+def test_so_it_is_without_a_prior_and_with_blank_unseen_parts(subject: Path, tmp_path: Path) -> None:
+    reconstruct(subject, tmp_path / "run", "--no-prior", "--space", "scanner", "--unseen", "blank")
     assert largest_difference(tmp_path / "run") < 1e-6
+    with pytest.raises(InputError, match="standard orientation is not known"):
+        target_grid(FinishedRun.load(tmp_path / "run"), space="standard")
 
 
 def test_a_finer_grid_holds_the_same_head(finished: Path, run: FinishedRun, tmp_path: Path) -> None:
