@@ -111,9 +111,9 @@ class ViewerImages:
         brain = (data["mask"] > 0) | (data["unseen"] > 0 if "unseen" in data else False)
         if not brain.any():
             brain = np.ones(brain.shape, bool)
-        for name in ("prior", "density"):  # they fill their whole grid
-            if name in data:
-                data[name] = data[name] * (brain | (data["volume"] != 0))
+        for layer in LAYERS:  # some images fill their whole grid
+            if layer.name in data and layer.kind != "mark":
+                data[layer.name] = data[layer.name] * (brain | (layer.kind == "grey") & (data["volume"] != 0))
         center = volume.grid.world(np.argwhere(brain).mean(0))
         box = bounding_box(brain, MARGIN_VOXELS)
         grid = volume.grid.cropped(box)

@@ -26,9 +26,10 @@ G3R.colormap = function (name, viewer) {
 G3R.webglViewer = async function (host, layers, told) {
   var viewer = new niivue.Niivue({
     logLevel: "error", loadingText: "", dragAndDropEnabled: false, isRadiologicalConvention: true, sagittalNoseLeft: true,
-    backColor: [0.02, 0.027, 0.04, 1], crosshairColor: [0.24, 0.78, 0.47, 0.8], crosshairWidth: 1,
+    backColor: [0.02, 0.027, 0.04, 1], crosshairColor: [0.24, 0.78, 0.47, 0.8], crosshairWidth: 0.4,
+    crosshairWidthUnit: "percent", isCornerOrientationText: true,
     fontColor: [0.91, 0.69, 0.29, 1], multiplanarShowRender: 0, isColorbar: false, show3Dcrosshair: false, sliceType: 3,
-    multiplanarPadPixels: 6, fontMinPx: 11,
+    multiplanarPadPixels: 6, fontMinPx: 17,
   });
   await viewer.attachToCanvas(host.querySelector("canvas"));
   var number = {}, shown = null, share = 0.7;
