@@ -69,7 +69,6 @@ def stack_rows(record: RunRecord) -> list[StackRow]:
 def _row(stack: StackRecord) -> StackRow:
     quality = stack.quality
     found = quality.held_out_correlation if quality else None
-    n_segments = stack.n_segments or 1
     return StackRow(
         name=stack.name,
         thickness=f"{stack.thickness_mm:g} mm",
@@ -83,8 +82,14 @@ def _row(stack: StackRecord) -> StackRow:
         agreement="-" if found is None else f"{found:.2f}",
         place=None if found is None else _place(found),
         judgement=_judgement(stack, found),
-        segments="" if n_segments == 1 else "the head jumped once" if n_segments == 2 else f"the head jumped {n_segments - 1} times",
+        segments=_jumps((stack.n_segments or 1) - 1),
     )
+
+
+def _jumps(n: int) -> str:
+    if n == 0:
+        return ""
+    return "the head jumped once" if n == 1 else f"the head jumped {n} times"
 
 
 def _judgement(stack: StackRecord, found: float | None) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 Word = Literal["use", "check", "do not use"]
 
-USE, CHECK, DO_NOT_USE = "use", "check", "do not use"
+USE: Final = "use"
+CHECK: Final = "check"
+DO_NOT_USE: Final = "do not use"
 
 MILDEST_FIRST: tuple[Word, ...] = (USE, CHECK, DO_NOT_USE)
 
@@ -106,6 +108,13 @@ class Reason:
     word: Word
     text: str
     advice: str
+
+    @property
+    def sentence(self) -> str:
+        """The text as a sentence of its own; the name of a file that it begins with stays as it is."""
+        first = self.text.split()[0]
+        text = self.text if "." in first else self.text[0].upper() + self.text[1:]
+        return text if text.endswith(".") else f"{text}."
 
 
 @dataclass(frozen=True)

@@ -188,9 +188,7 @@ def _joined_grid(grid: VolumeGrid) -> VolumeGrid:
     return VolumeGrid((n_i // 2, n_j // 2, n_k // 2), affine)
 
 
-def _window(
-    layer: Layer, data: dict[str, NDArray[np.float32]], inside: NDArray[np.bool_]
-) -> tuple[float, float]:
+def _window(layer: Layer, data: dict[str, NDArray[np.float32]], inside: NDArray[np.bool_]) -> tuple[float, float]:
     """Values shown as black and as bright."""
     if layer.kind == "mark":
         return 0.0, 1.0

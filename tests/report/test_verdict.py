@@ -21,7 +21,8 @@ def test_nothing_wrong_is_use_with_what_speaks_for_it() -> None:
     verdict = verdict_of(record())
     assert verdict.word == USE
     assert verdict.line() == (
-        "use: 3 of 3 stacks agree with each other (0.84, 0.84, 0.84; good is 0.68 and above); slices saw the whole brain"
+        "use: 3 of 3 stacks agree with each other (0.84, 0.84, 0.84; good is 0.68 and above); "
+        "slices saw the whole brain"
     )
 
 
@@ -104,12 +105,10 @@ def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
     share = unseen(0.1)
     lines = [
         "b.nii: registration probably failed (correlation ...); do not rely on the volume",
-        "the loss of the fit rose: 1 times it went back to its best state and on with shorter steps; look at the volume",
+        "the loss of the fit rose: 1 times it went back to its best state; look at the volume",
         str(share.line()),
     ]
-    found = record(
-        stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines
-    )
+    found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
     assert len(verdict_of(found).reasons) == 3
 
 

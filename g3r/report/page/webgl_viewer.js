@@ -12,7 +12,7 @@ G3R.colormap = function (name, viewer) {
   var colors = G3R.bytes(G3R.data.colors), map = { R: [], G: [], B: [], A: [], I: [] };
   var mark = G3R.MARK_COLORS[name];
   if (mark) {
-    map = { R: [mark[0], mark[0]], G: [mark[1], mark[1]], B: [mark[2], mark[2]], A: [0, mark[3]], I: [0, 255] };
+    map = { R: [mark[0], mark[0]], G: [mark[1], mark[1]], B: [mark[2], mark[2]], A: [0, 255], I: [0, 255] };
   } else {
     for (var n = 0; n < 256; n += 5) { // what is exactly zero lies outside the head and stays clear
       map.R.push(colors[3 * n]); map.G.push(colors[3 * n + 1]); map.B.push(colors[3 * n + 2]);
@@ -60,7 +60,7 @@ G3R.webglViewer = async function (host, layers, told) {
   viewer.createOnLocationChange();
   return {
     show: function (layer) { shown = layer; redraw(); },
-    mark: function (name, on) { viewer.volumes[number[name]].opacity = on ? 1 : 0; redraw(); },
+    mark: function (name, on) { viewer.volumes[number[name]].opacity = on ? G3R.MARK_COLORS[name][3] / 255 : 0; redraw(); },
     window: function (low, high) { viewer.volumes[0].cal_min = low; viewer.volumes[0].cal_max = high; redraw(); },
     opacity: function (value) { share = value; redraw(); },
   };
