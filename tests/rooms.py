@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "gaussians": "geometry run acquisition",
     "prior": "geometry acquisition checkpoints",
     "pose_network": "geometry acquisition checkpoints",
-    "mask_network": "acquisition checkpoints",
+    "mask_network": "geometry acquisition checkpoints",
     "masking": "acquisition mask_network",
     "registration": "geometry run acquisition",
     "evaluation": "geometry acquisition registration",

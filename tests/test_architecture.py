@@ -124,7 +124,8 @@ def test_the_pipeline_needs_no_training_packages() -> None:
     assert modules_after("import g3r.reconstruct", "lightning", "torchio", "pytorch_lightning") == set()
 
 
-COMMANDS = [f"g3r.cli.{name}" for name in ("infer", "bids", "evaluate", "pretrain", "export", "bench")] + [
+REUSE = ("render", "apply", "export_poses")
+COMMANDS = [f"g3r.cli.{name}" for name in ("infer", "bids", "evaluate", "pretrain", "export", "bench", *REUSE)] + [
     "data_synth.cli"
 ]
 

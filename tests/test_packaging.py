@@ -64,7 +64,8 @@ def test_a_wheel_from_the_source_distribution_works_in_a_clean_environment(dist:
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     where = run(scripts / "python", "-c", "import g3r, data_synth; print(g3r.__file__)", cwd=tmp_path).strip()
     assert Path(where).is_relative_to(tmp_path)
-    for command in ("infer", "simulate", "evaluate", "pretrain", "export", "bench"):
+    commands = ("infer", "mask", "bids", "simulate", "evaluate", "pretrain", "export", "bench", "render", "apply")
+    for command in (*commands, "export-poses"):
         assert run(scripts / f"g3r-{command}", "--version", cwd=tmp_path).split() == [f"g3r-{command}", __version__]
     code = "import g3r, g3r.uncertainty.estimate as e; g3r.GaussianReconstructor(); e.calibration()"
     run(scripts / "python", "-c", code, cwd=tmp_path)

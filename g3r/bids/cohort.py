@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import json
-import os
-import shlex
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,8 +13,8 @@ from pathlib import Path
 from g3r.bids.dataset import Session, find_masks
 from g3r.bids.derivative import RECORD, make_derivative, record_path
 from g3r.bids.description import WORK, read_object
+from g3r.bids.executor import Ended, Executor, Job
 from g3r.bids.outcome import failure_path, log_path, write_failure
-from g3r.bids.pool import run_all
 from g3r.bids.sidecars import inherited, with_sidecar
 from g3r.errors import InputError
 
@@ -98,17 +93,17 @@ class Cohort:
     keep_work: bool = False
     command: tuple[str, ...] = field(default_factory=lambda: INFER)
     say: Callable[[str], None] = lambda line: None
-    _started_s: dict[str, float] = field(default_factory=dict, init=False)
 
-    def run(self, sessions: Sequence[Session], n_jobs: int) -> None:
+    def run(self, sessions: Sequence[Session], executor: Executor) -> None:
         """Reconstruct what is not done yet.
 
         Args:
             sessions: of the data set.
-            n_jobs: processes at once.
+            executor: of the processes.
 
         Raises:
             KeyboardInterrupt: a stop was requested; no process is left.
+            InputError: the executor cannot run them.
         """
         works = []
         for session in sessions:
@@ -125,8 +120,13 @@ class Cohort:
                 self._finish(work)
             else:
                 works.append(work)
-        starts = [functools.partial(self._start, work) for work in works]
-        run_all(starts, lambda number, code: self._ended(works[number], code), n_jobs)
+        jobs = [Job(words=work.words, log=log_path(work.session, self.out_dir)) for work in works]
+        if jobs:
+            executor.run_all(
+                jobs,
+                lambda number: self._begin(works[number], executor.begun),
+                lambda number, how: self._ended(works[number], how),
+            )
 
     def _work(self, session: Session) -> Work:
         """The command of a session.
@@ -150,33 +150,23 @@ class Cohort:
         keys = inherited(stack, self.bids_dir)
         return stack if keys is None else with_sidecar(stack, keys, folder)
 
-    def _start(self, work: Work) -> subprocess.Popen[bytes]:
-        """Start its process; what it says goes to its log."""
+    def _begin(self, work: Work, begun: str) -> None:
+        """Make way for its process."""
         session = work.session
-        self._started_s[session.stem] = time.monotonic()
         failure_path(session, self.out_dir).unlink(missing_ok=True)
-        path = log_path(session, self.out_dir)
-        for folder in (path.parent, work.folder):
+        for folder in (log_path(session, self.out_dir).parent, work.folder):
             folder.mkdir(parents=True, exist_ok=True)
         work.note.write_text(json.dumps(work.words), encoding="utf-8")
-        self.say(f"{session.stem}: started")
-        with path.open("wb") as log:
-            log.write(f"{shlex.join(work.words)}\n".encode(errors="surrogateescape"))
-            log.flush()
-            return subprocess.Popen(
-                work.words,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"PYTHONUNBUFFERED": "1"},
-                start_new_session=True,  # Ctrl-C comes from us, once: a second one would end it without a trace
-            )
+        self.say(f"{session.stem}: {begun}")
 
-    def _ended(self, work: Work, code: int) -> None:
-        if code == 0:
-            self._finish(work)
+    def _ended(self, work: Work, how: Ended) -> None:
+        log = log_path(work.session, self.out_dir)
+        if how.code is None:
+            self._failed(work.session, f"{how.lost}; see {log.name}", how.seconds)
+        elif how.code:
+            self._failed(work.session, _reason(log, how.code), how.seconds)
         else:
-            self._failed(work.session, _reason(log_path(work.session, self.out_dir), code))
+            self._finish(work)
 
     def _finish(self, work: Work) -> None:
         """Make the derivative of a session, and forget the work."""
@@ -193,21 +183,22 @@ class Cohort:
                 work.folder.parent.rmdir()  # only where empty
         self.say(f"{session.stem}: done")
 
-    def _failed(self, session: Session, reason: str) -> None:
-        """Say and keep why a session failed; the others go on."""
+    def _failed(self, session: Session, reason: str, seconds: float | None = None) -> None:
+        """Say and keep why a session failed; the others go on.
+
+        Args:
+            session: that failed.
+            reason: why.
+            seconds: that its process took; None where it had none, or nobody could tell.
+        """
         line = " ".join(reason.split())[:MAX_REASON]
-        now_s = time.monotonic()
         with suppress(OSError):  # the disk is full: then it is said, at least
-            write_failure(session, self.out_dir, line, now_s - self._started_s.get(session.stem, now_s))
+            write_failure(session, self.out_dir, line, seconds)
         self.say(f"{session.stem}: failed: {line}")
 
 
 def _reason(log: Path, code: int) -> str:
     """Why a process failed, in one line, from what it said last."""
-    if code < 0:
-        return (
-            f"g3r-infer was ended by signal {-code} (9: perhaps for lack of memory; try fewer --jobs); see {log.name}"
-        )
     try:
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError:

@@ -14,6 +14,7 @@ import nibabel as nib
 from g3r.bids.dataset import Session
 from g3r.bids.description import SOURCE, as_json, read_object
 from g3r.bids.names import NIFTI_ENDINGS
+from g3r.bids.thumbnail import thumbnail
 from g3r.bids.transform import itk_text
 from g3r.run.atomic_file import sync
 
@@ -47,7 +48,9 @@ IMAGES = {
 }
 """By the name in the folder of a result."""
 
-FIGURES = {"sections.png": "desc-sections_T2w.png", "masks.png": "desc-masks_T2w.png"}
+SECTIONS, THUMBNAIL = "desc-sections_T2w.png", "desc-thumbnail_T2w.png"
+
+FIGURES = {"sections.png": SECTIONS, "masks.png": "desc-masks_T2w.png"}
 
 WORDS = {
     "standard": "in standard orientation (RAS, mid-sagittal plane at x = 0), not in scanner space",
@@ -60,9 +63,15 @@ def record_path(session: Session, out_dir: Path) -> Path:
     return out_dir / session.folder / "anat" / f"{session.stem}_{REC}_run.json"
 
 
-def figure_path(session: Session, out_dir: Path) -> Path:
-    """The picture of the volume's sections."""
-    return out_dir / session.folder / "figures" / f"{session.stem}_{REC}_{FIGURES['sections.png']}"
+def figure_path(session: Session, out_dir: Path, end: str = SECTIONS) -> Path:
+    """A picture of a session.
+
+    Args:
+        session: of the data set.
+        out_dir: the derivative data set.
+        end: of its name; the picture of the volume's sections unless said otherwise.
+    """
+    return out_dir / session.folder / "figures" / f"{session.stem}_{REC}_{end}"
 
 
 def make_derivative(
@@ -105,6 +114,7 @@ def make_derivative(
     for name, end in FIGURES.items():
         if (result / name).is_file():
             shutil.copyfile(result / name, figures / f"{begin}_{end}")
+    (figures / f"{begin}_{THUMBNAIL}").write_bytes(thumbnail(result / "volume.nii.gz"))
     shutil.copyfile(result / RECORD, anat / f"{begin}_run.json")
     _keep_others(target / "anat", anat, begin)
     for path in (*anat.iterdir(), *figures.iterdir()):  # a full disk may be reported only now

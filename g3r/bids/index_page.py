@@ -5,27 +5,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
-from g3r.bids.derivative import figure_path
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome
+from g3r.bids.derivative import THUMBNAIL, figure_path
+from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome, log_path
 from g3r.run.atomic_file import write_text
 
 PAGE = "index.html"
 
 WORST_FIRST = (FAILED, DO_NOT_USE, CHECK, NOT_RUN, TRUSTED)
 
+TITLES = ("session", "verdict", "slices", "unseen", "why", "picture")
+
 HEAD = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy"
  content="default-src 'none'; img-src 'self' file:; style-src 'unsafe-inline'">
 <title>Fetal brain volumes by g3r</title>
 <style>
 body { font-family: sans-serif; margin: 2em; }
-td, th { padding: 0.3em 0.8em; text-align: left; vertical-align: top; border-bottom: 1px solid #ccc; }
-img { height: 6em; }
-.failed, .do-not-use { color: #b00020; }
+table { border-collapse: collapse; }
+td, th { padding: 0.4em 0.8em; text-align: left; vertical-align: top; border-bottom: 1px solid #ccc; }
+td.session, td.verdict, td.slices, td.unseen { white-space: nowrap; }
+td.why { max-width: 40em; overflow-wrap: anywhere; }
+img { width: 15em; height: 5.5em; object-fit: contain; background: #000; display: block; }
+.failed, .do-not-use { color: #b00020; font-weight: bold; }
+.check { color: #8a5a00; font-weight: bold; }
+@media (max-width: 700px) {
+  body { margin: 1em; }
+  table, tbody, tr, td { display: block; }
+  tr { border-bottom: 1px solid #ccc; padding: 0.7em 0; }
+  td { border: none; padding: 0.15em 0; }
+  td.session, td.verdict { display: inline-block; margin-right: 0.8em; }
+  td.slices::after { content: " slices"; }
+  td.unseen::after { content: " unseen"; }
+  td.slices, td.unseen { display: inline-block; margin-right: 0.8em; color: #555; }
+  tr:first-child, td:empty { display: none !important; }
+  img { width: 100%; height: auto; }
+}
 </style>
 </head>
 <body>
@@ -43,23 +63,41 @@ def write_index(outcomes: Sequence[Outcome], out_dir: Path) -> None:
     ordered = sorted(outcomes, key=lambda one: (WORST_FIRST.index(one.verdict), -(one.unseen_share or 0.0)))
     counts = [f"{n} {verdict}" for verdict in WORST_FIRST if (n := sum(one.verdict == verdict for one in outcomes))]
     rows = "\n".join(_row(one, out_dir) for one in ordered)
-    titles = "".join(f"<th>{title}</th>" for title in ("session", "verdict", "slices", "unseen", "why", "picture"))
+    titles = "".join(f"<th>{title}</th>" for title in TITLES)
     body = f"<p>{escape(', '.join(counts))}</p>\n<table>\n<tr>{titles}</tr>\n{rows}\n</table>\n</body>\n</html>\n"
     write_text(out_dir / PAGE, HEAD + body)
 
 
 def _row(one: Outcome, out_dir: Path) -> str:
-    picture = figure_path(one.session, out_dir)
-    image = ""
-    if picture.is_file():
-        link = escape(picture.relative_to(out_dir).as_posix(), quote=True)
-        image = f'<a href="{link}"><img loading="lazy" alt="sections" src="{link}"></a>'
     cells = [
         escape(one.session.stem),
         f'<span class="{one.verdict.replace(" ", "-")}">{escape(one.verdict)}</span>',
         "" if one.n_slices is None else f"{one.n_used} of {one.n_slices}",
         "" if one.unseen_share is None else f"{100 * one.unseen_share:.1f} %",
-        escape("; ".join(one.warnings) or one.reason or ""),
-        image,
+        _why(one, out_dir),
+        _picture(one, out_dir),
     ]
-    return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    return f"<tr>{''.join(f'<td class={title}>{cell}</td>' for title, cell in zip(TITLES, cells, strict=True))}</tr>"
+
+
+def _why(one: Outcome, out_dir: Path) -> str:
+    """Warnings or the reason; beside a reason a link to what the run said."""
+    words = escape("; ".join(one.warnings) or one.reason or "")
+    log = log_path(one.session, out_dir)
+    if one.verdict != FAILED or not log.is_file():
+        return words
+    return f'{words} (<a href="{_link(log, out_dir)}">log</a>)'
+
+
+def _picture(one: Outcome, out_dir: Path) -> str:
+    """The small picture, leading to the large one; empty where there is none."""
+    large, small = figure_path(one.session, out_dir), figure_path(one.session, out_dir, THUMBNAIL)
+    if not large.is_file():
+        return ""
+    shown = small if small.is_file() else large
+    image = f'<img loading="lazy" alt="sections" src="{_link(shown, out_dir)}">'
+    return f'<a href="{_link(large, out_dir)}">{image}</a>'
+
+
+def _link(path: Path, out_dir: Path) -> str:
+    return escape(quote(path.relative_to(out_dir).as_posix()), quote=True)

@@ -56,21 +56,21 @@ def _plain(session: Session) -> str:
     return f"g3r-{session.stem.replace('_', '-')}"
 
 
-def write_failure(session: Session, out_dir: Path, reason: str, seconds: float) -> None:
+def write_failure(session: Session, out_dir: Path, reason: str, seconds: float | None) -> None:
     """Keep why a run failed.
 
     Args:
         session: that failed.
         out_dir: the derivative data set.
         reason: one line.
-        seconds: that it took.
+        seconds: that it took; None where nobody could tell.
 
     Raises:
         OSError: it cannot be written.
     """
     path = failure_path(session, out_dir)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, as_json({"reason": reason, "seconds": round(seconds, 1)}))
+    write_text(path, as_json({"reason": reason, "seconds": None if seconds is None else round(seconds, 1)}))
 
 
 def outcome_of(session: Session, out_dir: Path) -> Outcome:

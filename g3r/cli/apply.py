@@ -51,11 +51,13 @@ def _apply(options: argparse.Namespace) -> str:
 
     run = FinishedRun.load(options.run)
     images = load_images(run, paths)
+    affine = run.geometry.grid.affine
     if options.labels:
-        volume, what = fuse_labels(run, images), "labels"
+        save_volume(options.output, fuse_labels(run, images), affine, space=run.space)
     else:
-        volume, what = reconstruct_images(run, images, with_gain=not options.no_gain), "volume"
-    save_volume(options.output, volume, run.geometry.grid.affine, space=run.space)
+        volume = reconstruct_images(run, images, with_gain=not options.no_gain)
+        save_volume(options.output, volume, affine, space=run.space)
+    what = "labels" if options.labels else "volume"
     return f"{options.output}: {what} of {len(run.geometry.slices)} slices, on the grid of {run.folder}/volume.nii.gz"
 
 

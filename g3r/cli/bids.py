@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r._version import __version__
-from g3r.cli.failures import EXPECTED, line_and_code
+from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.bids.dataset import Session
+    from g3r.bids.executor import Executor
+    from g3r.bids.slurm_request import SlurmRequest
 
 FAILED = 1
 """Exit code where a session failed; the others are done."""
@@ -47,7 +50,17 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--session-label", nargs="+", metavar="LABEL", help="without ses- (default: all)")
     parser.add_argument("--mask-derivative", metavar="NAME", help="take masks from derivatives/NAME alone")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes at once (default: half the cores, as far as memory is free)"
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="processes at once (default: half the cores, as far as memory is free; with --slurm no limit of ours)",
+    )
+    parser.add_argument(
+        "--slurm",
+        type=_slurm_request,
+        metavar="partition=NAME[,key=value...]",
+        help="run in job arrays of Slurm, a task for each session (needs the slurm extra); keys are options of sbatch, "
+        "such as time=60,mem=4G,cpus_per_task=4,account=NAME",
     )
     parser.add_argument("--force", action="store_true", help="do what is done again, and replace it")
     parser.add_argument("--keep-work", action="store_true", help="keep all files of g3r-infer in OUT_DIR/.g3r")
@@ -72,8 +85,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(options, infer, tuple(words[cut + 1 :]), _command(options, words))
     except KeyboardInterrupt:
         return _said("interrupted; what was done stays, and the same command goes on", stop_request.exit_code)
+    except ModuleNotFoundError as error:
+        return _said(missing_extra(error), InputError.exit_code)
     except EXPECTED as error:
         return _said(*line_and_code(error))
+
+
+def _slurm_request(text: str) -> SlurmRequest:
+    from g3r.bids.slurm_request import parsed_request
+
+    try:
+        return parsed_request(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
@@ -97,7 +121,6 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
     from g3r.bids.cohort import Cohort
     from g3r.bids.dataset import find_sessions
     from g3r.bids.description import check_data_set, write_data_set
-    from g3r.bids.pool import NEEDED_BYTES, default_jobs, threads_each
 
     sessions = find_sessions(options.bids_dir, options.participant_label, options.session_label)
     check_data_set(options.bids_dir, options.out_dir)
@@ -107,7 +130,7 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
     for session in sessions:
         if session.left_out:
             print(f"{session.stem}: not read: {', '.join(session.left_out)} (only acq- and run- are, beside ses-)")
-    n_jobs = options.jobs or default_jobs(infer.max_memory or NEEDED_BYTES)
+    executor, n_threads = _executor(options, infer)
     cohort = Cohort(
         bids_dir=options.bids_dir,
         out_dir=options.out_dir,
@@ -116,15 +139,39 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
         resumes=infer.time_budget is None,
         force=options.force,
         mask_derivative=options.mask_derivative,
-        n_threads=None if infer.threads else threads_each(n_jobs),
+        n_threads=None if infer.threads else n_threads,
         keep_work=options.keep_work,
         say=lambda line: print(line, flush=True),
     )
     try:
-        cohort.run(sessions, n_jobs)
+        cohort.run(sessions, executor)
     finally:
         exit_code = _table(options, sessions)
     return exit_code
+
+
+def _executor(options: argparse.Namespace, infer: argparse.Namespace) -> tuple[Executor, int]:
+    """What runs the processes, and the threads of each.
+
+    Raises:
+        ModuleNotFoundError: the slurm extra is not installed.
+    """
+    from g3r.bids.pool import NEEDED_BYTES, LocalPool, default_jobs, threads_each
+
+    needed_bytes = infer.max_memory or NEEDED_BYTES
+    if options.slurm is None:
+        n_jobs = options.jobs or default_jobs(needed_bytes)
+        return LocalPool(n_jobs), threads_each(n_jobs)
+    from g3r.bids.description import WORK
+    from g3r.bids.slurm import SlurmArrays
+    from g3r.bids.slurm_request import CORES
+
+    n_cores = options.slurm.n_cores or infer.threads or CORES
+    folder = options.out_dir / WORK / "slurm"
+    arrays = SlurmArrays(
+        folder=folder, request=options.slurm, n_jobs=options.jobs, n_cores=n_cores, needed_bytes=needed_bytes
+    )
+    return arrays, n_cores
 
 
 def _table(options: argparse.Namespace, sessions: list[Session]) -> int:

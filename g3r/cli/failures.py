@@ -16,6 +16,7 @@ EXTRAS = {
     "evaluate": ("skimage",),
     "train": ("lightning", "torchio", "jsonargparse", "tensorboard"),
     "dicom": ("pydicom", "dcm2niix"),
+    "slurm": ("submitit",),
 }
 """Packages, as they are imported, that only some commands need."""
 

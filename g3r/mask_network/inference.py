@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
-from g3r.mask_network.mask_shape import as_people_draw, cleaned, without_tongues
+from g3r.mask_network.mask_shape import as_people_draw, cleaned
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,6 +27,8 @@ MIN_VOLUME_ML = 10.0
 """What is smaller is no head; at 19 weeks a brain has 20 ml, and a stack may show half of it."""
 MIN_PRESENCE = 0.65
 """Mean probability of a mask that is taken for a brain."""
+LEAST_PROBABILITY = 0.4
+"""Of a pixel of the brain: a lost piece of brain is worse than a piece of what is beside it."""
 N_PLACES = 3
 """Places at which a brain is outlined; the one that looks most like it from near is taken."""
 PLACE_MM = 12.0
@@ -95,7 +97,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     best, _ = tried[int(np.argmax(scores))]
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
-    mask = without_tongues(cleaned(probability > 0.5, spacing), spacing)
+    mask = cleaned(probability > LEAST_PROBABILITY, spacing)
     volume_ml = float(mask.sum() * spacing.prod() / 1000)
     presence = float(probability[mask].mean()) if mask.any() else 0.0
     if volume_ml < MIN_VOLUME_ML or presence < MIN_PRESENCE:

@@ -21,7 +21,6 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.run.atomic_file import atomic_path
 
 PLANE_FIELDS = ("rotation", "center_mm", "spacing_mm", "shape", "psf_var_mm2")
-SLICE_FIELDS = ("stack_id", "slice_index", "thickness_mm")
 
 
 @dataclass(frozen=True)
@@ -95,6 +94,9 @@ class ReuseRecord:
             "stack_shape": np.array([one.grid.shape for one in self.stacks]).reshape(-1, 3),
             "stack_affine": np.array([one.grid.affine for one in self.stacks]).reshape(-1, 4, 4),
             "stack_slice_axis": np.array([one.slice_axis for one in self.stacks], dtype=np.int64),
+            "stack_id": slices.stack_id,
+            "slice_index": slices.slice_index,
+            "thickness_mm": slices.thickness_mm,
             "mask": np.packbits(slices.mask),
             "header_rotation": header.rotation,
             "header_center_mm": header.translation_mm,
@@ -102,7 +104,6 @@ class ReuseRecord:
             "weight": self.weight,
         }
         arrays |= {name: getattr(slices.planes, name) for name in PLANE_FIELDS}
-        arrays |= {name: getattr(slices, name) for name in SLICE_FIELDS}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
         with atomic_path(path) as temporary:
@@ -134,7 +135,9 @@ def _record(data: dict[str, NDArray[Any]]) -> ReuseRecord:
         value=np.zeros(planes.n_pixels, np.float32),
         mask=_bits(data["mask"], planes.n_pixels),
         header_pose=RigidPose(data["header_rotation"], data["header_center_mm"]),
-        **{name: data[name] for name in SLICE_FIELDS},
+        stack_id=data["stack_id"],
+        slice_index=data["slice_index"],
+        thickness_mm=data["thickness_mm"],
     )
     stacks = zip(data["stack_shape"], data["stack_affine"], data["stack_slice_axis"], strict=True)
     return ReuseRecord(

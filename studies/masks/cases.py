@@ -13,6 +13,7 @@ import numpy as np
 
 from g3r.acquisition.stacks import Stack
 from g3r.evaluation.case import SimulatedCase, load_case
+from g3r.mask_network.mask_shape import as_people_draw
 from g3r.reconstruct import GaussianReconstructor
 from studies.harness import Record, Row, Study, Task
 from studies.masks.overlap import OPTIONS, mask_model, settings
@@ -54,10 +55,12 @@ def measure(folder: Path, seed: int, options: argparse.Namespace) -> Row:
 
 
 def _dice(found: Stack | None, true: Stack) -> float:
+    """Overlap with the true mask as people would draw it."""
     if found is None:
         return 0.0
-    shared = np.count_nonzero(found.mask & true.mask)
-    return round(2 * shared / (np.count_nonzero(found.mask) + np.count_nonzero(true.mask)), 4)
+    drawn = as_people_draw(true.mask, true.spacing_mm)
+    shared = np.count_nonzero(found.mask & drawn)
+    return round(2 * shared / (np.count_nonzero(found.mask) + np.count_nonzero(drawn)), 4)
 
 
 def _masked(stack: Stack, source: str | None) -> Stack | None:

@@ -52,6 +52,7 @@ def measure(name: str, n: int, without: bool, options: argparse.Namespace) -> Ro
     from data_synth.mask_data import new_scene
     from data_synth.mask_samples import full_stack
     from data_synth.mask_scans import draw_scan
+    from g3r.mask_network.mask_shape import as_people_draw
 
     rng = np.random.default_rng([DEVELOPMENT_SEED if options.development else FIRST_SEED, n])
     while True:
@@ -63,7 +64,8 @@ def measure(name: str, n: int, without: bool, options: argparse.Namespace) -> Ro
             break
     if without:
         true[:] = False
-    return scored(image, true, (pixel, pixel, scan.spacing_mm), options.masks)
+    spacing_mm = np.array([pixel, pixel, scan.spacing_mm])
+    return scored(image, as_people_draw(true, spacing_mm), spacing_mm.tolist(), options.masks)
 
 
 @cache

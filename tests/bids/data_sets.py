@@ -17,6 +17,9 @@ MASK_ENDS = {"desc": "_desc-brain_mask.nii.gz", "mialsrtk": "_T2w_desc-brain_mas
 BROKEN = b"broken"
 """Content of a stack that the stand-in refuses."""
 
+ENDLESS, HUNGRY = b"endless", b"hungry"
+"""Content of stacks that the stand-in never ends with, and for which it takes 600 MB of memory."""
+
 
 def begin(participant: str, session: str | None) -> str:
     """How the files of a session begin."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import signal
 import subprocess
@@ -18,6 +17,7 @@ import pytest
 
 from g3r.bids import cohort
 from g3r.cli.bids import main
+from tests.bids.cohorts import rows, volumes
 from tests.bids.data_sets import BROKEN, add_session, ready_result, stand_in
 
 N = 6
@@ -49,15 +49,6 @@ def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
 
 def events(tmp_path: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted((tmp_path / "events").iterdir())]
-
-
-def rows(out: Path) -> dict[str, dict[str, str]]:
-    with (out / "participants_g3r.tsv").open() as file:
-        return {row["participant_id"]: row for row in csv.DictReader(file, delimiter="\t")}
-
-
-def volumes(out: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_mtime_ns for path in out.glob("sub-*/**/*_rec-g3r_T2w.nii.gz")}
 
 
 def test_one_bad_subject_stops_nobody_and_what_is_done_stays(

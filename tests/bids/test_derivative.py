@@ -71,7 +71,7 @@ def test_a_session_is_there_whole_or_not_at_all(written: Path) -> None:
         f"{begin}_rec-g3r_slices.tsv",
         f"{begin}_rec-g3r_{XFM}",
         *(f"{begin}_acq-haste_run-{n}_{XFM}" for n in (1, 2, 3)),
-        "ses-a/figures/sub-01_ses-a_rec-g3r_desc-sections_T2w.png",
+        *(f"ses-a/figures/sub-01_ses-a_rec-g3r_desc-{kind}_T2w.png" for kind in ("sections", "thumbnail")),
     }
     assert not (written / "sub-03").exists()
     assert not (written / "sub-04").exists()

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 
 from g3r.bids.dataset import Session
-from g3r.bids.derivative import figure_path
+from g3r.bids.derivative import SECTIONS, THUMBNAIL, figure_path
 from g3r.bids.index_page import write_index
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome
+from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome, log_path
 
 
 def test_the_worst_come_first_and_text_is_escaped(tmp_path: Path) -> None:
@@ -24,15 +24,19 @@ def test_the_worst_come_first_and_text_is_escaped(tmp_path: Path) -> None:
         )
         for n, verdict in enumerate(verdicts)
     ]
-    picture = figure_path(outcomes[0].session, tmp_path)
-    picture.parent.mkdir(parents=True)
-    picture.write_bytes(b"picture")
+    pictures = [
+        figure_path(outcomes[n].session, tmp_path, end) for n, end in ((0, SECTIONS), (0, THUMBNAIL), (1, SECTIONS))
+    ]
+    log = log_path(outcomes[2].session, tmp_path)
+    for path in (*pictures, log):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"picture or log")
     write_index(outcomes, tmp_path)
     page = (tmp_path / "index.html").read_text()
-    assert re.findall(r"<td>(sub-\d\d)_ses-1", page) == ["sub-02", "sub-04", "sub-01", "sub-03", "sub-00"]
+    assert re.findall(r"<td class=session>(sub-\d\d)_ses-1", page) == ["sub-02", "sub-04", "sub-01", "sub-03", "sub-00"]
     assert "<script" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
     assert "http" not in page.replace("http-equiv", "")
-    links = re.findall(r'src="([^"]+)"', page)
-    assert [tmp_path / link for link in links] == [picture]
+    assert {tmp_path / link for link in re.findall(r'src="([^"]+)"', page)} == set(pictures[1:])
+    assert {tmp_path / link for link in re.findall(r'href="([^"]+)"', page)} == {pictures[0], pictures[2], log}
     assert "1 failed, 1 do not use, 1 check, 1 not run, 1 trusted" in page

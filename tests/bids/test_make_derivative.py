@@ -64,7 +64,9 @@ def test_a_new_result_leaves_nothing_of_the_old_one(session: Session, result: Pa
     names = {path.name for path in make(session, result, tmp_path).iterdir()}
     assert "sub-01_rec-g3r_dseg.nii.gz" in names
     assert not {name for name in names if "run-2_desc" in name or "priorshare" in name}
-    assert [path.name for path in (anat.parent / "figures").iterdir()] == ["sub-01_rec-g3r_desc-sections_T2w.png"]
+    assert {path.name for path in (anat.parent / "figures").iterdir()} == {
+        f"sub-01_rec-g3r_desc-{kind}_T2w.png" for kind in ("sections", "thumbnail")
+    }
 
 
 def test_killed_between_two_renames(session: Session, result: Path, tmp_path: Path) -> None:

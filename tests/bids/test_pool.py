@@ -3,69 +3,95 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
 
-from g3r.bids import pool
+from g3r.bids import executor, pool
+from g3r.bids.executor import Ended, Job
+from g3r.bids.pool import LocalPool
 
 
-def sleeper(seconds: float) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", f"import time; time.sleep({seconds})"])
+def sleeper(folder: Path, seconds: float, before: str = "pass") -> Job:
+    """A job that notes its process in its log."""
+    code = f"import os, signal, time; {before}; print(os.getpid(), flush=True); time.sleep({seconds})"
+    return Job(words=(sys.executable, "-c", code), log=folder / f"{time.monotonic_ns()}.log")
+
+
+def process_of(job: Job) -> psutil.Process | None:
+    """The process of a job, as soon as it has said who it is; None where it has gone."""
+    until_s = time.monotonic() + 20
+    while time.monotonic() < until_s:
+        lines = job.log.read_text().splitlines()
+        if lines and lines[-1].isdigit():
+            return psutil.Process(int(lines[-1])) if psutil.pid_exists(int(lines[-1])) else None
+        time.sleep(0.02)
+    raise AssertionError(f"{job.log} says nothing")
 
 
 @pytest.mark.parametrize("n_jobs", [1, 3])
-def test_never_more_than_allowed_and_all_are_reported(n_jobs: int) -> None:
-    alive: list[subprocess.Popen[bytes]] = []
-    counts, codes = [], {}
+def test_never_more_than_allowed_and_all_are_reported(n_jobs: int, tmp_path: Path) -> None:
+    jobs = [sleeper(tmp_path, 0.2) for _ in range(5)]
+    running: set[int] = set()
+    counts, ends = [], {}
 
-    def start() -> subprocess.Popen[bytes]:
-        alive.append(sleeper(0.2))
-        counts.append(sum(one.poll() is None for one in alive))
-        return alive[-1]
+    def begin(number: int) -> None:
+        running.add(number)
+        counts.append(len(running))
 
-    pool.run_all([start] * 5, lambda number, code: codes.update({number: code}), n_jobs)
-    assert codes == dict.fromkeys(range(5), 0)
+    def ended(number: int, how: Ended) -> None:
+        running.remove(number)
+        ends[number] = how
+
+    LocalPool(n_jobs).run_all(jobs, begin, ended)
+    assert [ends[number].code for number in range(5)] == [0] * 5
+    assert all(0.2 <= (how.seconds or 0.0) < 20 for how in ends.values())
     assert max(counts) == n_jobs
 
 
-def test_an_interrupt_ends_every_process() -> None:
-    alive: list[subprocess.Popen[bytes]] = []
+def test_a_process_that_is_killed_has_a_reason(tmp_path: Path) -> None:
+    job = sleeper(tmp_path, 0.0, "os.kill(os.getpid(), signal.SIGKILL)")
+    ends: list[Ended] = []
+    LocalPool(1).run_all([job], lambda number: None, lambda number, how: ends.append(how))
+    assert ends[0].code is None
+    assert "ended by signal 9" in ends[0].lost
+    assert "fewer --jobs" in ends[0].lost
 
-    def start() -> subprocess.Popen[bytes]:
-        if len(alive) == 2:
+
+def test_an_interrupt_ends_every_process(tmp_path: Path) -> None:
+    jobs = [sleeper(tmp_path, 60) for _ in range(3)]
+    processes: list[psutil.Process | None] = []
+
+    def begin(number: int) -> None:
+        if number == 2:
+            processes.extend(process_of(job) for job in jobs[:2])
             raise KeyboardInterrupt
-        alive.append(sleeper(60))
-        return alive[-1]
 
-    began = time.monotonic()
+    began_s = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        pool.run_all([start] * 3, lambda number, code: None, 3)
-    assert all(one.returncode is not None for one in alive)
-    assert time.monotonic() - began < 20
+        LocalPool(3).run_all(jobs, begin, lambda number, how: None)
+    assert len(processes) == 2
+    assert not any(process and process.is_running() for process in processes)
+    assert time.monotonic() - began_s < 20
 
 
-def test_a_process_that_does_not_listen_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pool, "GRACE_S", 0.3)
-    code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(60)"
-    deaf = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert deaf.stdout
-    deaf.stdout.readline()
-    deaf.stdout.close()
+def test_a_process_that_does_not_listen_is_killed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(executor, "GRACE_S", 0.3)
+    deaf = sleeper(tmp_path, 60, "signal.signal(signal.SIGTERM, signal.SIG_IGN)")
+    processes: list[psutil.Process | None] = []
 
-    def start() -> subprocess.Popen[bytes]:
-        if deaf.poll() is None and started:
+    def begin(number: int) -> None:
+        if number == 1:
+            processes.append(process_of(deaf))
             raise KeyboardInterrupt
-        started.append(deaf)
-        return deaf
 
-    started: list[subprocess.Popen[bytes]] = []
     with pytest.raises(KeyboardInterrupt):
-        pool.run_all([start, start], lambda number, code: None, 2)
-    assert not psutil.pid_exists(deaf.pid) or deaf.returncode is not None
+        LocalPool(2).run_all([deaf, deaf], begin, lambda number, how: None)
+    assert processes[0]
+    assert not processes[0].is_running()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,81 @@
+"""What `--slurm partition=NAME[,key=value...]` asks for: the options of sbatch, those apart that g3r-bids decides."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+DECIDED = {
+    "array": "--jobs says how many run at once",
+    "chdir": "paths of the command hold from here",
+    "error": "it is kept where the result is looked for",
+    "nodes": "a session needs one",
+    "ntasks": "a session is one task",
+    "ntasks-per-node": "a session is one task",
+    "output": "it is kept where the result is looked for",
+    "signal": "g3r-bids listens to its own",
+    "wrap": "g3r-bids writes the script",
+}
+"""Options of sbatch that cannot be passed, and why."""
+
+MINUTES = 120
+"""Until a session is ended, unless `time` says otherwise; the longest preset takes 10 minutes on two cores."""
+
+CORES = 2
+"""Of each session, unless `cpus_per_task` or --threads says otherwise."""
+
+TIME = re.compile(r"(?:(?P<days>\d+)-)?(?:(?P<hours>\d+):)?(?P<minutes>\d+)(?::\d\d)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlurmRequest:
+    """Resources of one session, and what else sbatch is told.
+
+    Attributes:
+        minutes: until it is ended.
+        n_cores: of its task; None for what the options of g3r-infer say.
+        options: of sbatch, by name without dashes in front.
+    """
+
+    minutes: int = MINUTES
+    n_cores: int | None = None
+    options: Mapping[str, str]
+
+
+def parsed_request(text: str) -> SlurmRequest:
+    """The request in words `key=value,key=value`; a key may be written with `_` or `-`.
+
+    Raises:
+        ValueError: a word without a value, a key that is not for the user to decide, no time, no number of cores.
+    """
+    options: dict[str, str] = {}
+    for word in text.split(","):
+        key, equals, value = (part.strip() for part in word.partition("="))
+        key = key.lstrip("-").replace("_", "-")
+        if not (key and equals and value):
+            raise ValueError(f"{word!r} in {text!r}; expected partition=NAME[,key=value...]")
+        if key in DECIDED:
+            raise ValueError(f"{key}={value} cannot be passed ({DECIDED[key]}); leave it out")
+        options[key] = value
+    cores = options.pop("cpus-per-task", None)
+    if cores is not None and not (cores.isdigit() and int(cores)):
+        raise ValueError(f"cpus_per_task={cores}; expected a number of cores")
+    minutes = _minutes(options.pop("time")) if "time" in options else MINUTES
+    return SlurmRequest(minutes=minutes, n_cores=int(cores) if cores else None, options=options)
+
+
+def _minutes(text: str) -> int:
+    """Minutes in Slurm's ways of saying a time: 90, 90:00, 1:30:00, 1-12:30.
+
+    Raises:
+        ValueError: it is no time.
+    """
+    found = TIME.fullmatch(text)
+    parts = text.split("-")[-1].split(":")
+    if not found or not any(part.strip("0") for part in re.findall(r"\d+", text)):
+        raise ValueError(f"time={text}; expected minutes, or HOURS:MINUTES:SECONDS")
+    days, hours, minutes = (int(found[name] or 0) for name in ("days", "hours", "minutes"))
+    if not found["days"] and len(parts) == 2:  # MINUTES:SECONDS
+        hours, minutes = 0, int(parts[0])
+    return max(1, days * 1440 + hours * 60 + minutes)

@@ -1,0 +1,1 @@
+"""What a cohort costs: docs/cohort.md."""
