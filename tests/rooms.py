@@ -35,13 +35,13 @@ MAY_IMPORT = {
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians output",
+    "report": "geometry run acquisition registration output reuse",
     "bids": "run acquisition",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (
         "run acquisition dicom checkpoints prior pose_network mask_network masking training planning evaluation output "
-        "bids reuse "
-        "reconstruct"
+        "bids reuse report reconstruct"
     ),
 }
 """From the bottom up: a room imports rooms above it in this list, `errors` and `_version` apart."""

@@ -99,10 +99,21 @@ def _reconstructed(
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, progress=progress)
         result = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
         result = _with_command(result, options, task)
-        result.save(folder, replace=replaces, run=output)
+        result.save(folder, replace=replaces, run=output, also=lambda staged: _write_report(staged, result))
         if not result.record.partial:
             output.forget_stages()
     return result
+
+
+def _write_report(folder: Path, result: ReconstructionResult) -> None:
+    """Write the page; without it the volume is no worse, so its failure is told and no more."""
+    from g3r.report.page import write_report
+
+    try:
+        write_report(folder, result.slices)
+    except EXPECTED as error:
+        reason = str(error).replace(str(folder), "")
+        logging.getLogger("g3r").warning("report.html could not be written (%s); try g3r-report DIR", reason)
 
 
 def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
@@ -161,11 +172,14 @@ def _interrupted(result: ReconstructionResult, folder: Path, stop_request: StopR
 
 
 def _print_summary(result: ReconstructionResult, folder: Path) -> None:
-    from g3r.output.files import MASK_PICTURE
+    from g3r.output.files import MASK_PICTURE, REPORT_NAME
+    from g3r.report.verdict import verdict_of
 
     seconds = sum(result.record.seconds.values())
     print(f"volume:  {folder / 'volume.nii.gz'}")
     print(f"picture: {folder / 'sections.png'}")
+    if (folder / REPORT_NAME).is_file():
+        print(f"report:  {folder / REPORT_NAME}")
     found = sorted({stack.mask_from for stack in result.record.stacks} - {"file"})
     if found:
         print(f"masks:   {' and '.join(found)}: look at {folder / MASK_PICTURE}")
@@ -175,6 +189,7 @@ def _print_summary(result: ReconstructionResult, folder: Path) -> None:
     if unseen:
         print(f"unseen:  {unseen}")
     print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
+    print(f"verdict: {verdict_of(result.record).line()}")
 
 
 def _warn_of_missed_budget(plan: Plan) -> None:

@@ -12,6 +12,9 @@ MASK_PICTURE = "masks.png"
 REUSE_NAME = "reuse.npz"
 """Numbers that other commands need of a finished run; see `ReuseRecord`."""
 
+REPORT_NAME = "report.html"
+"""The page to look at first; written by the command, see `g3r.report`."""
+
 MASK_NAMES = (MASK_PICTURE, *(f"brain-mask-{n}.nii.gz" for n in range(32)))
 """Of masks that were found, by the number of the stack in slices.tsv; not written for the user's own."""
 
@@ -29,6 +32,7 @@ OUTPUT_NAMES = (
     "slices.tsv",
     "run.json",
     "sections.png",
+    REPORT_NAME,
     *MASK_NAMES,
 )
 

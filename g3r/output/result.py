@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -87,13 +88,21 @@ class ReconstructionResult:
             f"{len(self.cloud)} Gaussians{', partial' if self.record.partial else ''})"
         )
 
-    def save(self, folder: str | os.PathLike[str], *, replace: bool = False, run: OutputFolder | None = None) -> None:
+    def save(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        replace: bool = False,
+        run: OutputFolder | None = None,
+        also: Callable[[Path], None] | None = None,
+    ) -> None:
         """Write every output into a folder; it appears whole or not at all.
 
         Args:
             folder: to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
             run: holds this folder already; one for this call alone when None.
+            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, in which the others are.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
@@ -102,13 +111,15 @@ class ReconstructionResult:
         if run is None:
             check_output_folder(folder, OUTPUT_NAMES, replace=replace)
             with OutputFolder(folder, OUTPUT_NAMES) as run:
-                self.save(folder, replace=replace, run=run)
+                self.save(folder, replace=replace, run=run, also=also)
             return
         check_output_folder(folder, OUTPUT_NAMES, replace=replace)
         try:
             run.make_room(self._max_bytes() + PICTURE_BYTES)
             with run.result() as staged:
                 self._write(staged)
+                if also is not None:
+                    also(staged)
         except OSError as error:
             raise cannot_be_written(folder, error, self._max_bytes()) from None
 

@@ -34,6 +34,7 @@ WHOLE = {
     "slices.tsv",
     "run.json",
     "sections.png",
+    "report.html",
 }
 """Files of a result without a prior network."""
 

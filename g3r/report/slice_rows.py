@@ -1,0 +1,106 @@
+"""slices.tsv read back: a record for each slice, and its motion against the mean of the head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.errors import InputError
+from g3r.geometry import RigidPose
+from g3r.geometry.rigid import orthonormal
+from g3r.output.files import SLICE_COLUMNS
+from g3r.output.record import RunRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class SliceRows:
+    """The K rows of slices.tsv.
+
+    Attributes:
+        stack, number: [K] of the stack, and of the slice in it.
+        motion: [K] takes a point by the file's header to where it was found to be.
+        weight, ncc: [K] weight in the volume and correlation with it.
+        reason: K words on why a slice counts less; "-" where it does not.
+    """
+
+    stack: NDArray[np.int64]
+    number: NDArray[np.int64]
+    motion: RigidPose
+    weight: NDArray[np.float64]
+    ncc: NDArray[np.float64]
+    reason: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.stack)
+
+    @classmethod
+    def read(cls, path: Path, n_stacks: int) -> SliceRows:
+        """Read the table that g3r-infer wrote.
+
+        Raises:
+            InputError: it is missing, no such table, or names a stack that run.json does not have.
+        """
+        try:
+            head, *lines = path.read_text(encoding="utf-8").splitlines()
+            rows = [dict(zip(head.split("\t"), line.split("\t"), strict=True)) for line in lines]
+            figure = {
+                name: np.array([float(row[name]) for row in rows], dtype=np.float64)
+                for name in SLICE_COLUMNS
+                if name != "reason"
+            }
+            reasons = tuple(row["reason"] for row in rows)
+            motion = RigidPose.from_rotvec(
+                np.column_stack([figure[name] for name in ("rx", "ry", "rz")]),
+                np.column_stack([figure[name] for name in ("tx", "ty", "tz")]),
+            )
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror}); pass the output folder of g3r-infer"
+            ) from None
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                f"{path}: is not a table that g3r-infer wrote ({error}); pass its output folder as it wrote it"
+            ) from None
+        stack = figure["stack"].astype(np.int64)
+        if stack.size and not 0 <= stack.min() <= stack.max() < n_stacks:
+            raise InputError(
+                f"{path}: names stack {stack.max()}, run.json has {n_stacks} stacks; pass a folder whose files belong "
+                "together"
+            )
+        return cls(
+            stack=stack,
+            number=figure["slice"].astype(np.int64),
+            motion=motion,
+            weight=figure["weight"],
+            ncc=figure["ncc"],
+            reason=reasons,
+        )
+
+    def acquisition_key(self, record: RunRecord) -> NDArray[np.int64]:
+        """Order [K] of the slices in time, stack after stack, by the interleaving that was found."""
+        step = np.array([stack.interleave or 1 for stack in record.stacks])[self.stack]
+        return np.lexsort((self.number // step, self.number % step, self.stack))
+
+    def head_motion(self, record: RunRecord, center_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """How the head lay in each slice, against its mean, along the axes of the scanner (RAS).
+
+        Args:
+            record: with the mean motion of all slices, where there is one.
+            center_mm: [3] of the head, in the volume's space.
+
+        Returns:
+            Shift of the head's centre [K, 3] (mm) and rotation vector [K, 3] (degrees).
+        """
+        mean = RigidPose.identity(1)
+        if record.registration and record.registration.standard_from_scanner is not None:
+            matrix = np.array(record.registration.standard_from_scanner, dtype=np.float64)
+            mean = RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])
+        # the slice lies still, the head moves: so the inverse of where the slice was put
+        head = self.motion.inverse() @ mean
+        center = mean.inverse().apply(center_mm[None])[0]
+        in_scanner = self.motion.inverse().apply(np.tile(center_mm, (len(self), 1)))
+        turned = RigidPose(head.rotation, np.zeros((len(self), 3)))
+        return in_scanner - center, np.rad2deg(turned.rotvec_rad())

@@ -1,0 +1,104 @@
+"""What the page says of each stack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from g3r.output.record import RunRecord
+from g3r.output.stack_record import StackRecord
+from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
+
+THICKNESS_FROM = {
+    "option": "given by the user",
+    "sidecar": "from the scanner's sidecar",
+    "spacing": "assumed: the distance of slices",
+}
+MASK_FROM = {
+    "file": "given by the user",
+    "empty background": "the part that is not zero",
+    "whole image": "none: the whole image",
+    "automatic": "found by the network",
+    "command": "found by the user's command",
+}
+SCALE_FROM = 0.3
+"""Agreement at the left end of the scale; the right end is 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackRow:
+    """One stack in words.
+
+    Attributes:
+        name: of the file.
+        thickness, thickness_from: of a slice, and who said so.
+        thickness_assumed: whether nobody did.
+        spacing: of pixels and slices.
+        mask, mask_from: its size, and who made it.
+        used, n_slices: slices of at least half the full weight, and all.
+        agreement: with the other stacks, as text.
+        place: of the agreement on the scale, 0 to 1; None where nothing was compared.
+        judgement: "good", "doubtful", "bad" or "not checked".
+        segments: how often the head jumped while it was acquired, in words.
+    """
+
+    name: str
+    thickness: str
+    thickness_from: str
+    thickness_assumed: bool
+    spacing: str
+    mask: str
+    mask_from: str
+    used: int
+    n_slices: int
+    agreement: str
+    place: float | None
+    judgement: str
+    segments: str
+
+
+def scale_ends() -> tuple[float, float]:
+    """Where on the scale, 0 to 1, "bad" ends and "good" begins."""
+    return _place(MIN_HELD_OUT), _place(RETRY_BELOW_CORRELATION)
+
+
+def stack_rows(record: RunRecord) -> list[StackRow]:
+    """A row for each stack of a run."""
+    return [_row(stack) for stack in record.stacks]
+
+
+def _row(stack: StackRecord) -> StackRow:
+    quality = stack.quality
+    found = quality.held_out_correlation if quality else None
+    return StackRow(
+        name=stack.name,
+        thickness=f"{stack.thickness_mm:g} mm",
+        thickness_from=THICKNESS_FROM[stack.thickness_from],
+        thickness_assumed=stack.thickness_from == "spacing",
+        spacing=" x ".join(f"{x:.3g}" for x in stack.spacing_mm) + " mm" if stack.spacing_mm else "",
+        mask=f"{stack.mask_ml:.0f} ml" if stack.mask_ml else "",
+        mask_from=MASK_FROM[stack.mask_from],
+        used=stack.n_slices - stack.n_downweighted_slices,
+        n_slices=stack.n_slices,
+        agreement="-" if found is None else f"{found:.2f}",
+        place=None if found is None else _place(found),
+        judgement=_judgement(stack, found),
+        segments=_jumps((stack.n_segments or 1) - 1),
+    )
+
+
+def _jumps(n: int) -> str:
+    if n == 0:
+        return ""
+    return "the head jumped once" if n == 1 else f"the head jumped {n} times"
+
+
+def _judgement(stack: StackRecord, found: float | None) -> str:
+    if stack.quality and stack.quality.reliable is False:
+        return "bad"
+    if found is None:
+        return "not checked"
+    return "good" if found >= RETRY_BELOW_CORRELATION else "doubtful"
+
+
+def _place(agreement: float) -> float:
+    return round(min(max((agreement - SCALE_FROM) / (1 - SCALE_FROM), 0.0), 1.0), 3)

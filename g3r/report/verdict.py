@@ -1,0 +1,207 @@
+"""The verdict on a volume, "use", "check" or "do not use", with its reasons: what terminal and report say.
+
+Every sentence is in `MESSAGES`. Thresholds are those of the code that judges: `registration.thresholds`,
+`uncertainty.unseen` and `fitting.volume_check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
+
+if TYPE_CHECKING:
+    from g3r.output.record import RunRecord
+    from g3r.output.stack_record import StackRecord
+
+Word = Literal["use", "check", "do not use"]
+
+USE: Final = "use"
+CHECK: Final = "check"
+DO_NOT_USE: Final = "do not use"
+
+MILDEST_FIRST: tuple[Word, ...] = (USE, CHECK, DO_NOT_USE)
+
+
+@dataclass(frozen=True)
+class Message:
+    """What may be said of a result.
+
+    Attributes:
+        word: the best verdict that is possible with it.
+        text: the fact; names in braces are filled in.
+        advice: what to do about it.
+    """
+
+    word: Word
+    text: str
+    advice: str
+
+
+MESSAGES = {
+    "stack failed": Message(
+        DO_NOT_USE,
+        "{stack} does not fit the other stacks (agreement {agreement}; good is {good:g} and above)",
+        "Leave that stack out and run again, or check that it shows the same head and that its mask is right.",
+    ),
+    "stack not used": Message(
+        DO_NOT_USE,
+        "{stack} was not used: no slice has enough pixels in its mask",
+        "Check its mask, or leave the stack out and run again.",
+    ),
+    "unseen too much": Message(
+        DO_NOT_USE, "{line}", "Acquire slices that cover the missing part, or add another stack."
+    ),
+    "stack doubtful": Message(
+        CHECK,
+        "{stack} agrees only just with the other stacks ({agreement}; good is {good:g} and above)",
+        "Look for doubled edges in the volume, and at the slices below.",
+    ),
+    "unseen": Message(CHECK, "{line}", "Nothing can be said of a lesion there; the part is outlined in the viewer."),
+    "volume check": Message(CHECK, "{line}", "Look at the slices below: measured and predicted should be alike."),
+    "rollbacks": Message(
+        CHECK, "the fit had to step back {n} times because its error rose", "Look at the whole volume for streaks."
+    ),
+    "single stack": Message(
+        CHECK,
+        "there is a single stack: nothing checks where its slices were put",
+        "Compare the volume with the stack; two more stacks in other planes make it far safer.",
+    ),
+    "masks found": Message(
+        CHECK,
+        "the brain {masks} of {stacks} found automatically",
+        "Look at masks.png: a mask that misses brain or takes in face leads registration astray.",
+    ),
+    "whole image": Message(
+        CHECK, "no mask was used for {stacks}: the whole image was taken for brain", "Check that only brain is shown."
+    ),
+    "thickness assumed": Message(
+        CHECK,
+        "the slice thickness of {stacks} was not stated; the distance of slices was taken ({mm} mm)",
+        "If there was a gap or an overlap, run again with --thickness: it decides how sharp the volume is.",
+    ),
+    "partial": Message(
+        CHECK,
+        "the run was {where}: this is the volume so far, without uncertainty",
+        "Finish it with --resume before using it.",
+    ),
+    "warning": Message(CHECK, "{line}", ""),
+    "all agree": Message(USE, "{n} of {n} stacks agree with each other ({agreement}; good is {good:g} and above)", ""),
+    "all seen": Message(USE, "slices saw the whole brain", ""),
+}
+"""By name: what terminal and report may say."""
+
+HEADLINES = {
+    USE: "No fault was found by the checks that g3r makes.",
+    CHECK: "Look at the points below before using this volume.",
+    DO_NOT_USE: "This volume must not be used.",
+}
+"""What the words mean."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One message of the table, filled in."""
+
+    word: Word
+    text: str
+    advice: str
+
+    @property
+    def sentence(self) -> str:
+        """The text as a sentence of its own; the name of a file that it begins with stays as it is."""
+        first = self.text.split()[0]
+        text = self.text if "." in first else self.text[0].upper() + self.text[1:]
+        return text if text.endswith(".") else f"{text}."
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The word and its reasons, the worst first; where the word is "use", what speaks for it."""
+
+    word: Word
+    reasons: tuple[Reason, ...]
+
+    @property
+    def headline(self) -> str:
+        """What the word means, as a sentence."""
+        return HEADLINES[self.word]
+
+    def line(self) -> str:
+        """The word and all reasons of its weight in one line, for the terminal."""
+        told = [reason.text for reason in self.reasons if reason.word == self.word]
+        return f"{self.word}: {'; '.join(told)}"
+
+
+def verdict_of(record: RunRecord) -> Verdict:
+    """Judge a result by its run.json."""
+    bad = sorted((_reason(*one) for one in _faults(record)), key=lambda one: -MILDEST_FIRST.index(one.word))
+    if bad:
+        return Verdict(bad[0].word, tuple(bad))
+    agreement = ", ".join(_agreement(stack) for stack in record.stacks)
+    good = [_reason("all agree", {"n": len(record.stacks), "agreement": agreement, "good": RETRY_BELOW_CORRELATION})]
+    return Verdict(USE, (*good, _reason("all seen", {})))
+
+
+def _reason(name: str, facts: dict[str, object]) -> Reason:
+    message = MESSAGES[name]
+    return Reason(message.word, message.text.format(**facts), message.advice)
+
+
+def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
+    """Names of messages, and what is filled in."""
+    for stack in record.stacks:
+        yield from _of_stack(stack)
+    unseen = record.unseen.line() if record.unseen else None
+    if record.unseen and unseen:
+        yield "unseen" if record.unseen.usable else "unseen too much", {"line": unseen}
+    checked = record.volume_check.line() if record.volume_check else ""
+    if checked:
+        yield "volume check", {"line": checked}
+    if record.n_rollbacks:
+        yield "rollbacks", {"n": record.n_rollbacks}
+    if len(record.stacks) == 1:
+        yield "single stack", {}
+    if found := [stack.name for stack in record.stacks if stack.mask_from in ("automatic", "command")]:
+        yield "masks found", {"masks": "mask" if len(found) == 1 else "masks", "stacks": _listed(found)}
+    if whole := [stack.name for stack in record.stacks if stack.mask_from in ("whole image", "empty background")]:
+        yield "whole image", {"stacks": _listed(whole)}
+    if assumed := [stack for stack in record.stacks if stack.thickness_from == "spacing"]:
+        mm = ", ".join(sorted({f"{stack.thickness_mm:g}" for stack in assumed}))
+        yield "thickness assumed", {"stacks": _listed([stack.name for stack in assumed]), "mm": mm}
+    if record.partial:
+        yield "partial", {"where": str(record.stopped_at or "interrupted")}
+    said = {unseen, checked}
+    for line in record.warnings:
+        if line not in said and not _is_said_otherwise(line, record):
+            yield "warning", {"line": line}
+
+
+def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
+    quality = stack.quality
+    if quality is None:
+        return
+    facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
+    if quality.reliable is False:
+        yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"good": MIN_HELD_OUT}
+    elif quality.held_out_correlation is not None and quality.held_out_correlation < RETRY_BELOW_CORRELATION:
+        yield "stack doubtful", facts | {"good": RETRY_BELOW_CORRELATION}
+
+
+def _agreement(stack: StackRecord) -> str:
+    found = stack.quality.held_out_correlation if stack.quality else None
+    return "none" if found is None else f"{found:.2f}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _is_said_otherwise(line: str, record: RunRecord) -> bool:
+    """Whether a warning of the run has a message of its own in the table."""
+    if line.startswith("the loss of the fit rose: "):
+        return record.n_rollbacks > 0
+    ends = ("registration probably failed", "no slice with enough masked pixels")
+    return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)

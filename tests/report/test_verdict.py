@@ -1,0 +1,123 @@
+"""The verdict: what leads to which word, in which order, and that the index of a cohort agrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from g3r.bids.outcome import TRUSTED, _verdict
+from g3r.fitting.volume_check import VolumeCheck
+from g3r.output.record import RunRecord
+from g3r.registration.quality import StackQuality
+from g3r.report.verdict import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE, verdict_of
+from g3r.run.context import StoppedAt
+from g3r.run.json_record import to_plain
+from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
+from tests.report.records import quality, record, stack, unseen
+
+
+def test_nothing_wrong_is_use_with_what_speaks_for_it() -> None:
+    verdict = verdict_of(record())
+    assert verdict.word == USE
+    assert verdict.line() == (
+        "use: 3 of 3 stacks agree with each other (0.84, 0.84, 0.84; good is 0.68 and above); "
+        "slices saw the whole brain"
+    )
+
+
+def stacks_with(one: Any) -> RunRecord:
+    return record(stack("a.nii"), stack("b.nii"), one)
+
+
+CASES: dict[str, tuple[RunRecord, str, str]] = {
+    "failed": (
+        stacks_with(stack("c.nii", quality(False, 0.31))),
+        DO_NOT_USE,
+        "c.nii does not fit the other stacks (agreement 0.31; good is 0.65 and above)",
+    ),
+    "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
+    "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
+    "single": (record(stack("a.nii", quality(None, None))), CHECK, "single stack"),
+    "unseen": (record(unseen=unseen(0.1)), CHECK, "10 % of the brain was not seen"),
+    "unseen too much": (
+        record(unseen=unseen(DO_NOT_USE_ABOVE + 0.01, usable=False)),
+        DO_NOT_USE,
+        "31 % of the brain was not seen",
+    ),
+    "cut": (record(unseen=unseen(usable=False, extent_known=False)), DO_NOT_USE, "the field of view cuts the head"),
+    "fallback": (
+        record(volume_check=VolumeCheck(volume=0.2, prior=0.1, coarse=0.3)),
+        CHECK,
+        "the fit made the volume worse",
+    ),
+    "rollbacks": (record(n_rollbacks=2), CHECK, "step back 2 times"),
+    "automatic": (stacks_with(stack("c.nii", mask_from="automatic")), CHECK, "mask of c.nii found automatically"),
+    "whole image": (stacks_with(stack("c.nii", mask_from="whole image")), CHECK, "no mask was used for c.nii"),
+    "thickness": (
+        record(*(stack(f"{n}.nii", thickness_from="spacing") for n in "abc")),
+        CHECK,
+        "the slice thickness of a.nii, b.nii and c.nii was not stated",
+    ),
+    "partial": (
+        record(partial=True, stopped_at=StoppedAt("fit to slices", 3, 40)),
+        CHECK,
+        "the run was interrupted in fit to slices, step 3 of 40",
+    ),
+    "left out": (record(warnings=["d.nii: left out, no head was found"]), CHECK, "d.nii: left out"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_fault_is_said_and_decides(name: str) -> None:
+    found, word, words = CASES[name]
+    verdict = verdict_of(found)
+    assert verdict.word == word
+    assert words in verdict.line()
+    assert verdict.headline == HEADLINES[verdict.word]
+    assert all(reason.advice for reason in verdict.reasons) or name == "left out"
+    assert "\n" not in verdict.line()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_index_of_a_cohort_refuses_the_same(name: str) -> None:
+    found, word, _ = CASES[name]
+    assert (_verdict(to_plain(found)) == DO_NOT_USE) == (word == DO_NOT_USE)
+
+
+def test_what_the_index_trusts_may_be_used() -> None:
+    assert _verdict(to_plain(record())) == TRUSTED
+    assert verdict_of(record()).word == USE
+
+
+def test_the_worst_comes_first_and_the_line_has_only_that() -> None:
+    verdict = verdict_of(
+        record(stack("a.nii", thickness_from="spacing"), stack("b.nii", quality(False, 0.2)), unseen=unseen(0.05))
+    )
+    order = [MILDEST_FIRST.index(reason.word) for reason in verdict.reasons]
+    assert order == sorted(order, reverse=True)
+    assert len(verdict.reasons) == 3
+    assert verdict.line().startswith("do not use: b.nii")
+    assert "thickness" not in verdict.line()
+
+
+def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
+    share = unseen(0.1)
+    lines = [
+        "b.nii: registration probably failed (correlation ...); do not rely on the volume",
+        "the loss of the fit rose: 1 times it went back to its best state; look at the volume",
+        str(share.line()),
+    ]
+    found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
+    assert len(verdict_of(found).reasons) == 3
+
+
+def test_slivers_are_not_mentioned() -> None:
+    assert verdict_of(record(unseen=unseen(MENTIONED_ABOVE / 2))).word == USE
+
+
+def test_the_table_says_things_in_the_same_form() -> None:
+    for name, message in MESSAGES.items():
+        assert message.word in MILDEST_FIRST, name
+        assert not message.text.endswith("."), name
+        assert message.advice == "" or message.advice.endswith("."), name
