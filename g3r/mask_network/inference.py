@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
-from g3r.mask_network.mask_shape import as_people_draw, cleaned
+from g3r.mask_network.mask_shape import as_people_draw, cleaned, without_outgrowths
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,9 +25,9 @@ Image = NDArray[np.float32]
 
 MIN_VOLUME_ML = 10.0
 """What is smaller is no head; at 19 weeks a brain has 20 ml, and a stack may show half of it."""
-MIN_PRESENCE = 0.65
+MIN_PRESENCE = 0.85
 """Mean probability of a mask that is taken for a brain."""
-LEAST_PROBABILITY = 0.4
+LEAST_PROBABILITY = 0.35
 """Of a pixel of the brain: a lost piece of brain is worse than a piece of what is beside it."""
 N_PLACES = 3
 """Places at which a brain is outlined; the one that looks most like it from near is taken."""
@@ -97,7 +97,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     best, _ = tried[int(np.argmax(scores))]
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
-    mask = cleaned(probability > LEAST_PROBABILITY, spacing)
+    mask = without_outgrowths(cleaned(probability > LEAST_PROBABILITY, spacing), probability, spacing)
     volume_ml = float(mask.sum() * spacing.prod() / 1000)
     presence = float(probability[mask].mean()) if mask.any() else 0.0
     if volume_ml < MIN_VOLUME_ML or presence < MIN_PRESENCE:

@@ -10,6 +10,10 @@ from g3r.geometry.grid import bounding_box
 
 JOIN_MM = 6.0
 """Parts of a mask no further from each other belong together: a head moves between slices."""
+LARGEST_RADIUS = 1.2
+"""In radii of the ellipsoid that has the moments of what was found: a brain is no further from its middle."""
+MIN_VOXELS = 50
+"""Fewer do not tell an ellipsoid."""
 RIM_MM = 3.5
 """How far outside the brain the outline is drawn, as people draw it, beyond the skull."""
 
@@ -46,6 +50,34 @@ def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.boo
     size[0] = 0
     kept = mask & (parts == int(size.argmax()))
     return np.stack([binary_fill_holes(kept[:, :, k]) for k in range(kept.shape[2])], axis=2)
+
+
+def without_outgrowths(
+    mask: NDArray[np.bool_], probability: NDArray[np.floating], spacing_mm: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """A mask without what sticks out of an ellipsoid: a brain is nearly one, face and neck lie beyond its end.
+
+    Args:
+        mask: [I, J, K].
+        probability: [I, J, K] of brain, the weights of the ellipsoid's moments.
+        spacing_mm: [3].
+    """
+    index = np.argwhere(mask)
+    position_mm, weight = index * spacing_mm, probability[mask]
+    kept = np.ones(len(index), dtype=bool)
+    for _ in range(4):  # each round without what the one before left out
+        if kept.sum() < MIN_VOXELS:
+            return mask
+        offset = position_mm - np.average(position_mm[kept], axis=0, weights=weight[kept])
+        covariance = np.cov(offset[kept].T, aweights=weight[kept], ddof=0)
+        if np.linalg.matrix_rank(covariance) < 3:  # of a single slice
+            return mask
+        # a solid ellipsoid's variance along an axis is a fifth of its radius squared
+        radius = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance), offset) / 5)
+        kept = radius < LARGEST_RADIUS
+    result = np.zeros_like(mask)
+    result[tuple(index[kept].T)] = True
+    return result
 
 
 def as_people_draw(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) -> NDArray[np.bool_]:

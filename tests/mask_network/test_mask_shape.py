@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.mask_network.mask_shape import RIM_MM, as_people_draw, cleaned
+from g3r.mask_network.mask_shape import RIM_MM, as_people_draw, cleaned, without_outgrowths
 
 SPACING_MM = np.array([0.8, 1.1, 3.0])
 
@@ -37,3 +37,27 @@ def test_the_rim_is_in_the_plane_and_as_wide_as_it_says(at_edge: bool) -> None:
 
 def test_nothing_stays_nothing() -> None:
     assert not as_people_draw(np.zeros((9, 9, 3), dtype=bool), SPACING_MM).any()
+
+
+def ellipsoid(shape: tuple[int, int, int], radius_mm: tuple[float, float, float]) -> np.ndarray:
+    x = (np.indices(shape) - np.reshape(np.array(shape) // 2, (3, 1, 1, 1))) * SPACING_MM[:, None, None, None]
+    return ((x / np.reshape(radius_mm, (3, 1, 1, 1))) ** 2).sum(0) < 1
+
+
+def test_an_ellipsoid_stays_whole_and_what_sticks_out_goes() -> None:
+    head = ellipsoid((120, 100, 40), (35.0, 45.0, 38.0))
+    probability = np.where(head, 0.9, 0.7)
+    np.testing.assert_array_equal(without_outgrowths(head, probability, SPACING_MM), head)
+    face = head.copy()
+    face[55:70, 45:60, 36:] = True  # from 10 mm below the head's end on
+    face &= ~head
+    left = without_outgrowths(head | face, probability, SPACING_MM)
+    assert (left & head).sum() == head.sum()
+    assert (left & face).sum() < 0.3 * face.sum()
+
+
+@pytest.mark.parametrize("slices", [slice(2, 3), slice(0, 0)])
+def test_one_slice_or_none_is_not_judged(slices: slice) -> None:
+    mask = np.zeros((30, 30, 5), dtype=bool)
+    mask[5:25, 8:20, slices] = True
+    np.testing.assert_array_equal(without_outgrowths(mask, np.ones(mask.shape), SPACING_MM), mask)
