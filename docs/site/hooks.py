@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "CHANGELOG.md": "CHANGELOG.md",
     "MODEL_CARD.md": "g3r/checkpoints/weights/MODEL_CARD.md",
-    "reconstruct.ipynb": "examples/reconstruct.ipynb",
+    "notebook.md": "examples/reconstruct.ipynb",
     "LICENSE.txt": "LICENSE",
 }
 """Files of the repository that pages point at: their names on the site, and where they are."""
@@ -33,8 +34,11 @@ def on_files(files: Files, config: Any) -> Files:
     """Take the files from outside into the site."""
     root = Path(config.config_file_path).parent
     for name, path in OUTSIDE.items():
-        if (root / path).is_file():
-            files.append(File.generated(config, name, abs_src_path=str(root / path)))
+        source = root / path
+        if source.suffix == ".ipynb":
+            files.append(File.generated(config, name, content=_notebook(source)))
+        else:
+            files.append(File.generated(config, name, abs_src_path=str(source)))
     return files
 
 
@@ -54,5 +58,16 @@ def on_page_content(content: str, page: Any, config: Any, files: Files) -> str:
     return EQUATION.sub(_mathml, content)
 
 
+def _notebook(path: Path) -> str:
+    """The cells of a notebook as a page."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
+    found = "\n\n".join(f"```python\n{text}\n```" if kind == "code" else text for kind, text in texts)
+    return f"{found}\n\n*Without its outputs; to see them, run `examples/{path.name}`.*"
+
+
 def _mathml(found: re.Match[str]) -> str:
-    return convert(html.unescape(found[3]).strip(), display="block" if found[2] == "[" else "inline")
+    text = html.unescape(found[3]).strip()
+    if found[2] == "(":
+        return convert(text)
+    return f'<div class="equation">{convert(text, display="block")}</div>'
