@@ -60,6 +60,16 @@ def test_equations_are_written_out(site: Path) -> None:
     assert r"\frac" not in re.sub(r"<annotation.*?</annotation>", "", text)
 
 
+def test_nothing_is_left_of_the_markup(site: Path) -> None:
+    """Lists and tables that begin without an empty line, and signs that were taken for tags."""
+    for page in site.glob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        text = re.sub(r"<(pre|code|math|script)\b.*?</\1>", "", text, flags=re.DOTALL)
+        for part in re.findall(r"<(?:p|li)>(.*?)</(?:p|li)>", text, flags=re.DOTALL):
+            assert not re.search(r"\n(?:- |\d+\. |\|)", part), f"{page.name}: {part}"
+        assert not re.search(r"<[a-z]+ [^<>]*,=", text), page.name
+
+
 def test_folded_tables_are_tables(site: Path) -> None:
     for page in site.glob("*.html"):
         for folded in re.findall(r"<details>.*?</details>", page.read_text(encoding="utf-8"), flags=re.DOTALL):
