@@ -44,6 +44,9 @@ def test_the_presets_in_the_readme_are_means_of_the_subjects() -> None:
             found.append(mean(float(one["CPU s"]) for one in two))
         assert row["CPU seconds, three and two"] == ", ".join(f"{one:.0f}" for one in found)
     assert len(three) == 8
+    sizes = [[float(one) for one in row["pixel x slice, mm"].split(" x ")] for row in three]
+    ranges = [f"{min(column):g} to {max(column):g} mm" for column in zip(*sizes, strict=True)]
+    assert f"pixels of {ranges[0]}, slices of {ranges[1]}" in " ".join(text_of("README.md").split())
     assert "eight simulated subjects" in text_of("README.md")
 
 
