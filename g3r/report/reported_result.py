@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -14,6 +16,9 @@ from g3r.errors import InputError
 from g3r.output.result import ReconstructionResult
 from g3r.report.pictures import grey
 from g3r.report.verdict import Verdict, verdict_of
+from g3r.run.output_folder import OutputFolder
+
+logger = logging.getLogger(__name__)
 
 BRIGHT_PERCENTILE = 99.5
 """Of the volume in the brain: what the pictures show as white."""
@@ -54,12 +59,43 @@ class Report:
 
 
 class ReportedResult(ReconstructionResult):
-    """A `ReconstructionResult` that can be judged; its attributes and `save` are those of that class."""
+    """A `ReconstructionResult` that can be judged; its attributes are those of that class."""
 
     @classmethod
     def of(cls, result: ReconstructionResult) -> ReportedResult:
         """The same result."""
         return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
+
+    def save(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        replace: bool = False,
+        run: OutputFolder | None = None,
+        also: Callable[[Path], None] | None = None,
+    ) -> None:
+        """Write every output and report.html into a folder; it appears whole or not at all.
+
+        Args:
+            folder: to write.
+            replace: whether an earlier result in it may be replaced; other files there are kept.
+            run: holds this folder already; one for this call alone when None.
+            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, report.html among them.
+
+        Raises:
+            InputError: the folder holds files already (without `replace`), or cannot be written.
+        """
+        super().save(folder, replace=replace, run=run, also=also or self._add_page)
+
+    def _add_page(self, folder: Path) -> None:
+        """Write the page; without it the volume is no worse, so its failure is told and no more."""
+        from g3r.report.page import write_report
+
+        try:
+            write_report(folder, self.slices)
+        except InputError as error:
+            reason = str(error).replace(str(folder), "")
+            logger.warning("report.html could not be written (%s); try g3r-report DIR", reason)
 
     def report(self, path: str | os.PathLike[str] | None = None, *, replace: bool = False) -> Report:
         """Whether the volume may be used, and why; in a notebook with pictures.
@@ -83,7 +119,7 @@ class ReportedResult(ReconstructionResult):
         # the page is made of the files, as everyone else has them
         with tempfile.TemporaryDirectory(prefix="g3r-report-") as folder:
             saved = Path(folder) / "result"
-            self.save(saved)
+            self.save(saved, also=lambda _: None)
             write_report(saved, self.slices, path)
 
     def _sections(self) -> tuple[tuple[str, str], ...]:

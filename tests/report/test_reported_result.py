@@ -65,6 +65,24 @@ def test_arrays_and_their_grid_are_the_file(result: ReportedResult, tmp_path: Pa
     np.testing.assert_allclose(result.grid.index(result.grid.world(first)), first, atol=1e-9)
 
 
+def test_saving_writes_the_page_too(result: ReportedResult, tmp_path: Path) -> None:
+    result.save(tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"<h1>{result.report().verdict.word.capitalize()}</h1>" in page
+
+
+def test_a_page_that_cannot_be_made_costs_no_volume(
+    result: ReportedResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(folder: Path, *others: object) -> None:
+        raise InputError(f"{folder}/run.json: damaged")
+
+    monkeypatch.setattr("g3r.report.page.write_report", fail)
+    result.save(tmp_path / "out")
+    assert (tmp_path / "out" / "volume.nii.gz").is_file()
+    assert "report.html could not be written" in caplog.text
+
+
 def test_a_volume_without_a_brain_has_no_pictures(result: ReportedResult) -> None:
     empty = replace(result, mask=np.zeros_like(result.mask))
     assert empty.report().sections == ()
