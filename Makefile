@@ -35,7 +35,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo test test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty clean
+.PHONY: help install demo docs docs-serve test test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty clean
 
 help: ## show this list
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -83,6 +83,12 @@ test-faults: install ## bad input by the hundred, fuzzed headers, kills, full di
 
 container-check: install ## the install steps of Dockerfile and Apptainer recipe, run in a clean environment (minutes)
 	$(BIN)/pytest -m "slow or not slow" tests/test_container.py
+
+docs: install ## the documentation site, in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs-serve: install ## the site while you write, on http://127.0.0.1:8000
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 lint: install ## ruff: style, imports, docstrings
 	$(BIN)/ruff check .

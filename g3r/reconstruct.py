@@ -23,7 +23,6 @@ from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
 from g3r.output.assemble import StageResults, assemble
-from g3r.output.result import ReconstructionResult
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, preset
 from g3r.planning.stages import Stage, stage_rng
@@ -32,6 +31,7 @@ from g3r.prior.model import Prior
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.quality import unknown_orientation_note
+from g3r.report.reported_result import ReportedResult
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
 
@@ -83,7 +83,7 @@ class GaussianReconstructor:
         *,
         plan: Plan | None = None,
         run: RunContext | None = None,
-    ) -> ReconstructionResult:
+    ) -> ReportedResult:
         """The volume, maps, poses and record of one subject.
 
         Args:
@@ -121,7 +121,7 @@ class GaussianReconstructor:
             prior_record=self.prior.record() if self.prior else None,
             pose_record=self.pose_model.record() if self.pose_model else None,
         )
-        return assemble(found, plan, run)
+        return ReportedResult.of(assemble(found, plan, run))
 
     def register_stacks(self, stacks: Sequence[Stack]) -> Registration:
         """Poses of all slices of some stacks, as `reconstruct` finds them and takes them.

@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "reuse": "geometry acquisition gaussians output",
     "report": "geometry run acquisition registration output reuse",
     "bids": "run acquisition",
-    "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output",
+    "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (
         "run acquisition dicom checkpoints prior pose_network mask_network masking training planning evaluation output "

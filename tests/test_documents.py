@@ -14,7 +14,7 @@ DOCUMENTS = [
     *sorted((REPOSITORY / "docs").glob("*.md")),
     *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
 ]
-FOLDERS = ("g3r", "data_synth", "studies", "tests", "lightning_configs", "docs")
+FOLDERS = ("g3r", "data_synth", "studies", "tests", "lightning_configs", "docs", "examples")
 MAX_CHARACTERS = 120
 PLACEHOLDERS = ("ROOM", "PAGE", "NAME", "MODULE", "DIR", "*")
 

@@ -97,7 +97,7 @@ def _reconstructed(
     with progress_bars(quiet=options.quiet) as progress, OutputFolder(folder, OUTPUT_NAMES) as output:
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, progress=progress)
-        result = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
+        result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
         result = _with_command(result, options, task)
         result.save(folder, replace=replaces, run=output, also=lambda staged: _write_report(staged, result))
         if not result.record.partial:

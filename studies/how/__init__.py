@@ -1,0 +1,1 @@
+"""Pictures of docs/how.md."""

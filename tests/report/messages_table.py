@@ -1,0 +1,47 @@
+"""The table in docs/report.md of all that a verdict may say: `python -m tests.report.messages_table` writes it."""
+
+from __future__ import annotations
+
+from g3r.bench.record import markdown_table, put_between_markers
+from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
+from g3r.report.verdict import CHECK, DO_NOT_USE, MESSAGES, USE
+from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
+from tests.rooms import REPOSITORY
+
+DOCUMENT = REPOSITORY / "docs" / "report.md"
+MARKER = "messages"
+
+FILLED_IN = {
+    "stack": "NAME",
+    "stacks": "NAME",
+    "agreement": "N",
+    "masks": "mask",
+    "mm": "N",
+    "n": "N",
+    "where": "interrupted",
+}
+
+LINES = {
+    "unseen too much": f"N % of the brain was not seen by any slice (N ml) ..., above {100 * DO_NOT_USE_ABOVE:.0f} %",
+    "unseen": f"N % of the brain was not seen by any slice (N ml): it is shown as an estimate from other brains; from "
+    f"{100 * MENTIONED_ABOVE:g} % on",
+    "volume check": "the fit made the volume worse ..., or: the mean of the slices explains them better ...",
+    "warning": "any other warning of the run, as `run.json` has it",
+}
+"""Of messages whose text comes from elsewhere."""
+
+
+def table() -> str:
+    """A row for each message, the worst first."""
+    rows = []
+    for word in (DO_NOT_USE, CHECK, USE):
+        for name, message in MESSAGES.items():
+            if message.word == word:
+                good = MIN_HELD_OUT if name == "stack failed" else RETRY_BELOW_CORRELATION
+                facts = FILLED_IN | {"good": good, "line": LINES.get(name, "")}
+                rows.append([word, message.text.format(**facts), message.advice])
+    return markdown_table(["verdict", "what it says", "what it advises"], rows).replace("---:", "---")
+
+
+if __name__ == "__main__":
+    put_between_markers(DOCUMENT, MARKER, table())
