@@ -92,8 +92,8 @@ def required_mask(volume: Volume) -> FoundMask:
     if found is None:
         zeros = 100 * float(np.mean(np.nan_to_num(volume.data) == 0))
         raise InputError(
-            f"{volume.name}: no mask says what is to be reconstructed, and the image shows more than that ({zeros:.0f} % "
-            f"of the voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
+            f"{volume.name}: no mask says what is to be reconstructed, and the image shows more than that "
+            f"({zeros:.0f} % of the voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
             f"{BRAIN_RANGE_ML[0]:g} to {BRAIN_RANGE_ML[1]:g} ml); {WAYS_ON}"
         )
     return found
