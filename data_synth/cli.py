@@ -1,4 +1,4 @@
-"""`g3r-simulate`: motion-corrupted stacks with known truth, from a volume or from the built-in phantom."""
+"""`g3r-simulate`: motion-corrupted stacks with known truth, from a volume or from a built-in phantom."""
 
 import argparse
 import sys
@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--volume", type=Path, help="NIfTI volume to slice")
     source.add_argument("--phantom", type=float, metavar="WEEKS", help="built-in brain of 18 to 41 weeks")
+    source.add_argument("--object", action="store_true", help="built-in object that is no brain, for --anatomy generic")
     parser.add_argument("--mask", type=Path, help="mask on the grid of --volume")
     parser.add_argument("--output", type=Path, required=True, help="folder to write")
     parser.add_argument("--stacks", type=int, default=3, help="axial, coronal, sagittal, axial, ...")
@@ -68,6 +69,7 @@ def _simulate(arguments: argparse.Namespace) -> str:
     from data_synth.atlas import AtlasSubject, cropped
     from data_synth.export import check_output, save_simulation
     from data_synth.heads import PhantomSubject, load_volume_of
+    from data_synth.objects import textured_ellipsoids
     from data_synth.simulator import orthogonal_settings, simulate_stacks
 
     check_output(arguments.output, replace=arguments.force)  # before any work
@@ -82,7 +84,9 @@ def _simulate(arguments: argparse.Namespace) -> str:
         bias=arguments.bias,
         gain_deviation=arguments.gain,
     )
-    if arguments.volume is None:
+    if arguments.object:
+        truth = textured_ellipsoids(PHANTOM_SPACING_MM, arguments.seed)
+    elif arguments.volume is None:
         truth = load_volume_of(PhantomSubject("phantom", arguments.phantom, arguments.seed), PHANTOM_SPACING_MM)
     else:
         truth = load_volume_of(AtlasSubject(arguments.volume.name, arguments.volume, arguments.mask), spacing_mm=None)

@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians output",
-    "report": "geometry run acquisition registration output reuse",
+    "report": "geometry run acquisition registration planning output reuse",
     "bids": "run acquisition",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",

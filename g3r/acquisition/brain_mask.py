@@ -25,7 +25,7 @@ BRAIN_RANGE_ML = (20.0, 900.0)
 
 WAYS_ON = (
     "pass --masks with a brain mask for each stack, or --mask-command with a tool that makes them, or --whole-image if "
-    "the image shows nothing but brain"
+    "the image shows nothing else"
 )
 
 
@@ -92,8 +92,8 @@ def required_mask(volume: Volume) -> FoundMask:
     if found is None:
         zeros = 100 * float(np.mean(np.nan_to_num(volume.data) == 0))
         raise InputError(
-            f"{volume.name}: no mask says what is brain, and the image shows more than that ({zeros:.0f} % of the "
-            f"voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
+            f"{volume.name}: no mask says what is to be reconstructed, and the image shows more than that "
+            f"({zeros:.0f} % of the voxels are zero; expected over {100 * MIN_ZERO_SHARE:.0f} % and a rest of "
             f"{BRAIN_RANGE_ML[0]:g} to {BRAIN_RANGE_ML[1]:g} ml); {WAYS_ON}"
         )
     return found

@@ -9,8 +9,16 @@ from g3r._version import __version__
 from g3r.cli.dicom_options import add_dicom_output_options, add_input_options, check_dicom_options
 from g3r.cli.mask_options import add_mask_options, check_mask_options
 from g3r.planning import PRESET_NAMES
+from g3r.planning.anatomy import ANATOMIES, FETAL_BRAIN, GENERIC
 
-DEFAULTS = {"preset": "balanced", "space": "standard", "unseen": "fill", "resolution": 0.8, "seed": 0}
+DEFAULTS = {
+    "anatomy": FETAL_BRAIN,
+    "preset": "balanced",
+    "space": "standard",
+    "unseen": "fill",
+    "resolution": 0.8,
+    "seed": 0,
+}
 """Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
 
 
@@ -50,6 +58,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--space",
         choices=("standard", "scanner"),
         help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
+    )
+    parser.add_argument(
+        "--anatomy",
+        choices=ANATOMIES,
+        help="fetal-brain (the default), or generic: anything else, with neither atlas, networks nor standard space",
     )
     parser.add_argument(
         "--unseen",
@@ -116,12 +129,25 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
         if decided:
             named = ", ".join(f"--{name.replace('_', '-')}" for name in decided)
             parser.error(f"--config and {named} exclude each other: the file decides that")
+    if options.anatomy == GENERIC:
+        _check_generic(parser, options)
     for name, value in DEFAULTS.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
     if options.ckpt and options.no_prior:
         parser.error("--ckpt and --no-prior exclude each other")
     return options
+
+
+def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the program with 2 where an option needs what only fetal brains have."""
+    named = {f"--{kind}": getattr(options, kind.replace("-", "_")) for kind in ("ckpt", "pose-ckpt", "mask-ckpt")}
+    given = [name for name, value in named.items() if value]
+    if options.space == "standard":
+        given.append("--space standard")
+    if given:
+        parser.error(f"--anatomy generic and {', '.join(given)} exclude each other: it uses no network and no atlas")
+    options.space = "scanner"
 
 
 def _size(text: str) -> int:

@@ -148,13 +148,13 @@ def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord 
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from g3r.planning.presets import PRESETS
+    from g3r.planning.presets import PRESETS, for_anatomy
 
     preset = PRESETS[options.preset]
     if options.time_budget is not None:
         preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
     registration = replace(preset.registration, standard_orientation=options.space == "standard", seed=options.seed)
-    return replace(
+    settings = replace(
         preset,
         registration=registration,
         resolution_mm=options.resolution,
@@ -162,6 +162,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         use_prior=not options.no_prior,
         fill_unseen=options.unseen == "fill",
     )
+    return for_anatomy(settings, options.anatomy)
 
 
 def _inputs(

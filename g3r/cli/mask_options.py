@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r.errors import InputError
+from g3r.planning.anatomy import FETAL_BRAIN
 
 if TYPE_CHECKING:
     from g3r.checkpoints.weights_file import WeightsFile
@@ -81,7 +82,8 @@ def given_masks(options: argparse.Namespace) -> list[str | None]:
 
 def needs_network(options: argparse.Namespace) -> bool:
     """Whether the mask network may be asked."""
-    return None in given_masks(options) and not options.whole_image and not options.mask_command
+    made_otherwise = options.whole_image or options.mask_command or options.anatomy != FETAL_BRAIN
+    return None in given_masks(options) and not made_otherwise
 
 
 def mask_weights_path(given: str | None, prior: str | None = None) -> Path:
@@ -122,6 +124,10 @@ def masked_stacks(options: argparse.Namespace, weights: WeightsFile | None) -> M
         from g3r.acquisition.brain_mask import whole_image
 
         return find_masks(options.stacks, None, lambda path, volume: whole_image(volume))
+    if options.anatomy != FETAL_BRAIN and not options.mask_command:
+        from g3r.acquisition.brain_mask import required_mask
+
+        return find_masks(options.stacks, given_masks(options), lambda path, volume: required_mask(volume))
     return find_masks(options.stacks, given_masks(options), masker_of(options, weights))
 
 

@@ -28,6 +28,7 @@ from g3r.output.mixture import Mixture
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
+from g3r.planning.anatomy import FETAL_BRAIN, NAME_OF, NOTE_ON_OTHERS
 from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
@@ -117,9 +118,11 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             mask,
             grid.voxel_volume_mm3,
             shown=_shown_unseen(found.prior, settings),
-            extent_known=_extent_known(found),
+            extent_known=_extent_known(found, settings),
+            what=NAME_OF[settings.anatomy],
         )
     run.warnings += [line for line in (check.line() if check else "", unseen_part.line()) if line]
+    run.notes += [NOTE_ON_OTHERS] if settings.anatomy != FETAL_BRAIN else []
     if run.stopped_at:
         run.notes.append(PARTIAL_NOTE)
     else:
@@ -206,8 +209,13 @@ def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
     return "estimate from other brains" if prior.has_template else "smooth continuation"
 
 
-def _extent_known(found: StageResults) -> bool:
-    """Whether the brain ends where slices or template say; not so for a single cut stack that no template fits."""
+def _extent_known(found: StageResults, settings: ReconstructionSettings) -> bool:
+    """Whether the brain ends where slices or template say; not so for a single cut stack that no template fits.
+
+    Of another object the part in the masks is meant, wherever it ends.
+    """
+    if settings.anatomy != FETAL_BRAIN:
+        return True
     profiles = found.registration.profiles
     return found.prior.has_template or len(profiles) != 1 or not profiles[0].is_cut
 

@@ -13,6 +13,7 @@ from g3r.fitting.pose_rounds import PoseRoundSettings, RoundFit
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
+from g3r.planning.anatomy import FETAL_BRAIN, Anatomy
 from g3r.prior.inference import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings
 
@@ -42,6 +43,7 @@ class ReconstructionSettings:
         distillation: False uses the prior for the start alone.
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
+        anatomy: what the stacks show; see `for_anatomy`.
         seed: of every random choice.
     """
 
@@ -65,6 +67,7 @@ class ReconstructionSettings:
     distillation: bool = True
     common_bias_field: bool = True
     fill_unseen: bool = True
+    anatomy: Anatomy = FETAL_BRAIN
     seed: int = 0
 
     @property
@@ -141,6 +144,22 @@ def preset(name: str) -> ReconstructionSettings:
     if name not in PRESETS:
         raise InputError(f"preset {name!r}; expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+def for_anatomy(settings: ReconstructionSettings, anatomy: Anatomy) -> ReconstructionSettings:
+    """The settings without what knows fetal brains alone, where the stacks show something else.
+
+    Without template, pose network and standard orientation the search starts from the stacks' headers, and V_sharp
+    stands for the prior volume.
+
+    Args:
+        settings: of a preset.
+        anatomy: what the stacks show.
+    """
+    if anatomy == FETAL_BRAIN:
+        return replace(settings, anatomy=anatomy)
+    search = replace(settings.registration, template=False, network=False, standard_orientation=False)
+    return replace(settings, anatomy=anatomy, use_prior=False, registration=search)
 
 
 def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSettings:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
+from g3r.planning.anatomy import NAME_OF
 from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ MESSAGES = {
     ),
     "warning": Message(CHECK, "{line}", ""),
     "all agree": Message(USE, "{n} of {n} stacks agree with each other ({agreement}; good is {good:g} and above)", ""),
-    "all seen": Message(USE, "slices saw the whole brain", ""),
+    "all seen": Message(USE, "slices saw the whole {what}", ""),
 }
 """By name: what terminal and report may say."""
 
@@ -142,7 +143,7 @@ def verdict_of(record: RunRecord) -> Verdict:
         return Verdict(bad[0].word, tuple(bad))
     agreement = ", ".join(_agreement(stack) for stack in record.stacks)
     good = [_reason("all agree", {"n": len(record.stacks), "agreement": agreement, "good": RETRY_BELOW_CORRELATION})]
-    return Verdict(USE, (*good, _reason("all seen", {})))
+    return Verdict(USE, (*good, _reason("all seen", {"what": NAME_OF[record.settings.anatomy]})))
 
 
 def _reason(name: str, facts: dict[str, object]) -> Reason:

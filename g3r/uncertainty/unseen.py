@@ -24,6 +24,7 @@ class UnseenPart:
         extent_known: False where the only field of view cuts the head and no template says how large the head is; the
             share is then too small.
         usable: False where the share is so large, or so little known, that the volume must not be used.
+        what: the volume shows, as in "of the brain".
     """
 
     share: float
@@ -31,6 +32,7 @@ class UnseenPart:
     shown: str
     extent_known: bool
     usable: bool
+    what: str = "brain"
 
     @classmethod
     def of(
@@ -41,6 +43,7 @@ class UnseenPart:
         *,
         shown: str,
         extent_known: bool = True,
+        what: str = "brain",
     ) -> UnseenPart:
         """Measure it.
 
@@ -50,6 +53,7 @@ class UnseenPart:
             voxel_volume_mm3: of both.
             shown: what the volume shows there.
             extent_known: whether the brain may not go on beyond all fields of view.
+            what: the volume shows.
         """
         share = float(unseen.sum()) / max(int(brain.sum()), 1)
         return cls(
@@ -58,6 +62,7 @@ class UnseenPart:
             shown=shown,
             extent_known=extent_known,
             usable=extent_known and share <= DO_NOT_USE_ABOVE,
+            what=what,
         )
 
     def line(self) -> str | None:
@@ -71,7 +76,7 @@ class UnseenPart:
             return None
         verb = "was left blank" if self.shown == "blank" else f"is shown as {_with_article(self.shown)}"
         percent = f"{100 * self.share:.0f} %" if self.share >= 0.01 else f"{100 * self.share:.1f} %"
-        text = f"{percent} of the brain was not seen by any slice ({self.volume_ml:.0f} ml): it {verb}"
+        text = f"{percent} of the {self.what} was not seen by any slice ({self.volume_ml:.0f} ml): it {verb}"
         return text if self.usable else f"{text}; do not use this volume"
 
 
