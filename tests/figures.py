@@ -98,7 +98,7 @@ def short_peers_table() -> str:
     """The same in the README, with what else one wants to know first."""
     asked = ["DICOM in and out", "tells when not to use it", "other organs", "validated on patients"]
     lines = [
-        ["g3r `balanced`", *measured("`balanced`"), "yes", "yes", "no", "**no**"],
+        ["g3r `balanced`", *measured("`balanced`"), "yes", "yes", "rigid ones", "**no**"],
         [f"{NESVOR[0]}, settings for a CPU", *NESVOR[2:], "no", "no", "yes", "published studies"],
     ]
     return _left(markdown_table(["", "PSNR, dB", "SSIM", "CPU seconds", *asked], lines))

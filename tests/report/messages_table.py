@@ -19,6 +19,7 @@ FILLED_IN = {
     "mm": "N",
     "n": "N",
     "where": "interrupted",
+    "what": "brain",
 }
 
 LINES = {
