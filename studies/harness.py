@@ -155,10 +155,11 @@ class Study:
         rows = record["rows"]
         todo = [task for task in tasks if task.key not in rows]
         start = time.perf_counter()
-        for task, row in results(todo, settings.get("jobs", 1), settings.get("threads")):
+        for n, (task, row) in enumerate(results(todo, settings.get("jobs", 1), settings.get("threads")), 1):
             if row is not None:
                 rows[task.key] = row
-                print(self.line(task.key, row) if self.line else f"{task.key}: measured", flush=True)
+                left = left_text(n, len(todo), time.perf_counter() - start)
+                print((self.line(task.key, row) if self.line else f"{task.key}: measured") + left, flush=True)
                 write_json(path, record)
         print(f"{len(todo)} of {len(tasks)} measured, {time.perf_counter() - start:.0f} s", flush=True)
         order = {task.key: n for n, task in enumerate(tasks)}
@@ -191,6 +192,20 @@ class Study:
         if hasattr(options, "development"):
             found["development"] = options.development
         return found | (self.settings(options) if self.settings else {})
+
+
+def left_text(n_done: int, n_all: int, seconds: float) -> str:
+    """How much of a run is left, for the end of a line; nothing after its last measurement.
+
+    Args:
+        n_done: measurements of this run so far.
+        n_all: measurements of this run.
+        seconds: that it has taken so far.
+    """
+    if n_done == n_all:
+        return ""
+    minutes = seconds / n_done * (n_all - n_done) / 60
+    return f" ({n_done} of {n_all}, about {max(1, round(minutes))} min left)"
 
 
 def resumed(path: Path, new: Record, renewed: set[str]) -> Record:

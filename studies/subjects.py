@@ -68,6 +68,18 @@ class SubjectSpec:
         """How its stacks are taken."""
         return orthogonal_settings(n_stacks, self.motion, bias=self.bias)
 
+    def truth(self, atlas: Path | None) -> TruthVolume:
+        """Its volume, as the atlas has it.
+
+        Args:
+            atlas: folder of the atlas; only what comes from none needs none.
+
+        Raises:
+            InputError: the atlas lacks the volume.
+        """
+        assert atlas is not None
+        return load_subject(find_subjects(atlas, include=[self.volume])[0], spacing_mm=None)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SizedSubject(SubjectSpec):
@@ -139,12 +151,12 @@ def simulated_case(spec: SubjectSpec, cache: Path, n_stacks: int | None = None) 
     return read_case(simulated_subject(spec, data_folder("atlas"), cache), n_stacks)
 
 
-def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
+def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Path:
     """The folder of a subject, simulated if the cache does not hold it.
 
     Args:
         spec: the subject.
-        atlas: folder of the atlas.
+        atlas: folder of the atlas; None for a subject that comes from none.
         cache: folder of simulated subjects.
 
     Raises:
@@ -158,9 +170,8 @@ def simulated_subject(spec: SubjectSpec, atlas: Path, cache: Path) -> Path:
         if found != record:
             raise InputError(f"{folder}: made by another specification; remove it or choose another --cache")
         return folder
-    chosen = find_subjects(atlas, include=[spec.volume])
     rng = np.random.default_rng(spec.seed)
-    truth = stretched(cropped(load_subject(chosen[0], spacing_mm=None), 4), spec, rng)
+    truth = stretched(cropped(spec.truth(atlas), 4), spec, rng)
     settings = spec.acquisition(3)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}

@@ -1,0 +1,101 @@
+"""Baselines without a network: super-resolution by least squares, with Tikhonov's regulariser and with total variation.
+
+    minimise over V:  sum_p w_p (A V - y)_p^2  +  s r sum of rho(grad V)
+
+rho is the square (Tikhonov), or the length with a rounded tip (total variation). The second is solved as a sequence of
+weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own operator, r the mean coverage of a voxel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.initial_volumes import InitialVolumes
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regulariser:
+    """How a volume is kept smooth.
+
+    Args:
+        strength: s; relative, so that it does not depend on the number of slices.
+        tip: length of the gradient (of intensities of order one, from voxel to voxel) below which total variation is
+            round; None for Tikhonov.
+        n_rounds: solutions with weights of the one before.
+        n_iterations: conjugate-gradient steps of each.
+    """
+
+    strength: float
+    tip: float | None = None
+    n_rounds: int = 1
+    n_iterations: int = 20
+
+
+def least_squares_volume(
+    volumes: InitialVolumes, gain: NDArray[np.float64], weight: NDArray[np.float64], regulariser: Regulariser
+) -> Array:
+    """The volume [I, J, K] on the grid of the initial volumes, started from V_coarse.
+
+    Args:
+        volumes: of the slices in their poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        regulariser: how it is kept smooth.
+    """
+    slices, grid = volumes.slices, volumes.grid
+    operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
+    pixel_weight = weight[slices.pixel_plane].astype(np.float32)
+    value = (slices.masked_value / gain[slices.pixel_plane]).astype(np.float32)
+    seen = operator.adjoint(pixel_weight)
+    strength = np.float32(regulariser.strength * float(seen[seen > 0.1 * seen.max()].mean()))
+    target = operator.adjoint(pixel_weight * value)
+
+    def solved(start: Array, diffusivity: Array | None) -> Array:
+        def normal(flat: NDArray[np.floating]) -> Array:
+            volume = flat.reshape(grid.shape).astype(np.float32)
+            data = operator.adjoint(pixel_weight * operator.forward(volume).astype(np.float32))
+            return (data + strength * divergence_of_gradient(volume, diffusivity)).ravel().astype(np.float32)
+
+        system = LinearOperator((target.size, target.size), matvec=normal, dtype=np.float32)
+        found, _ = cg(system, target.ravel(), x0=start.ravel(), maxiter=regulariser.n_iterations, rtol=1e-4)
+        return np.asarray(found, np.float32).reshape(grid.shape)
+
+    volume = volumes.coarse
+    for _ in range(regulariser.n_rounds):
+        volume = solved(volume, None if regulariser.tip is None else _diffusivity(volume, regulariser.tip))
+    return volume
+
+
+def _diffusivity(volume: Array, tip: float) -> Array:
+    """1 / (2 |grad V|) of total variation with a rounded tip [I, J, K]."""
+    squares = np.zeros_like(volume)
+    for axis in range(3):
+        squares += np.diff(volume, axis=axis, append=np.take(volume, [-1], axis)) ** 2
+    return (0.5 / np.sqrt(squares + np.float32(tip) ** 2)).astype(np.float32)
+
+
+def divergence_of_gradient(volume: Array, diffusivity: Array | None) -> Array:
+    """D^T W D V with forward differences D, free edges, and the weights W [I, J, K] of voxels (None: 1)."""
+    out = np.zeros_like(volume)
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        flow = np.diff(volume, axis=axis)
+        if diffusivity is not None:
+            flow = flow * diffusivity[tuple(low)]
+        out[tuple(low)] -= flow
+        out[tuple(high)] += flow
+    return out
+
+
+TIKHONOV = Regulariser(strength=0.03, n_iterations=25)
+TOTAL_VARIATION = Regulariser(strength=0.02, tip=0.02, n_rounds=4, n_iterations=12)
+"""As `studies.paper.tuning` chose them, on other subjects."""
+
