@@ -54,17 +54,16 @@ class Lpips(nn.Module):
 
     def __init__(self, features: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(
-            [
-                nn.Sequential(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU()),
-                nn.Sequential(nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2), nn.ReLU()),
-                nn.Sequential(nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
-                nn.Sequential(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
-                nn.Sequential(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
-            ]
-        )
+        blocks = [
+            nn.Sequential(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU()),
+            nn.Sequential(nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2), nn.ReLU()),
+            nn.Sequential(nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+            nn.Sequential(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+            nn.Sequential(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+        ]
+        self.blocks = nn.ModuleList(blocks)
         plain = {name.removeprefix("features."): tensor for name, tensor in features.items()}
-        convolutions = [layer for block in self.blocks for layer in block if isinstance(layer, nn.Conv2d)]
+        convolutions = [layer for block in blocks for layer in block.children() if isinstance(layer, nn.Conv2d)]
         try:
             for layer, n in zip(convolutions, (0, 3, 6, 8, 10), strict=True):
                 layer.load_state_dict({"weight": plain[f"{n}.weight"], "bias": plain[f"{n}.bias"]})
@@ -104,9 +103,7 @@ class Lpips(nn.Module):
             total = total + functional.conv2d(difference, head.to(one.dtype)).mean((1, 2, 3))
         return total
 
-    def distance(
-        self, volume: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_]
-    ) -> float:
+    def distance(self, volume: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:
         """Mean distance of the slices of two volumes on one grid: the mean of the means of three planes.
 
         Args:
@@ -154,9 +151,7 @@ def _unit(features: Tensor) -> Tensor:
     return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
 
 
-def _slices(
-    volume: NDArray[np.float32], mask: NDArray[np.bool_], axis: int
-) -> Iterator[NDArray[np.float32]]:
+def _slices(volume: NDArray[np.float32], mask: NDArray[np.bool_], axis: int) -> Iterator[NDArray[np.float32]]:
     """Slices across an axis that show a fair part of the mask."""
     across = tuple(a for a in range(3) if a != axis)
     area = mask.sum(across)

@@ -8,7 +8,7 @@ weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own opera
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,16 @@ def divergence_of_gradient(volume: Array, diffusivity: Array | None) -> Array:
 
 
 TIKHONOV = Regulariser(strength=0.03, n_iterations=25)
-TOTAL_VARIATION = Regulariser(strength=0.02, tip=0.02, n_rounds=4, n_iterations=12)
-"""As `studies.paper.tuning` chose them, on other subjects."""
+TOTAL_VARIATION = Regulariser(strength=0.01, tip=0.02, n_rounds=4, n_iterations=12)
 
+
+def tuned(atlas: bool, n_stacks: int) -> tuple[Regulariser, Regulariser]:
+    """Tikhonov and total variation as strong as `studies.paper.tuning` found best, on other subjects.
+
+    Args:
+        atlas: for atlas volumes; else for phantoms, whose tissues are flat.
+        n_stacks: of the subject.
+    """
+    if not atlas:
+        return TIKHONOV, TOTAL_VARIATION
+    return replace(TIKHONOV, strength=0.1), replace(TOTAL_VARIATION, strength=0.03 if n_stacks == 1 else 0.01)

@@ -6,6 +6,7 @@ Gaussian of the model; no setting was chosen on it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ N_SUBJECTS = 16
 
 WEEKS = (21.0, 38.0)
 
-BIAS = 0.15
+BIAS = 0.05
 """Strength of the inhomogeneity: three times that of other studies."""
 
 VOXEL_MM = 0.8
@@ -78,27 +79,31 @@ def phantom_heads(n: int, motion: str, first_seed: int = FIRST_SEED) -> list[Pap
     ]
 
 
-def atlas_heads(n: int, motion: str, atlas: Path) -> list[PaperSubject]:
+def atlas_heads(
+    n: int, motion: str, atlas: Path, include: Sequence[str] = (), first_seed: int = FIRST_SEED
+) -> list[PaperSubject]:
     """Volumes of an atlas folder between 21 and 38 weeks, by age.
 
     Args:
         n: at most so many.
         motion: level of motion.
         atlas: folder of subjects; see `find_subjects`.
+        include: glob patterns of names; none takes all.
+        first_seed: of the first; each has its own.
 
     Raises:
         InputError: none is of such an age.
     """
-    aged = sorted((weeks_of(one), one.name) for one in find_subjects(atlas))
+    aged = sorted((weeks_of(one), one.name) for one in find_subjects(atlas, include))
     found = [(weeks, name) for weeks, name in aged if WEEKS[0] <= weeks <= WEEKS[1]]
     if not found:
         raise InputError(f"--atlas {atlas}: no volume of 21 to 38 weeks; expected folders such as sta27")
     listed = [
         PaperSubject(
-            name=f"{motion}-{name.replace('/', '-')}-{FIRST_SEED + k}",
+            name=f"{motion}-{name.replace('/', '-')}-{first_seed + k}",
             volume=name,
             motion=motion,
-            seed=FIRST_SEED + k,
+            seed=first_seed + k,
             weeks=weeks,
         )
         for k, (weeks, name) in enumerate(found)

@@ -39,7 +39,7 @@ class Unconstrained:
 
     attenuation: str = "exact"
     seeding: str = "random"
-    n_steps: int = 120
+    n_steps: int = 200
     steps_per_list: int = 10
 
 
@@ -85,12 +85,7 @@ def fit_unconstrained(
             moved = moved_planes(planes, twist.detach() * unit)
             overlaps = find_overlaps(now.detach(), moved, CUTOFF_SIGMA + OVERLAP_MARGIN_SIGMA)
         pixels = render(
-            now,
-            planes,
-            twist=twist * unit,
-            log_gain=log_gain,
-            attenuation=settings.attenuation,
-            overlaps=overlaps,
+            now, planes, twist=twist * unit, log_gain=log_gain, attenuation=settings.attenuation, overlaps=overlaps
         )
         loss = (pixel_weight * (pixels - target).abs()).sum()
         adam.zero_grad()

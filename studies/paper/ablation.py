@@ -1,0 +1,57 @@
+"""Fig. 4A: the product without its parts, from three, two and one stacks, after one registration that all share."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from g3r.errors import G3RError
+from g3r.fitting.schedules import AnnealedWeight
+from g3r.planning.presets import PRESETS, changed
+from g3r.reconstruct import GaussianReconstructor
+from studies.harness import Row
+from studies.paper.subjects import PaperSubject, paper_case
+from studies.runs import aligned, figures
+
+SHIPPED, LINEAR, CONSTANT = "as shipped", "annealing linear", "annealing constant"
+NONE, NO_PRIOR = "no annealing: without distillation", "without prior"
+
+CONSTANT_WEIGHT = AnnealedWeight(0.2, 0.2)
+
+VARIANTS: dict[str, Mapping[str, Any]] = {
+    SHIPPED: {},
+    LINEAR: {"slice_stage.prior_error": 0.0},
+    CONSTANT: {"slice_stage.prior_error": 0.0, "slice_stage.distillation": CONSTANT_WEIGHT},
+    NONE: {"distillation": False},
+    NO_PRIOR: {"use_prior": False},
+}
+"""As changes of the settings. With several stacks the shipped settings anneal linearly, as the paper has it."""
+
+
+def measure_variants(spec: PaperSubject, n_stacks: int, options: argparse.Namespace) -> Row:
+    """One subject with every variant; "skipped" says why where g3r refuses it.
+
+    Args:
+        spec: the subject.
+        n_stacks: its first so many.
+        options: of the command.
+    """
+    row: Row = {"subject": spec.name, "motion": spec.motion, "n_stacks": n_stacks, "kind": "variants"}
+    case, settings = paper_case(spec, options.atlas, options.cache, n_stacks), PRESETS[options.preset]
+    scores, seconds = {}, {}
+    try:
+        motion = GaussianReconstructor(options.ckpt, settings).register_stacks(case.stacks)
+        for name, changes in VARIANTS.items():
+            if n_stacks > 1 and name == LINEAR:
+                continue  # the same as shipped
+            start = time.perf_counter()
+            result = GaussianReconstructor(options.ckpt, changed(settings, changes)).reconstruct(case.stacks, motion)
+            seconds[name] = round(time.perf_counter() - start, 2)
+            common = case.pose_error(result.slices).common
+            scores[name] = figures(aligned(case, result.volume, result.grid, common).scores)
+    except G3RError as error:
+        print(f"{spec.name}, {n_stacks}: {error}", flush=True)
+        return row | {"skipped": str(error)}
+    return row | {"scores": scores, "seconds": seconds}

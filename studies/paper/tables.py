@@ -1,0 +1,149 @@
+"""Tables of docs/paper.md, from the record of `studies.paper.compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import mean
+from typing import Any
+
+from studies.harness import Record, Row
+from studies.paper.ablation import VARIANTS
+from studies.paper.methods import METHODS, NO_NETWORK, PRODUCT, UNCONSTRAINED
+from studies.tables import Cell, spread, stacks, table
+
+SCORES = {"psnr_db": "PSNR, dB", "ssim": "SSIM", "ncc": "NCC", "rmse": "RMSE", "lpips": "LPIPS"}
+FORMS = {"psnr_db": "{:.2f}", "seconds": "{:.0f}"}
+ROUND = "{:.3f}"
+PLACES = {"mask": "in the mask", "grid": "on the whole grid"}
+
+CONDITIONS = (("moderate", 3), ("moderate", 1), ("mild", 3))
+
+
+def rows_of(record: Record, kind: str, **wanted: Any) -> list[Row]:
+    """Rows of a kind that were measured, with these values.
+
+    Args:
+        record: of the study.
+        kind: methods or variants.
+        wanted: values by name.
+    """
+    rows = record["rows"].values()
+    return [
+        row
+        for row in rows
+        if row["kind"] == kind and "skipped" not in row and all(row.get(k) == v for k, v in wanted.items())
+    ]
+
+
+def values(rows: Iterable[Row], method: str, place: str, score: str) -> list[float]:
+    """One score of a method, subject by subject.
+
+    Args:
+        rows: of methods.
+        method: its name.
+        place: "mask" or "grid".
+        score: key of the score, or "seconds".
+    """
+    found = [row["scores"][method] for row in rows if method in row["scores"]]
+    chosen = [one if score == "seconds" else one[place] for one in found]
+    return [float(one[score]) for one in chosen if score in one]
+
+
+def methods_table(rows: Sequence[Row], place: str, why_no_lpips: str) -> str:
+    """Table 1 for one level of motion, one number of stacks and one place.
+
+    Args:
+        rows: of methods.
+        place: "mask" or "grid".
+        why_no_lpips: why there is no LPIPS; empty where there is.
+    """
+    named = {name for row in rows for name in row["scores"]}
+    names = [name for name in METHODS if name in named] + sorted(named - set(METHODS))
+    shown = [key for key in SCORES if key != "lpips" or not why_no_lpips]
+
+    def cell(score: str) -> Cell:
+        return lambda line: spread(values(rows, line["name"], place, score), FORMS.get(score, ROUND))
+
+    columns: dict[str, Cell] = {"method": "{name}", "s": cell("seconds")}
+    columns |= {SCORES[key]: cell(key) for key in shown}
+    return table([{"name": name} for name in names], columns)
+
+
+def gains(rows: Sequence[Row]) -> str:
+    """By how much the product is above each kind of baseline, in words."""
+    product = values(rows, PRODUCT, "mask", "psnr_db")
+    if not product:
+        return ""
+    lines = []
+    for what, names in (
+        ("the best volume without a network", NO_NETWORK),
+        ("the best unconstrained fit", UNCONSTRAINED),
+    ):
+        means = {name: mean(found) for name in names if (found := values(rows, name, "mask", "psnr_db"))}
+        if means:
+            best = max(means, key=lambda name: means[name])
+            pairs = zip(product, values(rows, best, "mask", "psnr_db"), strict=True)
+            least = min(one - other for one, other in pairs)
+            lines.append(f"{mean(product) - means[best]:+.2f} dB over {what} ({best}; least {least:+.2f})")
+    return f"g3r: {'; '.join(lines)}."
+
+
+def main_tables(record: Record) -> str:
+    """Table 1 of every condition: in the mask, then on the whole grid."""
+    parts = []
+    for motion, n in CONDITIONS:
+        rows = rows_of(record, "methods", motion=motion, n_stacks=n)
+        if not rows:
+            continue
+        own = [row for row in rows if "tre_mm" in row]
+        poses = mean(row["tre_mm"] for row in own), mean(row["own_tre_mm"] for row in own)
+        title = f"**{motion.capitalize()} motion, {stacks(n)}, {len(own)} subjects.**"
+        parts.append(
+            f"{title} Median pose error {poses[0]:.2f} mm, {poses[1]:.2f} mm of poses of their own; "
+            f"{mean(row['cpu_seconds'] for row in own):.0f} CPU seconds of g3r. {gains(own)}"
+        )
+        for place, words in PLACES.items():
+            parts += [f"{words.capitalize()}:", methods_table(rows, place, record["why_no_lpips"])]
+    return "\n\n".join(parts)
+
+
+def variants_table(record: Record) -> str:
+    """Fig. 4A in figures."""
+    rows = rows_of(record, "variants")
+    numbers = sorted({row["n_stacks"] for row in rows}, reverse=True)
+    columns: dict[str, Cell] = {"variant": "{name}"}
+    for n in numbers:
+        columns[f"{stacks(n)}, dB ({len(of_number(rows, n))} subjects)"] = _variant_cell(rows, n)
+    return table([{"name": name} for name in VARIANTS], columns)
+
+
+def of_number(rows: Iterable[Row], n_stacks: int) -> list[Row]:
+    """Rows of a number of stacks."""
+    return [row for row in rows if row["n_stacks"] == n_stacks]
+
+
+def variant_values(rows: Iterable[Row], name: str, n_stacks: int) -> list[float]:
+    """PSNR of a variant, subject by subject.
+
+    Args:
+        rows: of variants.
+        name: of the variant.
+        n_stacks: rows of this number alone.
+    """
+    return [float(row["scores"][name]["psnr_db"]) for row in of_number(rows, n_stacks) if name in row["scores"]]
+
+
+def _variant_cell(rows: Sequence[Row], n_stacks: int) -> Cell:
+    return lambda line: spread(variant_values(rows, line["name"], n_stacks))
+
+
+def stages_table(record: Record) -> str:
+    """Seconds of each stage, three stacks, moderate motion."""
+    rows = [row for row in rows_of(record, "methods", motion="moderate", n_stacks=3) if "stages" in row]
+    names = list(dict.fromkeys(name for row in rows for name in row["stages"]))
+    lines: list[Mapping[str, Any]] = [
+        {"name": name, "of": [row["stages"].get(name, 0) for row in rows]} for name in names
+    ]
+    lines.append({"name": "all, wall time", "of": [row["seconds"] for row in rows]})
+    lines.append({"name": "all, CPU time", "of": [row["cpu_seconds"] for row in rows]})
+    return table(lines, {"stage": "{name}", "s": lambda line: spread(line["of"], "{:.1f}")})
