@@ -50,7 +50,7 @@ def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
                 yield Task(f"{spec.name}, {stacks(n)}, {one.name}", measure_peer, (spec, n, one, options))
     for spec in heads("moderate", options):
         for n in STACK_NUMBERS:
-            yield Task(f"{spec.name}, {stacks(n)}, variants", measure_variants, (spec, n, options))
+            yield Task(f"{spec.name}, variants from {stacks(n)}", measure_variants, (spec, n, options))
 
 
 def line(key: str, row: Row) -> str:

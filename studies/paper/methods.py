@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.coarse_volume import confidence
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.slicing import normalised_slices
 from g3r.errors import G3RError
@@ -18,7 +17,7 @@ from g3r.evaluation.align import Alignment
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.pose_error import PoseError
 from g3r.fitting.initial_volumes import InitialVolumes
-from g3r.fitting.prior_volume import placed_template
+from g3r.fitting.prior_volume import KNOWN_DENSITY, placed_template
 from g3r.gaussians import render
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.result import ReconstructionResult
@@ -227,7 +226,7 @@ def template_and_printed(posed: Posed, reconstructor: GaussianReconstructor, mot
     if placed is not None:
         squares = least_squares_volume(volumes, posed.gain, posed.weight, posed.regularisers[1])
         template = placed.fitted(volumes.sharp, volumes.share, volumes.density, volumes.grid)
-        seen = confidence(volumes.masked_density)
+        seen = np.clip(volumes.density / KNOWN_DENSITY, 0, 1)
         yield posed.made(FILL, seen * squares + (1 - seen) * template.values, start)
     yield _gaussians(posed, reconstructor, PRINTED, Unconstrained(attenuation="printed"))
 
