@@ -31,6 +31,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--reference", help="true volume (NIfTI)")
     parser.add_argument("--mask", help="mask on the grid of the reference, or of the stack (NIfTI)")
     parser.add_argument("--align", action="store_true", help="remove one rigid motion of the whole head first")
+    parser.add_argument(
+        "--lpips-weights", metavar="PATH", help="also LPIPS: a folder with alexnet*.pth and alex.pth, or AlexNet's file"
+    )
     parser.add_argument("--json", metavar="FILE", help="also write the scores here")
     parser.add_argument("--sections", metavar="FILE", help="also write a picture: reference, volume, error (PNG)")
     parser.add_argument("--poses", metavar="TSV", help="true slice poses (poses.tsv, with mask-N.nii.gz in its folder)")
@@ -61,13 +64,21 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def table(comparison: Comparison, pose_error: PoseError | None = None) -> str:
-    """The scores as a few lines of text."""
+def table(comparison: Comparison, pose_error: PoseError | None = None, lpips: float | None = None) -> str:
+    """The scores as a few lines of text.
+
+    Args:
+        comparison: of the volume with the truth.
+        pose_error: of the slices; None leaves it out.
+        lpips: mean distance of slices; None leaves it out.
+    """
     s, alignment = comparison.scores, comparison.alignment
     lines = [
         f"{'PSNR dB':>8} {'SSIM':>7} {'NCC':>7} {'RMSE':>7}   voxels",
         f"{s.psnr_db:8.2f} {s.ssim:7.4f} {s.ncc:7.4f} {s.rmse:7.4f}   {s.n_voxels}",
     ]
+    if lpips is not None:
+        lines.append(f"LPIPS (AlexNet, v0.1): {lpips:.4f}")
     if alignment:
         lines.append(f"aligned: {alignment.rotation_deg:.2f} deg, {alignment.translation_mm:.2f} mm removed")
     if pose_error:
@@ -79,12 +90,18 @@ def table(comparison: Comparison, pose_error: PoseError | None = None) -> str:
     return "\n".join(lines)
 
 
-def _compare(options: argparse.Namespace) -> Comparison:
+def _compare(options: argparse.Namespace) -> tuple[Comparison, float | None]:
+    """The volume beside the reference, and their LPIPS where its weights are given."""
     from g3r.acquisition.images import load_mask, load_volume
     from g3r.evaluation.compare import compare
 
     volume, reference = load_volume(options.volume), load_volume(options.reference)
     mask = load_mask(options.mask, reference)
+    lpips = None
+    if options.lpips_weights:
+        from g3r.evaluation.lpips import Lpips
+
+        lpips = Lpips.load(options.lpips_weights)  # before the alignment: a wrong path shows at once
     comparison = compare(volume, reference, mask, align=options.align)
     if options.sections:
         from g3r.output.sections import save_sections
@@ -95,7 +112,10 @@ def _compare(options: argparse.Namespace) -> Comparison:
             "error": abs(comparison.volume - reference.data) * mask,
         }
         save_sections(options.sections, rows, reference.affine, mask, maps=("error",))
-    return comparison
+    if lpips is None:
+        return comparison, None
+    data_range = comparison.scores.data_range
+    return comparison, lpips.distance(comparison.volume / data_range, reference.data / data_range, mask)
 
 
 def _pose_error(poses: str, slices: str) -> PoseError:
@@ -112,10 +132,12 @@ def _scored(options: argparse.Namespace) -> dict[str, Any]:
     """Compare with the truth, and print; returns the scores for --json."""
     from dataclasses import asdict
 
-    comparison = _compare(options)
+    comparison, lpips = _compare(options)
     pose_error = _pose_error(options.poses, options.slices) if options.poses else None
-    print(table(comparison, pose_error))
+    print(table(comparison, pose_error, lpips))
     record: dict[str, Any] = asdict(comparison.scores)
+    if lpips is not None:
+        record["lpips"] = lpips
     if comparison.alignment:
         record["alignment"] = {
             "rotation_deg": comparison.alignment.rotation_deg,

@@ -19,7 +19,7 @@ LOW_CORRELATION = 0.6
 """Below this a stack was hardly found in the volume, and its scores may be those of a wrong place."""
 
 TAKEN = {
-    "reference": (("volume", "reference", "mask"), ("align", "sections", "poses", "slices")),
+    "reference": (("volume", "reference", "mask"), ("align", "sections", "poses", "slices", "lpips_weights")),
     "held_out_stack": (("volume", "mask"), ("held_out_stack", "thickness", "support", "eroded_pixels")),
     "leave_one_out": (("stacks", "masks"), ("leave_one_out", "thickness", "preset", "ckpt", "eroded_pixels")),
 }

@@ -12,6 +12,7 @@ import pytest
 
 from g3r.acquisition.images import save_volume
 from g3r.cli.evaluate import main
+from tests.evaluation.alexnet import save_states
 
 
 @pytest.fixture
@@ -50,6 +51,14 @@ def test_scores_as_a_process(files: Path) -> None:
     assert {p.name for p in files.iterdir() if p.name.startswith(".")} == set()
 
 
+def test_lpips_is_reported(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_states(files)
+    assert main([*options(files, json="s.json"), "--lpips-weights", str(files)]) == 0
+    found = json.loads((files / "s.json").read_text())["lpips"]
+    assert f"LPIPS (AlexNet, v0.1): {found:.4f}" in capsys.readouterr().out
+    assert found > 0
+
+
 def test_alignment_is_reported(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*options(files), "--align"]) == 0
     assert "aligned: 0." in capsys.readouterr().out
@@ -72,6 +81,7 @@ def test_pose_error_is_reported(files: Path, capsys: pytest.CaptureFixture[str])
         ({"volume": "nan.nii.gz"}, "no finite value"),
         ({"mask": "small.nii.gz"}, "grid"),
         ({"mask": "empty.nii.gz"}, "empty"),
+        ({"lpips-weights": "nowhere"}, "no alexnet"),
         ({"json": "no/folder/scores.json"}, "cannot be written"),
         ({"poses": "nowhere.tsv", "slices": "nowhere.tsv"}, "no such file"),
     ],

@@ -12,25 +12,13 @@ from torch import Tensor, nn
 
 from g3r.errors import InputError
 from g3r.evaluation.lpips import Lpips
+from tests.evaluation.alexnet import CHANNELS, INPUTS, SIDES, random_states, save_states
 from tests.rooms import REPOSITORY
 
 WEIGHTS = Path(os.environ.get("G3R_TEST_DATA", REPOSITORY.parent / "shared" / "data")) / "lpips"
 
-CHANNELS, SIDES, INPUTS, PLACES = (64, 192, 384, 256, 256), (11, 5, 3, 3, 3), (3, 64, 192, 384, 256), (0, 3, 6, 8, 10)
-
 PUBLISHED = {"ex_p0.png": 0.722, "ex_p1.png": 0.138}
 """Distances from ex_ref.png that the authors print (README of PerceptualSimilarity)."""
-
-
-def random_states(seed: int = 0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Weights of the right shapes: the metric's mathematics does not depend on what AlexNet learned."""
-    g = torch.Generator().manual_seed(seed)
-    features: dict[str, Tensor] = {}
-    for n, c, i, k in zip(PLACES, CHANNELS, INPUTS, SIDES, strict=True):
-        features[f"features.{n}.weight"] = torch.randn(c, i, k, k, generator=g) / (i * k * k) ** 0.5
-        features[f"features.{n}.bias"] = torch.randn(c, generator=g) / 10
-    heads = {f"lin{n}.model.1.weight": torch.rand(1, c, 1, 1, generator=g) for n, c in enumerate(CHANNELS)}
-    return features, heads
 
 
 def images(n: int, seed: int = 1) -> Tensor:
@@ -92,8 +80,7 @@ def test_the_distance_of_volumes() -> None:
 
 def test_weights_are_read_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     features, heads = random_states()
-    torch.save(features, tmp_path / "alexnet-owt-7be5be79.pth")
-    torch.save(heads, tmp_path / "alex.pth")
+    save_states(tmp_path)
     one, two = images(1), images(1, seed=2)
     expected = float(Lpips(features, heads)(one, two))
     assert float(Lpips.load(tmp_path)(one, two)) == expected
