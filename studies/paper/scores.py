@@ -14,13 +14,10 @@ from g3r.evaluation.align import Alignment, resample
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import Comparison
 from g3r.evaluation.lpips import Lpips
-from g3r.evaluation.metrics import Scores, score
+from g3r.evaluation.metrics import Scores, correlation, mean_ssim, psnr_db, score
 from g3r.geometry import RigidPose, VolumeGrid
 from studies.harness import Row
 from studies.runs import aligned
-
-PLACES = ("mask", "grid")
-"""In the mask of the truth, and on the whole grid, with what a method shows beside the brain."""
 
 
 @functools.lru_cache(maxsize=1)
@@ -46,7 +43,9 @@ def scored(
     lpips: Lpips | None,
     known: Alignment | None = None,
 ) -> tuple[Row, Comparison]:
-    """Scores by place, and the volume as it was scored.
+    """Scores in the mask of the truth ("mask") and on its whole grid ("grid"), and the volume as it was scored.
+
+    In the mask gain and offset are fitted, as everywhere in g3r; on the grid a factor alone.
 
     Args:
         case: with the truth.
@@ -63,16 +62,41 @@ def scored(
         moved = resample(volume, case.truth.grid, known.volume_from_reference)
         scores = score(moved, case.truth.data, case.truth_mask)
         found = Comparison(scores, known, (moved * scores.gain + scores.offset).astype(np.float32))
-    truth, everywhere = case.truth.data, np.ones(case.truth_mask.shape, bool)
-    row: Row = {}
-    for place, mask in zip(PLACES, (case.truth_mask, everywhere), strict=True):
-        scores = found.scores if place == "mask" else score(found.volume, truth, mask)
-        row[place] = _figures(scores)
-        if lpips is not None:
-            fitted = found.volume if place == "mask" else found.volume * scores.gain + scores.offset
-            distance = lpips.distance(fitted / scores.data_range, truth / scores.data_range, mask)
-            row[place]["lpips"] = round(distance, 5)
+    truth, mask = case.truth.data.astype(np.float64) / found.scores.data_range, case.truth_mask
+    fitted = found.volume.astype(np.float64) / found.scores.data_range
+    row: Row = {"mask": _figures(found.scores), "grid": _on_grid(fitted, truth, found.scores)}
+    if lpips is not None:
+        row["mask"]["lpips"] = round(lpips.distance(fitted, truth, mask), 5)
+        everywhere = np.ones(mask.shape, bool)
+        row["grid"]["lpips"] = round(lpips.distance(_scaled(fitted, truth, found.scores), truth, everywhere), 5)
     return row, found
+
+
+def _scaled(fitted: NDArray[np.float64], truth: NDArray[np.float64], scores: Scores) -> NDArray[np.float64]:
+    """A volume as it was given, times the factor that brings it nearest to the truth on the whole grid.
+
+    No offset: what a method leaves black stays black, as the truth is beside the brain.
+
+    Args:
+        fitted: [I, J, K] the volume with gain and offset of the scores, over the data range.
+        truth: [I, J, K] over the data range.
+        scores: in the mask.
+    """
+    given = fitted - scores.offset / scores.data_range
+    power = float((given**2).sum())
+    return given * (float((given * truth).sum()) / power if power > 0 else 0.0)
+
+
+def _on_grid(fitted: NDArray[np.float64], truth: NDArray[np.float64], scores: Scores) -> dict[str, float]:
+    """Scores over all voxels; for arguments see `_scaled`."""
+    scaled, everywhere = _scaled(fitted, truth, scores), np.ones(truth.shape, bool)
+    rmse = float(np.sqrt(((scaled - truth) ** 2).mean()))
+    return {
+        "psnr_db": round(psnr_db(rmse), 4),
+        "ssim": round(mean_ssim(scaled, truth, everywhere), 5),
+        "ncc": round(correlation(scaled.ravel(), truth.ravel()), 5),
+        "rmse": round(rmse, 5),
+    }
 
 
 def _figures(scores: Scores) -> dict[str, float]:
