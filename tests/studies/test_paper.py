@@ -19,6 +19,7 @@ from g3r.evaluation.case import SimulatedCase, load_case
 from g3r.evaluation.compare import compare
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.gaussians import render
+from g3r.geometry import RigidPose
 from studies.harness import left_text
 from studies.paper import peers
 from studies.paper.compare import STUDY, tables
@@ -151,6 +152,14 @@ def test_a_command_without_its_places_is_refused(text: str) -> None:
 def test_places_inside_words(tmp_path: Path) -> None:
     words = peers.arguments(peers.peer("x=run --in={stacks} {output}"), tmp_path, 2, 2.2, tmp_path / "v.nii.gz")
     assert words == ["run", f"--in={tmp_path}/stack-0.nii.gz {tmp_path}/stack-1.nii.gz", f"{tmp_path}/v.nii.gz"]
+
+
+def test_beside_the_brain_black_stays_black(case: SimulatedCase) -> None:
+    """The fit in the mask has an offset; on the whole grid it must not light up the background."""
+    dimmed = np.where(case.truth_mask, 0.5 * case.truth.data + 100, 0).astype(np.float32)
+    row, _ = scored(case, dimmed, case.truth.grid, RigidPose.identity(1), None)
+    assert row["mask"]["psnr_db"] > 60
+    assert row["grid"]["ssim"] > 0.8
 
 
 def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVolumes, tmp_path: Path) -> None:
