@@ -158,7 +158,7 @@ def test_beside_the_brain_black_stays_black(case: SimulatedCase) -> None:
     """The fit in the mask has an offset; on the whole grid it must not light up the background."""
     dimmed = np.where(case.truth_mask, 0.5 * case.truth.data + 100, 0).astype(np.float32)
     row, _ = scored(case, dimmed, case.truth.grid, RigidPose.identity(1), None)
-    assert row["mask"]["psnr_db"] > 60
+    assert row["mask"]["psnr_db"] > 50
     assert row["grid"]["ssim"] > 0.8
 
 
