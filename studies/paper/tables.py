@@ -65,7 +65,10 @@ def methods_table(rows: Sequence[Row], place: str, why_no_lpips: str) -> str:
     def cell(score: str) -> Cell:
         return lambda line: spread(values(rows, line["name"], place, score), FORMS.get(score, ROUND))
 
-    columns: dict[str, Cell] = {"method": "{name}", "s": cell("seconds")}
+    def subjects(line: Mapping[str, Any]) -> int:
+        return sum(line["name"] in row["scores"] for row in rows)
+
+    columns: dict[str, Cell] = {"method": "{name}", "subjects": subjects, "s": cell("seconds")}
     columns |= {SCORES[key]: cell(key) for key in shown}
     return table([{"name": name} for name in names], columns)
 
@@ -80,11 +83,12 @@ def gains(rows: Sequence[Row]) -> str:
         ("the best volume without a network", NO_NETWORK),
         ("the best unconstrained fit", UNCONSTRAINED),
     ):
-        means = {name: mean(found) for name in names if (found := values(rows, name, "mask", "psnr_db"))}
+        # those that every subject has: a template fits some heads alone
+        found = {name: values(rows, name, "mask", "psnr_db") for name in names}
+        means = {name: mean(each) for name, each in found.items() if len(each) == len(product)}
         if means:
             best = max(means, key=lambda name: means[name])
-            pairs = zip(product, values(rows, best, "mask", "psnr_db"), strict=True)
-            least = min(one - other for one, other in pairs)
+            least = min(one - other for one, other in zip(product, found[best], strict=True))
             lines.append(f"{mean(product) - means[best]:+.2f} dB over {what} ({best}; least {least:+.2f})")
     return f"g3r: {'; '.join(lines)}."
 

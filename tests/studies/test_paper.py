@@ -25,7 +25,7 @@ from studies.paper import peers
 from studies.paper.compare import STUDY, tables
 from studies.paper.figures import draw
 from studies.paper.least_squares import TIKHONOV, TOTAL_VARIATION, least_squares_volume
-from studies.paper.methods import PRODUCT, VARIATION
+from studies.paper.methods import FILL, PRODUCT, VARIATION
 from studies.paper.pictures import keep_sections
 from studies.paper.scores import scored
 from studies.paper.subjects import FIRST_SEED, TUNING_SEED, phantom_heads, spread_order
@@ -166,6 +166,7 @@ def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVo
     row, comparison = scored(case, volumes.sharp, volumes.grid, case.header_error().common, None)
     subject, base = "moderate-30.0w-1", {"weeks": 30.0, "motion": "moderate", "subject": "moderate-30.0w-1"}
     scores = {name: row | {"seconds": 1.0} for name in (PRODUCT, VARIATION)}
+    filled = {FILL: row | {"seconds": 2.0}}
     stages = {"tre_mm": 0.1, "own_tre_mm": 0.2, "seconds": 30.0, "cpu_seconds": 40.0, "stages": {"registration": 9.0}}
     variants = {"as shipped": {"psnr_db": 30.0}, "without prior": {"psnr_db": 28.0}}
     record = {
@@ -178,6 +179,7 @@ def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVo
         | {"g3r": "0", "commit": None},
         "rows": {
             "one": base | {"kind": "methods", "n_stacks": 3, "scores": scores} | stages,
+            "other": base | {"kind": "methods", "n_stacks": 3, "scores": scores | filled} | stages,
             "refused": base | {"kind": "methods", "n_stacks": 3, "skipped": "no"},
             "peer": base | {"kind": "methods", "n_stacks": 3, "scores": {"fake": row | {"seconds": 5.0}}},
             "parts": base | {"kind": "variants", "n_stacks": 3, "scores": variants},
@@ -187,7 +189,7 @@ def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVo
     assert set(texts) == {"paper-methods", "paper-variants", "paper-stages", "paper-elsewhere"}
     assert "LPIPS is left out: no weights" in texts["paper-methods"]
     assert "| LPIPS" not in texts["paper-methods"]
-    assert "| fake | 5 |" in texts["paper-methods"]
+    assert "| fake | 1 | 5 |" in texts["paper-methods"]
     assert "+0.00 dB over the best volume" in texts["paper-methods"]
     assert "| as shipped | 30.00 |" in texts["paper-variants"]
     assert "registration | 9.0" in texts["paper-stages"]
