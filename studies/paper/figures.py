@@ -41,6 +41,8 @@ def draw(record: Record, options: argparse.Namespace) -> None:
 def _draw_variants(record: Record, path: Path) -> None:
     """Fig. 4A: mean PSNR of each variant against the number of stacks."""
     rows = rows_of(record, "variants")
+    if not rows:
+        return
     figure = new_figure((6, 4))
     axes = figure.subplots()
     for shift, name in enumerate(VARIANTS):

@@ -18,6 +18,9 @@ TRUTH = "truth"
 ERROR_WINDOW = 0.25
 """Of the data range: where the map of errors is white."""
 
+DPI = 72
+"""Slices have about a hundred pixels: more would only be larger files."""
+
 PLANES = ("sagittal", "coronal", "axial")
 
 
@@ -79,4 +82,4 @@ def draw_methods(sections: Path, methods: Sequence[str], path: Path, titles: Map
         axes[0, column].set_title(f"{head}\n{titles.get(name, '')}", fontsize=8)
     for row, plane in enumerate(planes):
         axes[2 * row, 0].set_ylabel(PLANES[plane], fontsize=8)
-    save_figure(figure, path)
+    save_figure(figure, path, dpi=DPI)
