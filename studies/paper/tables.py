@@ -66,12 +66,17 @@ def methods_table(rows: Sequence[Row], place: str, why_no_lpips: str) -> str:
     def cell(score: str) -> Cell:
         return lambda line: spread(values(rows, line["name"], place, score), FORMS.get(score, ROUND))
 
-    def subjects(line: Mapping[str, Any]) -> int:
+    def how_many(line: Mapping[str, Any]) -> int:
         return sum(line["name"] in row["scores"] for row in rows)
 
-    columns: dict[str, Cell] = {"method": "{name}", "subjects": subjects, "s": cell("seconds")}
+    columns: dict[str, Cell] = {"method": "{name}", "subjects": how_many, "s": cell("seconds")}
     columns |= {SCORES[key]: cell(key) for key in shown}
     return table([{"name": name} for name in names], columns)
+
+
+def subjects(n: int) -> str:
+    """A number of subjects in words."""
+    return f"{n} subject{'s' * (n != 1)}"
 
 
 def gains(rows: Sequence[Row]) -> str:
@@ -103,7 +108,7 @@ def main_tables(record: Record) -> str:
             continue
         own = [row for row in rows if "tre_mm" in row]
         poses = mean(row["tre_mm"] for row in own), mean(row["own_tre_mm"] for row in own)
-        title = f"**{motion.capitalize()} motion, {stacks(n)}, {len(own)} subjects.**"
+        title = f"**{motion.capitalize()} motion, {stacks(n)}, {subjects(len(own))}.**"
         parts.append(
             f"{title} Median pose error {poses[0]:.2f} mm, {poses[1]:.2f} mm of poses of their own; "
             f"{mean(row['cpu_seconds'] for row in own):.0f} CPU seconds of g3r. {gains(own)}"
@@ -121,7 +126,7 @@ def variants_table(record: Record) -> str:
     numbers = sorted({row["n_stacks"] for row in rows}, reverse=True)
     columns: dict[str, Cell] = {"variant": "{name}"}
     for n in numbers:
-        columns[f"{stacks(n)}, dB ({len(of_number(rows, n))} subjects)"] = _variant_cell(rows, n)
+        columns[f"{stacks(n)}, dB ({subjects(len(of_number(rows, n)))})"] = _variant_cell(rows, n)
     return table([{"name": name} for name in VARIANTS], columns)
 
 
