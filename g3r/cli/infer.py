@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-infer`: motion-corrupted stacks in, one volume with maps, poses and a record out."""
 
 from __future__ import annotations
@@ -7,6 +8,8 @@ import atexit
 import gc
 import io
 import logging
+import os
+import platform
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -15,9 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r._version import __version__
 from g3r.cli.dicom_options import stacks_on_disk, write_dicom
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
-from g3r.cli.infer_options import parsed_options, without_names
+from g3r.cli.infer_options import parsed_options, told_options, without_names
 from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
 from g3r.cli.terminal import PROGRAM, Terminal
 from g3r.cli.time_left import COMPILING_S, TimeLeft, expected_seconds, needs_compiling
@@ -58,6 +62,8 @@ def _terminal(options: argparse.Namespace) -> Terminal:
     compiling = needs_compiling() and not options.dry_run
     time_left = TimeLeft(expected_seconds(options, compiling=compiling))
     log = LogFile(*without_names(options))
+    log.say(f"{PROGRAM} {__version__}, Python {platform.python_version()}, {platform.system()}, {os.cpu_count()} cores")
+    log.say(f"options: {told_options(options)}")
     compiling_s = sum(COMPILING_S.get(stage, 0.0) for stage in time_left.expected_s) if compiling else 0.0
     return Terminal(time_left, log, quiet=options.quiet, verbose=options.verbose, compiling_s=compiling_s)
 
@@ -112,7 +118,11 @@ def _reconstructed(
     from g3r.run.context import RunContext
     from g3r.run.output_folder import OutputFolder, check_output_folder
 
-    with OutputFolder(folder, OUTPUT_NAMES) as output, _logged(output, terminal.log), _reporter(options, task, terminal) as reporter:
+    with (
+        OutputFolder(folder, OUTPUT_NAMES) as output,
+        _logged(output, terminal.log),
+        _reporter(options, task, terminal) as reporter,
+    ):
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, reporter=reporter)
         result = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
@@ -148,7 +158,7 @@ def _reporter(options: argparse.Namespace, task: Task, terminal: Terminal) -> It
     if not options.tensorboard:
         yield terminal
         return
-    from g3r.output.tensorboard import LiveBoard
+    from g3r.output.live_board import LiveBoard
     from g3r.run.reporter import Reporters
 
     with LiveBoard(Path(options.tensorboard)) as board:

@@ -1,4 +1,3 @@
-# PYTHON_ARGCOMPLETE_OK
 """The options of `g3r-infer`, and which of them go together; nothing heavy is imported here."""
 
 from __future__ import annotations
@@ -134,8 +133,8 @@ def _add_networks(parser: argparse.ArgumentParser) -> None:
     networks.add_argument(
         "--ckpt",
         metavar="PRIOR.safetensors",
-        help="prior from g3r-export, or cc0: shipped weights, of both networks, that were trained on data in the public "
-        "domain alone (default: the one shipped)",
+        help="prior from g3r-export, or cc0: shipped weights, of both networks, that were trained on data in the "
+        "public domain alone (default: the one shipped)",
     )
     networks.add_argument(
         "--pose-ckpt",
@@ -203,6 +202,18 @@ def without_names(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     files = [one for value in given if value for one in ([value] if isinstance(value, str) else value)]
     folders = [str(value) for name in FOLDERS if (value := getattr(options, name))]
     return files, [*folders, *map(os.path.dirname, folders)]
+
+
+def told_options(options: argparse.Namespace) -> str:
+    """The options that were given, for the log: files by their names, folders and commands not at all."""
+    told = []
+    for name, value in vars(options).items():
+        if value in (None, False) or name in (*FOLDERS, "mask_command"):
+            continue
+        values = value if isinstance(value, list) else [value]
+        words = [os.path.basename(str(one)) if name in PATHS else str(one) for one in values]
+        told.append(" ".join([f"--{name.replace('_', '-')}", *([] if value is True else words)]))
+    return " ".join(told)
 
 
 def _size(text: str) -> int:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, TextIO
 
 from g3r.cli.time_left import TimeLeft
-from g3r.report.stage_words import COMPILING, DOING, STARTING, line
+from g3r.report.stage_words import COMPILING, DOING, STARTING, WITHOUT_FACTS, line
 from g3r.run.log_file import LogFile
 from g3r.run.reporter import Reporter
 
@@ -48,13 +48,7 @@ class Terminal(Reporter):
     """
 
     def __init__(
-        self,
-        time_left: TimeLeft,
-        log: LogFile,
-        *,
-        quiet: bool = False,
-        verbose: bool = False,
-        compiling_s: float = 0.0,
+        self, time_left: TimeLeft, log: LogFile, *, quiet: bool = False, verbose: bool = False, compiling_s: float = 0.0
     ) -> None:
         self.time_left, self.log, self.quiet = time_left, log, quiet
         self.compiling_s = compiling_s
@@ -92,7 +86,9 @@ class Terminal(Reporter):
     def ended(self, stage: str, found: object, *, resumed: bool = False) -> None:
         """See `Reporter`; says in a line what the stage found."""
         self.time_left.ended(stage)
-        if found is not None:
+        if stage in WITHOUT_FACTS:
+            self.tell(WITHOUT_FACTS[stage], {})
+        elif found is not None:
             from g3r.output.stage_facts import told_of
 
             for name, facts in told_of(found):
@@ -169,7 +165,12 @@ class Terminal(Reporter):
         for width, ratio in ((max(map(len, DOING.values())), None), (None, 1), (5, None), (15, None)):
             bar.add_column(width=width, ratio=ratio, no_wrap=True)
         left = f"about {left_s // 60}:{left_s % 60:02d} left" if left_s else "nearly done"
-        bar.add_row(DOING.get(self.stage, self.stage), ProgressBar(1.0, share, complete_style="cyan", finished_style="cyan"), f"{100 * share:3.0f} %", left)
+        bar.add_row(
+            DOING.get(self.stage, self.stage),
+            ProgressBar(1.0, share, complete_style="cyan", finished_style="cyan"),
+            f"{100 * share:3.0f} %",
+            left,
+        )
         return bar
 
 

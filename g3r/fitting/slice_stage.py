@@ -12,8 +12,8 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
 from g3r.fitting.objective import CloudObjective, ImageTerm, TermLoss
+from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget

@@ -38,14 +38,14 @@ DOING = {
 LINES = {
     "stacks": (LOADING, "{n_stacks:stack}, {n_slices:slice} {thickness} thick"),
     "thickness unknown": (LOADING, "the thickness of {n:stack} is not stated: look at the warnings"),
-    "masks given": (FINDING_MASKS, "your masks are used for {n_given} of {n_stacks:stack}"),
+    "masks given": (FINDING_MASKS, "your {n_given:mask} will be used"),
     "masks found": (FINDING_MASKS, "found in {n_found} of {n_stacks:stack}; look at masks.png"),
     "masks mixed": (FINDING_MASKS, "your masks for {n_given:stack}, found in {n_found:more}; look at masks.png"),
     "whole image": (FINDING_MASKS, "no masks: the whole image is taken for brain"),
     "head found": ("registration", "found, {n_agree} of {n_stacks:stack} agree"),
     "head doubtful": ("registration", "only {n_agree} of {n_stacks:stack} agree"),
     "head alone": ("registration", "a single stack, which no other stack checks"),
-    "placed": ("poses in rounds", "{n_slices:slice} placed, moved {median} mm (at most {most} mm)"),
+    "placed": ("poses in rounds", "{n_slices:slice} show brain, moved by {median} mm, at most {most} mm"),
     "masks refined": ("masks", "compared between stacks, {n_changed} of {n_stacks:mask} differed"),
     "coarse": ("coarse volume", "a blurred volume of {n_slices:slice}"),
     "prior used": ("prior", "used where slices say little"),
@@ -57,18 +57,21 @@ LINES = {
     "rounds undone": ("poses in rounds", "done again, which did not help and was undone"),
     "rounds alone": ("poses in rounds", "done again with the volume so far"),
     "gaussians": ("fit to prior", "made of {n:Gaussian}"),
-    "width narrower": ("held-out slices", "they act {percent} % thinner than stated"),
-    "width wider": ("held-out slices", "they act {percent} % thicker than stated"),
-    "width as stated": ("held-out slices", "they act as thick as stated"),
+    "width narrower": ("held-out slices", "slices act {percent} % thinner than stated"),
+    "width wider": ("held-out slices", "slices act {percent} % thicker than stated"),
+    "width as stated": ("held-out slices", "slices act as thick as stated"),
     "width unclear": ("held-out slices", "no clear answer; the stated one is taken"),
     "fitted": ("fit to slices", "{n_trusted} of {n_slices:slice} fit well"),
     "volume": ("volume", "{voxel} mm voxels, a brain of {volume} ml"),
     "volume unseen": ("volume", "{voxel} mm voxels, a brain of {volume} ml, {unseen} % of it unseen"),
-    "shares": ("prior share", "done, voxel by voxel"),
-    "errors": ("uncertainty", "done, voxel by voxel"),
+    "shares": ("prior share", "prior_share.nii.gz says it of each voxel"),
+    "errors": ("uncertainty", "uncertainty.nii.gz says them of each voxel"),
     "written": (WRITING, "done"),
 }
 """By name: the stage, and what is said of it when it has ended. `{n:stack}` is "1 stack" or "3 stacks"."""
+
+WITHOUT_FACTS = {"prior share": "shares", "uncertainty": "errors"}
+"""Stages of which one thing is said, whatever they found."""
 
 RESUMED = " (from the earlier run)"
 
