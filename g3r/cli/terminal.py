@@ -145,7 +145,7 @@ class Terminal(Reporter):
         """
         self.end_bar()
         for text in lines:
-            print(text)
+            print(text if os.sep in text else _laid_out(text, PLAIN, sys.stdout))  # a path stays in one piece
         self.log.say(verdict)
         print(_laid_out(verdict, COLOURS[word], sys.stdout), flush=True)
 

@@ -44,7 +44,7 @@ def _(found: Registration) -> Iterator[Told]:
         yield "head alone", {}
     else:
         n_agree = sum(one.reliable is not False for one in qualities)
-        name = "head found" if n_agree == len(qualities) else "head doubtful"
+        name = "head found" if n_agree == len(qualities) else "head doubtful" if n_agree else "head lost"
         yield name, {"n_agree": n_agree, "n_stacks": len(qualities)}
     center_mm = slices.header_pose.translation_mm
     motion = centred_on_headers(slices).world_from_header()

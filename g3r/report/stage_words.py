@@ -44,6 +44,7 @@ LINES = {
     "whole image": (FINDING_MASKS, "no masks: the whole image is taken for brain"),
     "head found": ("registration", "found, {n_agree} of {n_stacks:stack} agree"),
     "head doubtful": ("registration", "only {n_agree} of {n_stacks:stack} agree"),
+    "head lost": ("registration", "not found: the {n_stacks:stack} do not agree"),
     "head alone": ("registration", "a single stack, which no other stack checks"),
     "placed": ("poses in rounds", "{n_slices:slice} show brain, moved by {median} mm, at most {most} mm"),
     "masks refined": ("masks", "compared between stacks, {n_changed} of {n_stacks:mask} differed"),
