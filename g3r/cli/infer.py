@@ -24,7 +24,7 @@ from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options, told_options, without_names
 from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
 from g3r.cli.terminal import PROGRAM, Terminal
-from g3r.cli.time_left import COMPILING_S, TimeLeft, expected_seconds, needs_compiling
+from g3r.cli.time_left import TimeLeft, expected_seconds, needs_compiling
 from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
 from g3r.run.log_file import LOG_NAME, LogFile
@@ -60,12 +60,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _terminal(options: argparse.Namespace) -> Terminal:
     """The terminal of this run, with the time that it will probably take."""
     compiling = needs_compiling() and not options.dry_run
-    time_left = TimeLeft(expected_seconds(options, compiling=compiling))
+    expected_s, compiled_s = (expected_seconds(options, compiling=one) for one in (compiling, False))
     log = LogFile(*without_names(options))
     log.say(f"{PROGRAM} {__version__}, Python {platform.python_version()}, {platform.system()}, {os.cpu_count()} cores")
     log.say(f"options: {told_options(options)}")
-    compiling_s = sum(COMPILING_S.get(stage, 0.0) for stage in time_left.expected_s) if compiling else 0.0
-    return Terminal(time_left, log, quiet=options.quiet, verbose=options.verbose, compiling_s=compiling_s)
+    compiling_s = sum(expected_s.values()) - sum(compiled_s.values())
+    return Terminal(TimeLeft(expected_s), log, quiet=options.quiet, verbose=options.verbose, compiling_s=compiling_s)
 
 
 def _failed(line: str, exit_code: int) -> int:

@@ -39,8 +39,17 @@ EXPECTED_S = {
 }
 """The same of each preset, with all programs compiled, by stage in their order."""
 
-COMPILING_S = {"registration": 9.0, "coarse volume": 1.0, "poses in rounds": 27.0, "prior": 1.0}
+COMPILING_S = {
+    "registration": 9.0,
+    "coarse volume": 1.0,
+    "poses in rounds": 27.0,
+    "fit to prior": 3.0,
+    "held-out slices": 2.0,
+}
 """What stages take longer where numba has nothing compiled yet."""
+
+COMPILING_FIT_S = 22.0
+"""What the fit to the slices takes longer where no round has compiled it before."""
 
 MASK_S = 8.0
 """For the network to find the brain in one stack."""
@@ -87,6 +96,8 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_PRIOR}
     if compiling:
         stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
+        if "poses in rounds" not in stages:
+            stages["fit to slices"] += COMPILING_FIT_S
     if options.time_budget:
         shorter = max(options.time_budget, 1.0) / sum(stages.values())
         stages = {name: seconds * shorter for name, seconds in stages.items()}

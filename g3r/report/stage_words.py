@@ -76,7 +76,7 @@ WITHOUT_FACTS = {"prior share": "shares", "uncertainty": "errors"}
 
 RESUMED = " (from the earlier run)"
 
-COMPILING = "first run on this machine: programs are compiled once, about {seconds} s more"
+COMPILING = "first run on this machine: programs are compiled once, about {seconds} s"
 
 
 class Count(int):

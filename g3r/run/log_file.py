@@ -73,7 +73,9 @@ class LogFile(logging.Handler):
     def without_folders(self, text: str) -> str:
         """A text in which paths are names of files."""
         for folder in sorted(self.hidden, key=len, reverse=True):
-            text = text.replace(folder, "").replace(folder.rstrip(os.sep), "DIR")
+            whole = re.escape(folder.rstrip(os.sep))
+            text = re.sub(rf"(?<![\w./-]){whole}[/\\]+(?=[^\s/])", "", text)  # a name may be a part of a word
+            text = re.sub(rf"(?<![\w./-]){whole}(?![\w.-])", "DIR", text)
         return ABSOLUTE.sub("", text)
 
     def keep_in(self, folder: Path) -> None:

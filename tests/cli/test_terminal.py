@@ -148,7 +148,12 @@ def test_the_bar_ends_when_everything_is_written(
 ) -> None:
     there: list[set[str]] = []
     end = terminal.Terminal.end_bar
-    monkeypatch.setattr(terminal.Terminal, "end_bar", lambda self: (there.append(names(tmp_path)), end(self))[1])
+
+    def look(self: terminal.Terminal) -> None:
+        there.append(names(tmp_path))
+        end(self)
+
+    monkeypatch.setattr(terminal.Terminal, "end_bar", look)
     assert main(case.arguments(tmp_path / "out")) == 0
     assert there[0] == {"out"}
 
