@@ -44,10 +44,11 @@ class LogFile(logging.Handler):
 
     def hide(self, folders: Iterable[str]) -> None:
         """Leave some more folders out, however they are written."""
-        spelled = (
-            one for folder in folders if folder for one in (folder, os.path.abspath(folder), os.path.realpath(folder))
-        )
-        self.hidden |= {one.rstrip(os.sep) + os.sep for one in spelled if one.strip("./\\")}
+        for folder in folders:
+            if not folder or "\0" in folder:  # that no file can have: it is refused later
+                continue
+            spelled = (folder, os.path.abspath(folder), os.path.realpath(folder))
+            self.hidden |= {one.rstrip(os.sep) + os.sep for one in spelled if one.strip("./\\")}
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record, and write it where there is a file."""
