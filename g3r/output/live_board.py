@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import singledispatchmethod
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +23,8 @@ from g3r.geometry import VolumeGrid
 from g3r.output.mixture import FinishedVolume
 from g3r.registration import Registration
 from g3r.run.reporter import Reporter
+
+logger = logging.getLogger(__name__)
 
 SLICES_EVERY = 5
 """Steps of a fit between two looks at its slices."""
@@ -61,6 +65,7 @@ class LiveBoard(Reporter):
         self._summary, self._value = Summary, Summary.Value
         self.writer = SummaryWriter(str(folder))
         self.stage, self.n_stages = "", 0
+        self.works = True
         self.begun_s = self.stage_begun_s = time.monotonic()
         self.planes: Planes | None = None
         self.top = 1.0
@@ -73,7 +78,8 @@ class LiveBoard(Reporter):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.writer.close()
+        with self._as_long_as_it_works():
+            self.writer.close()
 
     def begun(self, stage: str) -> None:
         """See `Reporter`."""
@@ -83,14 +89,32 @@ class LiveBoard(Reporter):
         """See `Reporter`; writes the seconds of the stage, and what it found."""
         self.stage = str(stage)
         now = time.monotonic()
-        if not resumed:
-            self._scalars("seconds", {self.stage: now - self.stage_begun_s, "all": now - self.begun_s}, self.n_stages)
-        self.n_stages += 1
-        self._write(found)
-        self._flush()
+        with self._as_long_as_it_works():
+            if not resumed:
+                seconds = {self.stage: now - self.stage_begun_s, "all": now - self.begun_s}
+                self._scalars("seconds", seconds, self.n_stages)
+            self.n_stages += 1
+            self._write(found)
+            self._flush()
 
     def __call__(self, moment: FitMoment) -> None:
         """A step of a fit."""
+        with self._as_long_as_it_works():
+            self._step(moment)
+
+    @contextmanager
+    def _as_long_as_it_works(self) -> Iterator[None]:
+        """Where the disk is full, the run goes on without TensorBoard."""
+        try:
+            yield
+        except OSError as error:
+            if self.works:
+                logger.warning("--tensorboard: cannot be written (%s); the run goes on without it", error.strerror)
+            self.works = False
+
+    def _step(self, moment: FitMoment) -> None:
+        if not self.works:
+            return
         passed_s = time.monotonic() - self.stage_begun_s
         figures = {f"loss/{name}": value for name, value in moment.loss.items()}
         figures |= {"seconds": passed_s, "Gaussians": len(moment.parameters)}

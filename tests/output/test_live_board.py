@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,6 +74,20 @@ def test_what_came_before_a_failure_is_there(case: SmallCase, tmp_path: Path, mo
     monkeypatch.setattr(LiveBoard, "__call__", look)
     assert main(case.arguments(tmp_path / "out", "--tensorboard", str(tmp_path / "board"))) == 0
     assert seen[:10] == list(range(1, 11))
+
+
+def test_a_full_disk_ends_the_watching_and_not_the_run(
+    case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from torch.utils.tensorboard import SummaryWriter
+
+    def full(self: SummaryWriter) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(SummaryWriter, "flush", full)
+    assert main(case.arguments(tmp_path / "out", "--tensorboard", str(tmp_path / "board"))) == 0
+    assert (tmp_path / "out" / "volume.nii.gz").read_bytes() == case.volume
+    assert caplog.text.count("the run goes on without it") == 1
 
 
 @pytest.mark.parametrize("flip", [1, -1])
