@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     stop_request = StopRequest()
     try:
-        with stop_request, _terminal(options) as terminal:
+        with stop_request, _terminal(options, stop_request) as terminal:
             return _run(options, stop_request, terminal)
     except KeyboardInterrupt:
         line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(*line_and_code(error))
 
 
-def _terminal(options: argparse.Namespace) -> Terminal:
+def _terminal(options: argparse.Namespace, stop_request: StopRequest) -> Terminal:
     """The terminal of this run, with the time that it will probably take."""
     compiling = needs_compiling() and not options.dry_run
     expected_s, compiled_s = (expected_seconds(options, compiling=one) for one in (compiling, False))
@@ -65,7 +65,14 @@ def _terminal(options: argparse.Namespace) -> Terminal:
     log.say(f"{PROGRAM} {__version__}, Python {platform.python_version()}, {platform.system()}, {os.cpu_count()} cores")
     log.say(f"options: {told_options(options)}")
     compiling_s = sum(expected_s.values()) - sum(compiled_s.values())
-    return Terminal(TimeLeft(expected_s), log, quiet=options.quiet, verbose=options.verbose, compiling_s=compiling_s)
+    return Terminal(
+        TimeLeft(expected_s),
+        log,
+        quiet=options.quiet,
+        verbose=options.verbose,
+        compiling_s=compiling_s,
+        stop_request=stop_request,
+    )
 
 
 def _failed(line: str, exit_code: int) -> int:

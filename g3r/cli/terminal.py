@@ -16,9 +16,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, TextIO
 
 from g3r.cli.time_left import TimeLeft
-from g3r.report.stage_words import COMPILING, DOING, STARTING, WITHOUT_FACTS, line
+from g3r.report.stage_words import COMPILING, DOING, STARTING, STOPPING, WITHOUT_FACTS, line
 from g3r.run.log_file import LogFile
 from g3r.run.reporter import Reporter
+from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -45,13 +46,21 @@ class Terminal(Reporter):
         quiet: whether only warnings and errors are shown.
         verbose: whether the developers' detail is shown, too.
         compiling_s: seconds that it takes to compile programs, once; 0 where they are compiled.
+        stop_request: whether the run is to end early; None where nobody can ask for that.
     """
 
     def __init__(
-        self, time_left: TimeLeft, log: LogFile, *, quiet: bool = False, verbose: bool = False, compiling_s: float = 0.0
+        self,
+        time_left: TimeLeft,
+        log: LogFile,
+        *,
+        quiet: bool = False,
+        verbose: bool = False,
+        compiling_s: float = 0.0,
+        stop_request: StopRequest | None = None,
     ) -> None:
         self.time_left, self.log, self.quiet = time_left, log, quiet
-        self.compiling_s = compiling_s
+        self.compiling_s, self.stop_request = compiling_s, stop_request
         self.stage = STARTING
         self._level = logging.DEBUG if verbose else logging.WARNING
         self._held: list[tuple[str, str]] | None = None
@@ -165,12 +174,10 @@ class Terminal(Reporter):
         for width, ratio in ((max(map(len, DOING.values())), None), (None, 1), (5, None), (15, None)):
             bar.add_column(width=width, ratio=ratio, no_wrap=True)
         left = f"about {left_s // 60}:{left_s % 60:02d} left" if left_s else "nearly done"
-        bar.add_row(
-            DOING.get(self.stage, self.stage),
-            ProgressBar(1.0, share, complete_style="cyan", finished_style="cyan"),
-            f"{100 * share:3.0f} %",
-            left,
-        )
+        is_stopping = self.stop_request is not None and self.stop_request.is_requested()
+        doing = STOPPING if is_stopping else DOING.get(self.stage, self.stage)
+        progress = ProgressBar(1.0, share, complete_style="cyan", finished_style="cyan")
+        bar.add_row(doing, progress, f"{100 * share:3.0f} %", left)
         return bar
 
 

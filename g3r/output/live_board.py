@@ -32,7 +32,7 @@ SLICES_EVERY = 5
 SECTION_EVERY = 10
 """Steps between two sections of its volume, at least."""
 
-SECTION_SHARE = 0.01
+SECTION_SHARE = 0.005
 """Sections take no more than this share of the fit's time: after a dear one the next is further away."""
 
 FLUSH_S = 0.5

@@ -79,6 +79,10 @@ RESUMED = " (from the earlier run)"
 COMPILING = "first run on this machine: programs are compiled once, about {seconds} s"
 
 
+STOPPING = "stopping after this step"
+"""Beside the bar, from a first Ctrl-C on."""
+
+
 class Count(int):
     """A number of things: formatted with their name, it says one or several of them."""
 
