@@ -167,8 +167,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if len(record.stacks) == 1:
         yield "single stack", {}
     if found := [stack.name for stack in record.stacks if stack.mask_from in ("automatic", "command")]:
-        one = len(found) == 1
-        facts = {"masks": "mask" if one else "masks", "were": "was" if one else "were", "stacks": _listed(found)}
+        masks, were = ("mask", "was") if len(found) == 1 else ("masks", "were")
+        facts: dict[str, object] = {"masks": masks, "were": were, "stacks": _listed(found)}
         yield "masks found", facts
     if whole := [stack.name for stack in record.stacks if stack.mask_from in ("whole image", "empty background")]:
         yield "whole image", {"stacks": _listed(whole)}
