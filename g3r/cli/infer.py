@@ -238,9 +238,6 @@ def _conclude(result: ReconstructionResult, folder: Path, terminal: Terminal) ->
     found = sorted({stack.mask_from for stack in result.record.stacks} - {"file"})
     if found:
         lines.append(f"masks:   {' and '.join(found)}: look at {folder / MASK_PICTURE}")
-    unseen = result.record.unseen.line() if result.record.unseen else None
-    if unseen:
-        lines.append(f"unseen:  {unseen}")
     lines.append(f"details: {folder / LOG_NAME}")
     verdict = verdict_of(result.record)
     terminal.conclude(lines, verdict.word, f"verdict: {verdict.line()}")
