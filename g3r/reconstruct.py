@@ -16,10 +16,11 @@ from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
 from g3r.fitting.mask_agreement import REFINED
+from g3r.fitting.observer import FitObserver
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import distillation_target, fit_to_prior
-from g3r.fitting.slice_stage import FitObserver, SliceFit, fit_slices
+from g3r.fitting.slice_stage import SliceFit, fit_slices
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
 from g3r.output.assemble import StageResults, assemble
@@ -47,7 +48,7 @@ class GaussianReconstructor:
         settings: see `ReconstructionSettings`, or the name of a preset.
         pose_checkpoint: pose network and atlas template; when None those of the set that `checkpoint` names.
         device: of the networks, see `on_device`.
-        observer: sees the cloud during the fit to the slices.
+        observer: sees both stages of the fit.
 
     Raises:
         InputError: an unreadable or mismatched checkpoint, an unknown preset, a resolution outside 0.3-3 mm, no GPU.
@@ -91,7 +92,7 @@ class GaussianReconstructor:
             registration: what `register_stacks` found for the same stacks, to fit several times to one registration;
                 found here when None. Slices of a single stack still move to the prior volume afterwards.
             plan: settings and deadlines; the reconstructor's settings without a deadline when None.
-            run: stage store, stop request and progress. A stop request during the fit gives the volume so far
+            run: stage store, stop request and reporter. A stop request during the fit gives the volume so far
                 (`record.partial`); else `KeyboardInterrupt` passes through.
 
         Raises:
@@ -158,8 +159,8 @@ class GaussianReconstructor:
         """The slices in their poses."""
         if given is not None:
             run.notes.append("registration was given, not estimated here")
-            with run.clock(Stage.REGISTRATION):
-                poses = with_pixels_of(slices, given)
+            with run.timed(Stage.REGISTRATION) as tell:
+                tell(poses := with_pixels_of(slices, given))
         else:
             deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
             asked = plan.settings.registration
@@ -174,21 +175,19 @@ class GaussianReconstructor:
         """Stacks and slices with masks that were found once more, with what registration knows."""
         if not any(stack.mask_source == REFINED for stack in stacks):
             return stacks, poses
-        with run.clock(Stage.MASKS):
-            refined = self.subject_prior.refined_masks(stacks, poses, intensity)
+        with run.timed(Stage.MASKS) as tell:
+            tell(refined := self.subject_prior.refined_masks(stacks, poses, intensity))
         run.notes += refined.notes
         return refined.stacks, refined.poses
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
         plan.for_prior(run.clock.seconds[Stage.COARSE])
-        run.report(Stage.PRIOR)(0, 1)
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
         # V_prior of several stacks is made anew after each round, the last time with all views
         is_replaced = n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) > 0
         views = 1 if is_replaced else plan.settings.prior_views
         prior = run.stage(Stage.PRIOR, lambda: self.subject_prior.of(volumes, poses, views, tiling))
-        run.report(Stage.PRIOR)(1, 1)
         if n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
@@ -239,6 +238,7 @@ class GaussianReconstructor:
                 rng=stage_rng(settings.seed, Stage.FIT_TO_PRIOR),
                 progress=run.report(Stage.FIT_TO_PRIOR),
                 deadline=deadline,
+                observer=self.observer,
             )
 
         return run.droppable_stage(Stage.FIT_TO_PRIOR, fit)

@@ -9,6 +9,7 @@ from typing import Any
 from g3r.acquisition.planes import Slices
 from g3r.bench.scores import Quality, cloud_psnr_db, quality
 from g3r.evaluation.case import SimulatedCase, pose_table
+from g3r.fitting.observer import FitMoment
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import RigidPose
 from g3r.planning.presets import ReconstructionSettings, changed
@@ -65,13 +66,15 @@ class FitWatch:
         self.pose: list[RigidPose] = []
         self.spent = 0.0
 
-    def __call__(self, step: int, cloud: GaussianCloud, pose: RigidPose) -> None:
-        """Keep a copy; the optimiser goes on writing into the cloud's tensors."""
+    def __call__(self, moment: FitMoment) -> None:
+        """Keep a copy of a moment of the fit to the slices."""
+        if moment.slices is None:
+            return
         now = time.perf_counter()
-        self.step.append(step)
+        self.step.append(moment.step)
         self.seconds.append(now - self.spent)
-        self.cloud.append(GaussianCloud.of([p.clone() for p in cloud.parameters], cloud.origin_mm))
-        self.pose.append(pose)
+        self.cloud.append(moment.cloud())
+        self.pose.append(moment.slices.pose(moment.parameters.origin_mm))
         self.spent += time.perf_counter() - now
 
     def seconds_before_end(self) -> list[float]:

@@ -161,7 +161,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
     class Watch:
         every = 1
 
-        def __call__(self, step: int, cloud: object, pose: object) -> None:
+        def __call__(self, moment: object) -> None:
             moments.append(time.process_time())
 
     settings = SliceStageSettings(n_steps=TIMED_STEPS, amplitude_iterations=0)

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-apply`: other echoes, contrasts or label maps of the same slices, in the poses of a finished run."""
 
 from __future__ import annotations
@@ -6,6 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from g3r.cli.completion import parsed
 from g3r.cli.reuse_options import add_file_options, check_output_file, reuse_parser, told
 
 PROG = "g3r-apply"
@@ -36,7 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = build_parser()
-    options = parser.parse_args(argv)
+    options = parsed(parser, argv)
     if options.no_gain and options.labels:
         parser.error("--no-gain and --labels exclude each other: labels have no gain")
     return told(PROG, lambda: _apply(options))

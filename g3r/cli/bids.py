@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-bids`: every session of a BIDS data set to a derivative data set, as BIDS Apps are called."""
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r._version import __version__
+from g3r.cli.completion import parsed
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
@@ -73,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
     parser = build_parser()
-    options = parser.parse_args(words[:cut])
+    options = parsed(parser, words[:cut])
     if options.jobs is not None and options.jobs < 1:
         parser.error(f"--jobs {options.jobs}; expected at least 1")
     infer = _infer_options(parser, words[cut + 1 :])

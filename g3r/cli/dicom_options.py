@@ -43,7 +43,7 @@ class DicomInput:
     notes: list[str] = field(default_factory=list)
 
 
-def add_input_options(parser: argparse.ArgumentParser) -> None:
+def add_input_options(parser: argparse._ActionsContainer) -> None:
     """Where the stacks are: NIfTI files, or a folder of DICOM."""
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--stacks", nargs="+", metavar="NIFTI", help="one file per stack")
@@ -58,7 +58,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_dicom_output_options(parser: argparse.ArgumentParser) -> None:
+def add_dicom_output_options(parser: argparse._ActionsContainer) -> None:
     """The volume as DICOM."""
     parser.add_argument(
         "--dicom-out",

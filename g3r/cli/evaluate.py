@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-evaluate`: score a reconstruction against the truth, or by what it predicts of a stack that was held out."""
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from g3r._version import __version__
 from g3r.cli import held_out
+from g3r.cli.completion import parsed
 from g3r.cli.failures import missing_extra
 from g3r.errors import G3RError, InputError
 
@@ -46,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code (0 done, 2 usage, 3 bad input)."""
     parser = build_parser()
-    options = parser.parse_args(argv)
+    options = parsed(parser, argv)
     if (options.poses is None) != (options.slices is None):
         parser.error("--poses and --slices belong together")
     predicts = held_out.check_options(parser, options)

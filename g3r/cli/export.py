@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-export`: turn a training checkpoint of the prior, the pose or the mask network into the file that is used."""
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g3r._version import __version__
+from g3r.cli.completion import parsed
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE.safetensors", type=Path, help="file to write")
     parser.add_argument("--data-description", metavar="TEXT", help="training data in words, kept in the file")
     parser.add_argument("--force", action="store_true", help="replace FILE.safetensors if it exists")
-    arguments = parser.parse_args(argv)
+    arguments = parsed(parser, argv)
     try:
         model = export(arguments.run, arguments.file, arguments.data_description, replace=arguments.force)
     except G3RError as error:

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-export-poses`: the slice poses of a finished run as files of other programs."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from g3r.cli.completion import parsed
 from g3r.cli.reuse_options import reuse_parser, told
 
 PROG = "g3r-export-poses"
@@ -35,7 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = build_parser()
-    options = parser.parse_args(argv)
+    options = parsed(parser, argv)
     if options.stacks and options.format != "nesvor":
         parser.error(f"--stacks and --format {options.format} exclude each other: such files hold no pixels")
     return told(PROG, lambda: _export(options))

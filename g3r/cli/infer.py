@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-infer`: motion-corrupted stacks in, one volume with maps, poses and a record out."""
 
 from __future__ import annotations
@@ -7,42 +8,46 @@ import atexit
 import gc
 import io
 import logging
+import os
+import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g3r._version import __version__
 from g3r.cli.dicom_options import stacks_on_disk, write_dicom
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
-from g3r.cli.infer_options import parsed_options
+from g3r.cli.infer_options import parsed_options, told_options, without_names
 from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
-from g3r.cli.terminal import log_held_back, progress_bars
+from g3r.cli.terminal import PROGRAM, Terminal
+from g3r.cli.time_left import TimeLeft, expected_seconds, needs_compiling
 from g3r.errors import InputError
+from g3r.report.stage_words import WRITING
+from g3r.run.log_file import LOG_NAME, LogFile
 from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from g3r.output.result import ReconstructionResult
     from g3r.planning.plan import Plan
+    from g3r.run.output_folder import OutputFolder
+    from g3r.run.reporter import Reporter
     from g3r.run.stage_store import StageStore
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parsed_options(argv)
-    logging.basicConfig(
-        level=logging.WARNING if options.quiet else logging.INFO, format="g3r-infer: %(message)s", stream=sys.stderr
-    )
-    for chatty in ("numba", "matplotlib", "PIL"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     stop_request = StopRequest()
     try:
-        with stop_request:
-            return _run(options, stop_request)
+        with stop_request, _terminal(options, stop_request) as terminal:
+            return _run(options, stop_request, terminal)
     except KeyboardInterrupt:
         line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
         return _failed(line, stop_request.exit_code)
@@ -52,8 +57,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(*line_and_code(error))
 
 
+def _terminal(options: argparse.Namespace, stop_request: StopRequest) -> Terminal:
+    """The terminal of this run, with the time that it will probably take."""
+    compiling = needs_compiling() and not options.dry_run
+    expected_s, compiled_s = (expected_seconds(options, compiling=one) for one in (compiling, False))
+    log = LogFile(*without_names(options))
+    log.say(f"{PROGRAM} {__version__}, Python {platform.python_version()}, {platform.system()}, {os.cpu_count()} cores")
+    log.say(f"options: {told_options(options)}")
+    compiling_s = sum(expected_s.values()) - sum(compiled_s.values())
+    return Terminal(
+        TimeLeft(expected_s),
+        log,
+        quiet=options.quiet,
+        verbose=options.verbose,
+        compiling_s=compiling_s,
+        stop_request=stop_request,
+    )
+
+
 def _failed(line: str, exit_code: int) -> int:
-    print(f"g3r-infer: {line}", file=sys.stderr)
+    print(f"{PROGRAM}: {line}", file=sys.stderr)
     return exit_code
 
 
@@ -64,56 +87,89 @@ def _way_on(folder: Path) -> str:
     return "; --resume goes on from the last finished stage" if kept else ""
 
 
-def _run(options: argparse.Namespace, stop_request: StopRequest) -> int:
+def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Terminal) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
-    with log_held_back(), stacks_on_disk(options, replaces=replaces) as dicom:
-        networks = check_files(options, folder, replaces=replaces)  # before an image is read
-        task = prepared(options, networks)
+    with terminal.held_back():
+        with stacks_on_disk(options, replaces=replaces) as dicom:
+            networks = check_files(options, folder, replaces=replaces)  # before an image is read
+            task = prepared(options, networks, terminal)
+        for name, facts in task.told():
+            terminal.tell(name, facts)
     task = replace(task, warnings=dicom.warnings + task.warnings, notes=dicom.notes)
     for warning in task.warnings:
         logging.getLogger("g3r").warning(warning)
     if options.dry_run:
+        terminal.end_bar()
         return _dry_run(task, folder)
-    result = _reconstructed(options, task, folder, stop_request, replaces=replaces)
-    if options.tensorboard:
-        from g3r.output.tensorboard import write_tensorboard
-
-        write_tensorboard(Path(options.tensorboard), result.record.loss, result.volume, result.mask)
+    result = _reconstructed(options, task, folder, stop_request, terminal, replaces=replaces)
     _warn_of_missed_budget(task.plan)
-    _print_summary(result, folder)
     write_dicom(options, result, dicom)
-    return _interrupted(result, folder, stop_request) if stop_request.is_requested() else 0
+    terminal.end_bar()
+    code = _interrupted(result, folder, stop_request) if stop_request.is_requested() else 0
+    _conclude(result, folder, terminal)
+    return code
 
 
 def _reconstructed(
-    options: argparse.Namespace, task: Task, folder: Path, stop_request: StopRequest, *, replaces: bool
+    options: argparse.Namespace,
+    task: Task,
+    folder: Path,
+    stop_request: StopRequest,
+    terminal: Terminal,
+    *,
+    replaces: bool,
 ) -> ReconstructionResult:
     """Run the reconstruction and write its folder."""
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.context import RunContext
     from g3r.run.output_folder import OutputFolder, check_output_folder
 
-    with progress_bars(quiet=options.quiet) as progress, OutputFolder(folder, OUTPUT_NAMES) as output:
+    with (
+        OutputFolder(folder, OUTPUT_NAMES) as output,
+        _logged(output, terminal.log),
+        _reporter(options, task, terminal) as reporter,
+    ):
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
-        run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, progress=progress)
+        run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, reporter=reporter)
         result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
         result = _with_command(result, options, task)
-        result.save(folder, replace=replaces, run=output, also=lambda staged: _write_report(staged, result))
+        terminal.begun(WRITING)
+
+        def also(staged: Path) -> None:
+            terminal.tell("written", {})
+            terminal.log.copy_to(staged)
+
+        result.save(folder, replace=replaces, run=output, also=also)
+        terminal.log.go_on_in(folder)
         if not result.record.partial:
             output.forget_stages()
     return result
 
 
-def _write_report(folder: Path, result: ReconstructionResult) -> None:
-    """Write the page; without it the volume is no worse, so its failure is told and no more."""
-    from g3r.report.page import write_report
-
+@contextmanager
+def _logged(output: OutputFolder, log: LogFile) -> Iterator[None]:
+    """Keep the log beside the stages until there is a result; a failure is logged with its trace."""
+    log.keep_in(output.staging)
     try:
-        write_report(folder, result.slices)
-    except EXPECTED as error:
-        reason = str(error).replace(str(folder), "")
-        logging.getLogger("g3r").warning("report.html could not be written (%s); try g3r-report DIR", reason)
+        yield
+    except BaseException:
+        logging.getLogger("g3r").debug("the run failed", exc_info=True)
+        raise
+
+
+@contextmanager
+def _reporter(options: argparse.Namespace, task: Task, terminal: Terminal) -> Iterator[Reporter]:
+    """Who hears of the stages: the terminal, and TensorBoard where it is asked for."""
+    if not options.tensorboard:
+        yield terminal
+        return
+    from g3r.output.live_board import LiveBoard
+    from g3r.run.reporter import Reporters
+
+    with LiveBoard(Path(options.tensorboard)) as board:
+        task.reconstructor.observer = board
+        yield Reporters([terminal, board])
 
 
 def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
@@ -171,25 +227,20 @@ def _interrupted(result: ReconstructionResult, folder: Path, stop_request: StopR
     return _failed(line, stop_request.exit_code)
 
 
-def _print_summary(result: ReconstructionResult, folder: Path) -> None:
+def _conclude(result: ReconstructionResult, folder: Path, terminal: Terminal) -> None:
+    """Say what there is to look at, and last the verdict."""
     from g3r.output.files import MASK_PICTURE, REPORT_NAME
     from g3r.report.verdict import verdict_of
 
-    seconds = sum(result.record.seconds.values())
-    print(f"volume:  {folder / 'volume.nii.gz'}")
-    print(f"picture: {folder / 'sections.png'}")
+    lines = [f"volume:  {folder / 'volume.nii.gz'}", f"picture: {folder / 'sections.png'}"]
     if (folder / REPORT_NAME).is_file():
-        print(f"report:  {folder / REPORT_NAME}")
+        lines.append(f"report:  {folder / REPORT_NAME}")
     found = sorted({stack.mask_from for stack in result.record.stacks} - {"file"})
     if found:
-        print(f"masks:   {' and '.join(found)}: look at {folder / MASK_PICTURE}")
-    if result.record.registration:
-        print(f"poses:   {result.record.registration.summary}")
-    unseen = result.record.unseen.line() if result.record.unseen else None
-    if unseen:
-        print(f"unseen:  {unseen}")
-    print(f"{len(result.slices)} slices, {len(result.cloud)} Gaussians, {seconds:.0f} s")
-    print(f"verdict: {verdict_of(result.record).line()}")
+        lines.append(f"masks:   {' and '.join(found)}: look at {folder / MASK_PICTURE}")
+    lines.append(f"details: {folder / LOG_NAME}")
+    verdict = verdict_of(result.record)
+    terminal.conclude(lines, verdict.word, f"verdict: {verdict.line()}")
 
 
 def _warn_of_missed_budget(plan: Plan) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 
 from g3r._version import __version__
+from g3r.cli.completion import HelpFormatter, parsed
 from g3r.cli.dicom_options import add_dicom_output_options, add_input_options, check_dicom_options
 from g3r.cli.mask_options import add_mask_options, check_mask_options
 from g3r.planning import PRESET_NAMES
@@ -21,19 +23,52 @@ DEFAULTS = {
 }
 """Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
 
+USAGE = """%(prog)s --stacks NIFTI [NIFTI ...] --output DIR [options]
+       %(prog)s --dicom DIR --output DIR [options]"""
+
+DESCRIPTION = """\
+Reconstruct one isotropic fetal brain volume from stacks of thick slices.
+For research only, not for diagnosis."""
+
+EPILOG = """\
+examples:
+  three stacks; the brain is found, thickness is read from files beside them:
+    g3r-infer --stacks ax.nii.gz cor.nii.gz sag.nii.gz --output out
+
+  with brain masks, slices of 3 mm, as quick as can be:
+    g3r-infer --stacks ax.nii cor.nii --masks ax-mask.nii cor-mask.nii \\
+              --thickness 3 --preset preview --output out
+
+  an examination as the scanner sent it; what would be used is only listed:
+    g3r-infer --dicom examination --output out --dry-run
+
+Look at out/report.html first. The last line says: use, check, or do not use.
+exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out
+of memory, 130 interrupted (Ctrl-C; --resume goes on)"""
+
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """The command's options, in groups."""
     parser = argparse.ArgumentParser(
         prog="g3r-infer",
-        description="Reconstruct one isotropic fetal brain volume from stacks of thick slices. "
-        "For research only, not for diagnosis.",
-        epilog="exit codes: 0 done, 2 usage, 3 bad input or output, 4 numerical failure or out of memory, "
-        "130 interrupted",
+        usage=USAGE,
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+        add_help=False,
     )
-    add_input_options(parser)
-    add_mask_options(parser)
-    parser.add_argument(
+    _add_input(parser)
+    _add_result(parser)
+    _add_effort(parser)
+    _add_networks(parser)
+    _add_saying(parser)
+    return parser
+
+
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    stacks = parser.add_argument_group("stacks")
+    add_input_options(stacks)
+    stacks.add_argument(
         "--thickness",
         nargs="+",
         type=float,
@@ -41,73 +76,106 @@ def build_parser() -> argparse.ArgumentParser:
         help="slice thickness, one for all or one per stack (default: what the JSON sidecar beside each stack says, or "
         "else the distance of slices)",
     )
-    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write")
-    add_dicom_output_options(parser)
-    parser.add_argument(
-        "--ckpt",
-        metavar="PRIOR.safetensors",
-        help="prior from g3r-export (default: the one shipped), or cc0: shipped weights, of both networks, that were "
-        "trained on data in the public domain alone",
+    add_mask_options(parser.add_argument_group("what is brain"))
+
+
+def _add_result(parser: argparse.ArgumentParser) -> None:
+    result = parser.add_argument_group("result")
+    result.add_argument("--output", required=True, metavar="DIR", help="folder to write")
+    result.add_argument("--force", action="store_true", help="replace an earlier result in --output")
+    result.add_argument(
+        "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
     )
-    parser.add_argument(
-        "--pose-ckpt",
-        metavar="POSE.safetensors",
-        help="pose network and atlas template from g3r-export, or cc0 (default: shipped, of the set that --ckpt names)",
-    )
-    parser.add_argument(
+    result.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default: 0.8)")
+    result.add_argument(
         "--space",
         choices=("standard", "scanner"),
-        help="standard orientation (RAS, mid-sagittal plane in the middle; the default) or scanner space",
+        help="standard orientation (RAS, mid-sagittal plane in the middle) or scanner space (default: standard)",
     )
-    parser.add_argument(
+    result.add_argument(
         "--anatomy",
         choices=ANATOMIES,
-        help="fetal-brain (the default), or generic: anything else, with neither atlas, networks nor standard space",
+        help="fetal-brain, or generic: anything else, with neither atlas, networks nor standard space (default: "
+        "fetal-brain)",
     )
-    parser.add_argument(
+    result.add_argument(
         "--unseen",
         choices=("fill", "blank"),
-        help="what to show of the brain where no slice looked: an estimate (fill, the default) or zeros (blank)",
+        help="what to show of the brain where no slice looked: an estimate, or zeros (default: fill)",
     )
-    parser.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
-    parser.add_argument("--resolution", type=float, metavar="MM", help="voxel size (default 0.8)")
-    parser.add_argument("--preset", choices=PRESET_NAMES, help="speed against accuracy (default: balanced)")
-    parser.add_argument(
+    result.add_argument(
+        "--keep-header-text",
+        action="store_true",
+        help="carry free text of the stacks' headers (may name patients, dates) into the results (default: leave out)",
+    )
+    add_dicom_output_options(result)
+
+
+def _add_effort(parser: argparse.ArgumentParser) -> None:
+    effort = parser.add_argument_group("speed against accuracy")
+    effort.add_argument(
+        "--preset", choices=PRESET_NAMES, help="from quick to thorough (default: balanced, about half a minute)"
+    )
+    effort.add_argument(
         "--time-budget",
         type=float,
         metavar="SECONDS",
         help="in place of --preset: the best that can be done from the start of the command to its files",
     )
-    parser.add_argument(
+    effort.add_argument(
         "--config",
         metavar="RUN.json",
         help="settings and threads of an earlier result, in place of the options that decide them",
     )
-    parser.add_argument("--seed", type=int, help="of every random choice (default 0)")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    effort.add_argument("--seed", type=int, metavar="N", help="of every random choice (default: 0)")
+    effort.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
     devices = ("auto", "cpu", "cuda")
-    parser.add_argument("--device", choices=devices, default="auto", help="of the networks (default: a GPU if found)")
-    parser.add_argument("--max-memory", type=_size, metavar="SIZE", help="as 2G or 1500M; what does not fit is refused")
-    parser.add_argument("--tensorboard", metavar="DIR", help="write loss curves and sections for TensorBoard")
-    parser.add_argument(
-        "--keep-header-text",
-        action="store_true",
-        help="carry free text of the stacks' headers (may name patients, dates) into the results",
+    effort.add_argument(
+        "--device", choices=devices, default="auto", help="of the networks (default: auto, a GPU if found)"
     )
-    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
-    parser.add_argument("--force", action="store_true", help="replace an earlier result in --output")
-    parser.add_argument(
-        "--resume", action="store_true", help="go on from the last finished stage of a run that was cut short"
+    effort.add_argument(
+        "--max-memory",
+        type=_size,
+        metavar="SIZE",
+        help="as 2G or 1500M; what does not fit is refused (default: what is free)",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars, warnings only")
-    return parser
+
+
+def _add_networks(parser: argparse.ArgumentParser) -> None:
+    networks = parser.add_argument_group("networks")
+    networks.add_argument("--no-prior", action="store_true", help="reconstruct without the prior network")
+    networks.add_argument(
+        "--ckpt",
+        metavar="PRIOR.safetensors",
+        help="prior from g3r-export, or cc0: shipped weights, of both networks, that were trained on data in the "
+        "public domain alone (default: the one shipped)",
+    )
+    networks.add_argument(
+        "--pose-ckpt",
+        metavar="POSE.safetensors",
+        help="pose network and atlas template from g3r-export, or cc0 (default: shipped, of the set that --ckpt names)",
+    )
+
+
+def _add_saying(parser: argparse.ArgumentParser) -> None:
+    saying = parser.add_argument_group("what is said")
+    saying.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
+    how_much = saying.add_mutually_exclusive_group()
+    how_much.add_argument("--quiet", action="store_true", help="no bar and no stages: warnings and the result only")
+    how_much.add_argument(
+        "--verbose", action="store_true", help="developers' detail, too (log.txt in the output always has it)"
+    )
+    saying.add_argument(
+        "--tensorboard", metavar="DIR", help="write losses, poses and sections while the fit runs, for TensorBoard"
+    )
+    saying.add_argument("--version", action="version", version=f"%(prog)s {__version__}", help="say it and end")
+    saying.add_argument("-h", "--help", action="help", help="say this and end")
 
 
 def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """The options as they hold, defaults filled in; ends the program with 2 where they cannot go together."""
     parser = build_parser()
-    options = parser.parse_args(argv)
+    options = parsed(parser, argv)
     check_dicom_options(parser, options)
     n_stacks = len(options.stacks)
     check_mask_options(parser, options)
@@ -148,6 +216,31 @@ def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace)
     if given:
         parser.error(f"--anatomy generic and {', '.join(given)} exclude each other: it uses no network and no atlas")
     options.space = "scanner"
+
+
+PATHS = ("stacks", "masks", "config", "ckpt", "pose_ckpt", "mask_ckpt")
+FOLDERS = ("output", "dicom", "dicom_out", "dicom_reference", "tensorboard")
+"""Options that name files, and folders."""
+
+
+def without_names(options: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """What the log must not name: files, whose folders are left out, and folders."""
+    given = [getattr(options, name) for name in PATHS]
+    files = [one for value in given if value for one in ([value] if isinstance(value, str) else value)]
+    folders = [str(value) for name in FOLDERS if (value := getattr(options, name))]
+    return files, [*folders, *map(os.path.dirname, folders)]
+
+
+def told_options(options: argparse.Namespace) -> str:
+    """The options that were given, for the log: files by their names, folders and commands not at all."""
+    told = []
+    for name, value in vars(options).items():
+        if value in (None, False) or name in (*FOLDERS, "mask_command"):
+            continue
+        values = value if isinstance(value, list) else [value]
+        words = [os.path.basename(str(one)) if name in PATHS else str(one) for one in values]
+        told.append(" ".join([f"--{name.replace('_', '-')}", *([] if value is True else words)]))
+    return " ".join(told)
 
 
 def _size(text: str) -> int:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r.cli.mask_options import given_masks, mask_weights_path, masked_stacks, needs_network
 from g3r.errors import InputError
+from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING
 
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import Stack
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from g3r.planning.plan import Plan
     from g3r.planning.presets import ReconstructionSettings
     from g3r.reconstruct import GaussianReconstructor
+    from g3r.run.reporter import Reporter
 
 STARTED_S = time.monotonic()
 """When the command began; what Python itself needs before is a few hundredths of a second."""
@@ -51,6 +54,24 @@ class Task:
     plan: Plan
     warnings: list[str]
     notes: list[str] = field(default_factory=list)
+
+    def told(self) -> Iterator[tuple[str, dict[str, object]]]:
+        """Lines of `stage_words` on the input, and what is filled in."""
+        n_stacks, sources = len(self.stacks), [stack.mask_source for stack in self.stacks]
+        n_given = sources.count("file")
+        n_found = n_stacks - n_given - sources.count("whole image") - sources.count("empty background")
+        facts: dict[str, object] = {"n_given": n_given, "n_found": n_found, "n_stacks": n_stacks}
+        if not n_given and not n_found:
+            yield "whole image", {}
+        elif n_given and n_found:
+            yield "masks mixed", facts
+        else:
+            yield "masks found" if n_found else "masks given", facts
+        thickness = " and ".join(f"{mm:g}" for mm in sorted({stack.thickness_mm for stack in self.stacks}))
+        n_slices = sum(stack.image.shape[2] for stack in self.stacks)
+        yield "stacks", {"n_stacks": n_stacks, "n_slices": n_slices, "thickness": f"{thickness} mm"}
+        if n := sum(stack.origin.thickness_from == "spacing" for stack in self.stacks):
+            yield "thickness unknown", {"n": n}
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
@@ -85,15 +106,23 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     return {kind: read_weights(path, kind) for kind, path in networks.items()}
 
 
-def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile]) -> Task:
+def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], reporter: Reporter) -> Task:
     """Read and check everything that the run needs.
+
+    Args:
+        options: of g3r-infer.
+        networks: files of networks, by kind.
+        reporter: is told what is under way.
 
     Raises:
         InputError: something in the files or options cannot be used.
     """
     earlier = _earlier(options)
+    reporter.begun(FINDING_MASKS)
     masked = masked_stacks(options, networks.get("mask"))
+    reporter.begun(LOADING)
     stacks = _load(options, masked, earlier)
+    reporter.begun(PREPARING)
     from g3r.planning.memory_limit import plan_for_stacks
     from g3r.reconstruct import GaussianReconstructor
     from g3r.run.machine import use_threads

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-mask`: brain masks of stacks, without a reconstruction."""
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r._version import __version__
+from g3r.cli.completion import parsed
 from g3r.cli.failures import EXPECTED, line_and_code
 from g3r.cli.mask_options import add_masker_options, check_masker_options, mask_weights_path, masker_of
 from g3r.errors import InputError
@@ -42,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = build_parser()
-    options = parser.parse_args(argv)
+    options = parsed(parser, argv)
     check_masker_options(parser, options)
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
     logging.getLogger("g3r.acquisition.slice_profile").setLevel(logging.ERROR)  # the thickness decides nothing here

@@ -19,7 +19,7 @@ AUTO = "auto"
 """In place of a mask's file: it is to be found."""
 
 
-def add_mask_options(parser: argparse.ArgumentParser) -> None:
+def add_mask_options(parser: argparse._ActionsContainer) -> None:
     """The options that say what is brain."""
     parser.add_argument(
         "--masks",
@@ -33,7 +33,7 @@ def add_mask_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_masker_options(parser: argparse.ArgumentParser) -> None:
+def add_masker_options(parser: argparse._ActionsContainer) -> None:
     """The options that say who finds masks."""
     parser.add_argument(
         "--mask-command",
@@ -41,7 +41,7 @@ def add_masker_options(parser: argparse.ArgumentParser) -> None:
         help="a tool that makes the masks that are not given: run once for each stack, to write {mask}",
     )
     parser.add_argument(
-        "--mask-timeout", type=float, metavar="SECONDS", help="for --mask-command and one stack (default 900)"
+        "--mask-timeout", type=float, metavar="SECONDS", help="for --mask-command and one stack (default: 900)"
     )
     parser.add_argument(
         "--mask-ckpt", metavar="MASK.safetensors", help="mask network from g3r-export (default: shipped)"

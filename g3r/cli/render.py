@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-render`: the volume of a finished run at another resolution, on another grid or in the scanner's space."""
 
 from __future__ import annotations
@@ -6,6 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from g3r.cli.completion import parsed
 from g3r.cli.reuse_options import add_file_options, check_output_file, reuse_parser, told
 
 PROG = "g3r-render"
@@ -30,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = build_parser().parse_args(argv)
+    options = parsed(build_parser(), argv)
     return told(PROG, lambda: _render(options))
 
 

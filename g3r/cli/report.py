@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`g3r-report`: report.html of a finished run, one page that says whether its volume may be used, and shows it."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from g3r.cli.completion import parsed
 from g3r.cli.reuse_options import reuse_parser, told
 from g3r.errors import InputError
 
@@ -32,7 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = build_parser().parse_args(argv)
+    options = parsed(build_parser(), argv)
     return told(PROG, lambda: _report(options))
 
 

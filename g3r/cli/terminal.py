@@ -1,48 +1,260 @@
-"""Progress bars, and log lines that are held back until the input has been checked."""
+"""What `g3r-infer` says while it runs: a line when a stage has ended, a bar with the time left, and the verdict.
+
+The bar is drawn where the error stream is a terminal; elsewhere there are the lines alone. The words are those of
+`g3r.report.stage_words`. Nothing heavy is imported here: the bar stands before torch is loaded.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+import os
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from logging.handlers import MemoryHandler
-from typing import TYPE_CHECKING
+from types import TracebackType
+from typing import TYPE_CHECKING, TextIO
+
+from g3r.cli.time_left import TimeLeft
+from g3r.report.stage_words import COMPILING, DOING, STARTING, STOPPING, WITHOUT_FACTS, line
+from g3r.run.log_file import LogFile
+from g3r.run.reporter import Reporter
+from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
-    from g3r.run.context import Progress
+    from rich.console import RenderableType
+    from rich.live import Live
+
+PROGRAM = "g3r-infer"
+
+PLAIN, DETAIL, WARNING = "", "2", "33"
+COLOURS = {"use": "1;32", "check": "1;33", "do not use": "1;31"}
+"""Codes of terminals for kinds of lines, and for the words of the verdict."""
+
+MAX_COLUMNS = 100
+"""Longer lines are hard to read."""
+
+PER_SECOND = 4
 
 
-@contextmanager
-def progress_bars(*, quiet: bool) -> Iterator[Progress]:
-    """A progress function that draws a bar per stage, or nothing."""
-    if quiet:
-        yield lambda stage, done, total: None
-        return
+class Terminal(Reporter):
+    """The terminal of one run, to be entered; it hears log lines and stages, and passes all on to the log file.
+
+    Args:
+        time_left: of the run.
+        log: keeps everything.
+        quiet: whether only warnings and errors are shown.
+        verbose: whether the developers' detail is shown, too.
+        compiling_s: seconds that it takes to compile programs, once; 0 where they are compiled.
+        stop_request: whether the run is to end early; None where nobody can ask for that.
+    """
+
+    def __init__(
+        self,
+        time_left: TimeLeft,
+        log: LogFile,
+        *,
+        quiet: bool = False,
+        verbose: bool = False,
+        compiling_s: float = 0.0,
+        stop_request: StopRequest | None = None,
+    ) -> None:
+        self.time_left, self.log, self.quiet = time_left, log, quiet
+        self.compiling_s, self.stop_request = compiling_s, stop_request
+        self.stage = STARTING
+        self._level = logging.DEBUG if verbose else logging.WARNING
+        self._held: list[tuple[str, str]] | None = None
+        self._live: Live | None = None
+        self._loggers = _Loggers([log, _Lines(self)])
+
+    def __enter__(self) -> Terminal:
+        self._loggers.install()
+        if not self.quiet and is_live(sys.stderr):
+            self._live = _live(self)
+            self._live.start()
+        self.begun(STARTING)
+        if self.compiling_s:
+            self.say(COMPILING.format(seconds=round(self.compiling_s)))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end_bar()
+        self._loggers.remove()
+
+    def begun(self, stage: str) -> None:
+        """See `Reporter`."""
+        self.stage = stage
+        self.time_left.begun(stage)
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """See `Reporter`."""
+        self.time_left.progress(done, total)
+
+    def ended(self, stage: str, found: object, *, resumed: bool = False) -> None:
+        """See `Reporter`; says in a line what the stage found."""
+        self.time_left.ended(stage)
+        if stage in WITHOUT_FACTS:
+            self.tell(WITHOUT_FACTS[stage], {})
+        elif found is not None:
+            from g3r.output.stage_facts import told_of
+
+            for name, facts in told_of(found):
+                self.tell(name, facts, resumed=resumed)
+
+    def tell(self, name: str, facts: Mapping[str, object], *, resumed: bool = False) -> None:
+        """A line about a stage.
+
+        Args:
+            name: in `stage_words.LINES`.
+            facts: what is filled in.
+            resumed: whether the stage was taken from an earlier run.
+        """
+        self.say(line(name, facts, resumed=resumed))
+
+    def say(self, text: str) -> None:
+        """A line for everybody but those who want quiet."""
+        self.log.say(text)
+        if not self.quiet:
+            self._show(text, PLAIN)
+
+    def heard(self, record: logging.LogRecord) -> None:
+        """Show what was logged, where it is a warning or where detail is wanted."""
+        if record.levelno >= logging.WARNING:
+            self._show(f"{PROGRAM}: {record.getMessage()}", WARNING)
+        elif record.levelno >= self._level and record.name.startswith("g3r"):
+            self._show(f"  {record.getMessage()}", DETAIL)
+
+    @contextmanager
+    def held_back(self) -> Iterator[None]:
+        """Hold lines back until the block ends well, so that a refusal is one line."""
+        self._held = []
+        try:
+            yield
+            held, self._held = self._held, None
+            for text, colour in held:
+                self._show(text, colour)
+        finally:
+            self._held = None
+
+    def end_bar(self) -> None:
+        """Take the bar away."""
+        if self._live is not None:
+            live, self._live = self._live, None
+            live.stop()
+
+    def conclude(self, lines: list[str], word: str, verdict: str) -> None:
+        """Say on the standard output what was written, and last the verdict.
+
+        Args:
+            lines: to be said before it.
+            word: of the verdict, which decides its colour.
+            verdict: the whole line.
+        """
+        self.end_bar()
+        for text in lines:
+            print(text if os.sep in text else _laid_out(text, PLAIN, sys.stdout))  # a path stays in one piece
+        self.log.say(verdict)
+        print(_laid_out(verdict, COLOURS[word], sys.stdout), flush=True)
+
+    def _show(self, text: str, colour: str) -> None:
+        if self._held is not None:
+            self._held.append((text, colour))
+            return
+        print(_laid_out(text, colour, sys.stderr), file=sys.stderr, flush=True)
+
+    def picture(self) -> RenderableType:
+        """The bar as it is now."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        share, left_s = self.time_left.share(), round(self.time_left.left_s())
+        bar = Table.grid(padding=(0, 2), expand=True)
+        for width, ratio in ((max(map(len, DOING.values())), None), (None, 1), (5, None), (15, None)):
+            bar.add_column(width=width, ratio=ratio, no_wrap=True)
+        left = f"about {left_s // 60}:{left_s % 60:02d} left" if left_s else "nearly done"
+        is_stopping = self.stop_request is not None and self.stop_request.is_requested()
+        doing = STOPPING if is_stopping else DOING.get(self.stage, self.stage)
+        progress = ProgressBar(1.0, share, complete_style="cyan", finished_style="cyan")
+        bar.add_row(doing, progress, f"{100 * share:3.0f} %", left)
+        return bar
+
+
+def is_live(stream: TextIO) -> bool:
+    """Whether a stream is a terminal on which a line can be drawn anew."""
+    return stream.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown")
+
+
+def _live(terminal: Terminal) -> Live:
+    """Draws the bar from now on, a few times a second, in a thread."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+    from rich.live import Live
 
-    columns = (TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(str(stage), total=total)
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield report
+    return Live(
+        get_renderable=terminal.picture,
+        console=Console(file=sys.stderr, highlight=False),
+        refresh_per_second=PER_SECOND,
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+    )
 
 
-@contextmanager
-def log_held_back() -> Iterator[None]:
-    """Hold log lines back until the block ends well, so that a refusal is one line."""
-    root = logging.getLogger()
-    streams = root.handlers
-    held = [MemoryHandler(1000, logging.CRITICAL + 1, stream, flushOnClose=False) for stream in streams]
-    root.handlers = list(held)
+def _laid_out(text: str, colour: str, stream: TextIO) -> str:
+    """A line broken between words and coloured where the stream is a terminal; as it is elsewhere."""
+    if not stream.isatty():
+        return text
+    indent = text[: len(text) - len(text.lstrip())] + "  "
+    columns = min(_columns(stream), MAX_COLUMNS)
+    text = textwrap.fill(
+        text, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False, drop_whitespace=True
+    )
+    if not colour or os.environ.get("NO_COLOR") or not is_live(stream):
+        return text
+    return "\n".join(f"\x1b[{colour}m{one}\x1b[0m" for one in text.split("\n"))
+
+
+def _columns(stream: TextIO) -> int:
     try:
-        yield
-        for handler in held:
-            handler.flush()
-    finally:
-        root.handlers = streams
+        return os.get_terminal_size(stream.fileno()).columns or 80
+    except (OSError, ValueError):
+        return 80
+
+
+class _Lines(logging.Handler):
+    """Passes log lines on to the terminal."""
+
+    def __init__(self, terminal: Terminal) -> None:
+        super().__init__(logging.DEBUG)
+        self.terminal = terminal
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show it, if it is to be shown."""
+        try:
+            self.terminal.heard(record)
+        except Exception:  # as with every handler: a line that cannot be shown does not end the run
+            self.handleError(record)
+
+
+class _Loggers:
+    """Handlers at the root of all loggers, for as long as a run takes."""
+
+    def __init__(self, handlers: list[logging.Handler]) -> None:
+        self.handlers = handlers
+        self._levels: dict[str | None, int] = {}
+
+    def install(self) -> None:
+        """Add them; g3r speaks in detail from now on, others only of what goes wrong."""
+        for name, level in ((None, logging.WARNING), ("g3r", logging.DEBUG)):
+            logger = logging.getLogger(name)
+            self._levels[name] = logger.level
+            logger.setLevel(level)
+        for handler in self.handlers:
+            logging.getLogger().addHandler(handler)
+
+    def remove(self) -> None:
+        """Leave the loggers as they were."""
+        for handler in self.handlers:
+            logging.getLogger().removeHandler(handler)
+        for name, level in self._levels.items():
+            logging.getLogger(name).setLevel(level)

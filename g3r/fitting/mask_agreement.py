@@ -23,6 +23,8 @@ from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
 from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration import Registration
+from g3r.registration.estimate import measured_again
+from g3r.registration.unseen import TemplateFill
 
 REFINED = "automatic"
 """Masks of this source are refined; what a person drew, or a tool of the user's made, is not."""
@@ -83,7 +85,18 @@ def refine_masks(
             notes.append(f"{stacks[n].name}: its mask was refined by the other stacks and the template ({changed:.1%})")
     rows = slices_from_stacks(refined).scaled(1 / intensity)
     kept = rows.take(_rows_of(slices, rows)).with_motion(slices.world_from_header())
-    return RefinedMasks(stacks=refined, poses=replace(registration, slices=kept), notes=notes)
+    poses = replace(registration, slices=kept)
+    if any(new is not old for new, old in zip(refined, stacks, strict=True)):
+        poses = measured_again(poses, _fill(template))
+    return RefinedMasks(stacks=refined, poses=poses, notes=notes)
+
+
+def _fill(template: PlacedTemplate | None) -> TemplateFill | None:
+    """The template in place of what stacks do not show."""
+    if template is None:
+        return None
+    center_mm = template.grid.world(np.argwhere(template.volume > 0)).mean(0)
+    return TemplateFill(template.volume, template.grid, center_mm)
 
 
 def _seen_and_brain(stack: Slices, grid: VolumeGrid) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

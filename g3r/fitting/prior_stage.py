@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Planes, volume_planes
 from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm
+from g3r.fitting.observer import FitMoment, FitObserver, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.schedules import cosine_decay
@@ -109,6 +110,7 @@ def fit_prior(
     *,
     progress: Callable[[int, int], None] = NO_PROGRESS,
     deadline: Deadline | None = None,
+    observer: FitObserver | None = None,
 ) -> tuple[GaussianCloud, list[float]]:
     """Fit a seeded cloud to the prior volume (G3R Eq. 8).
 
@@ -122,6 +124,7 @@ def fit_prior(
         rng: draws the planes of each step.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it.
+        observer: sees the fit at its steps.
 
     Returns:
         The fitted cloud, and the image loss of each step.
@@ -151,6 +154,8 @@ def fit_prior(
         image = loss.add("prior", 1.0).mean
         guard.step(image + loss.finish(), cosine_decay(fraction))
         history.append(image)
+        if is_due(observer, step + 1, settings.n_steps):
+            observer(FitMoment(step=step + 1, loss={"image": image}, parameters=parameters))
     progress(settings.n_steps, settings.n_steps)
     guard.finish()
     return parameters.cloud(), history

@@ -8,6 +8,7 @@ import numpy as np
 
 from g3r.acquisition.coarse_volume import confidence
 from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.observer import FitObserver
 from g3r.fitting.prior_stage import PriorCloud, PriorStageSettings, VolumeTarget, fit_prior
 from g3r.gaussians.seeding import seed_cloud
 from g3r.run.deadline import Deadline
@@ -24,6 +25,7 @@ def fit_to_prior(
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
     deadline: Deadline | None,
+    observer: FitObserver | None = None,
 ) -> PriorCloud:
     """Gaussians seeded in the prior volume and fitted to it (G3R Eq. 8).
 
@@ -34,11 +36,12 @@ def fit_to_prior(
         rng: draws the planes of each step.
         progress: called with (steps done, steps in all).
         deadline: when the fit has to end.
+        observer: sees the fit at its steps.
     """
     grid = prior.volumes.grid
     seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm)
     target = VolumeTarget.of(prior.values, prior.support.astype(np.float32), grid)
-    cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline)
+    cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline, observer=observer)
     return PriorCloud(cloud, history, spacing_mm)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm, TermLoss
+from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
@@ -22,7 +22,6 @@ from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
-from g3r.geometry import RigidPose
 from g3r.run.deadline import Deadline, timed_steps
 
 AMPLITUDE_DAMPING = 0.05
@@ -90,16 +89,6 @@ class SliceFit:
     bias_field: list[list[float]]
 
 
-class FitObserver(Protocol):
-    """Watches a fit from outside."""
-
-    every: int
-    """Steps between two calls; the last step always has one."""
-
-    def __call__(self, step: int, cloud: GaussianCloud, pose: RigidPose) -> None:
-        """Called after `step` steps with the detached cloud and the poses [K] of that moment."""
-
-
 def fit_slices(
     cloud: GaussianCloud,
     slices: Slices,
@@ -128,7 +117,7 @@ def fit_slices(
         pixel_weight: [P] not negative; the slices' masks when None.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it; schedules run to their ends even so.
-        observer: sees the cloud during the fit.
+        observer: sees the fit at its steps.
 
     Raises:
         NumericalError: a loss that is not finite from the start.
@@ -173,8 +162,9 @@ def fit_slices(
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
-        if observer and ((step + 1) % observer.every == 0 or step + 1 == settings.n_steps):
-            observer(step + 1, parameters.cloud(), loss.state().pose(cloud.origin_mm))
+        if is_due(observer, step + 1, settings.n_steps):
+            moved = SliceMoment(loss.state(), slices)
+            observer(FitMoment(step=step + 1, loss=entry, parameters=parameters, slices=moved))
     progress(settings.n_steps, settings.n_steps)
     guard.finish()
     state = loss.state()

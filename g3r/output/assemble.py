@@ -24,7 +24,7 @@ from g3r.fitting.volume_check import VolumeCheck, check_volume
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
-from g3r.output.mixture import Mixture
+from g3r.output.mixture import FinishedVolume, Mixture
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
@@ -92,7 +92,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     grid = volumes.grid.respaced(settings.resolution_mm)
     fit = found.fit or _no_fit(found)
     uncertainty, prior_share, uncertainty_record = None, None, None
-    with run.clock(Stage.VOLUME):
+    with run.timed(Stage.VOLUME) as tell:
         mask, support = _masks_on(grid, found.prior, fit)
         least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
         mixture = Mixture(
@@ -121,13 +121,14 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             extent_known=_extent_known(found, settings),
             what=NAME_OF[settings.anatomy],
         )
+        tell(FinishedVolume(volume=volume, mask=mask, grid=grid, unseen=unseen_part))
     run.warnings += [line for line in (check.line() if check else "", unseen_part.line()) if line]
     run.notes += [NOTE_ON_OTHERS] if settings.anatomy != FETAL_BRAIN else []
     if run.stopped_at:
         run.notes.append(PARTIAL_NOTE)
     else:
         if settings.use_prior:
-            with run.clock(Stage.PRIOR_SHARE):
+            with run.timed(Stage.PRIOR_SHARE):
                 prior_share = estimate_prior_share(
                     fit,
                     density=volumes.density,
@@ -142,7 +143,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                 prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share)
                 prior_share = prior_share.astype(np.float32)
                 release_memory()
-        with run.clock(Stage.UNCERTAINTY):
+        with run.timed(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
                 UncertaintyInputs(
                     volume=volume,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.run.log_file import LOG_NAME
 
 MASK_PICTURE = "masks.png"
 
@@ -33,6 +34,7 @@ OUTPUT_NAMES = (
     "run.json",
     "sections.png",
     REPORT_NAME,
+    LOG_NAME,
     *MASK_NAMES,
 )
 

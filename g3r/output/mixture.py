@@ -13,6 +13,7 @@ from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
+from g3r.uncertainty.unseen import UnseenPart
 
 LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
@@ -94,3 +95,13 @@ def _margin(inside: NDArray[np.bool_], margin_mm: float, grid: VolumeGrid) -> ND
     """Voxels [I, J, K] outside a region that are within a distance of it, in whole voxels along the axes."""
     n_voxels = round(margin_mm / float(grid.spacing_mm.mean()))
     return binary_dilation(inside, iterations=n_voxels) & ~inside if n_voxels else np.zeros_like(inside)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedVolume:
+    """The volume [I, J, K] in intensities of the fit, the brain's mask on the same grid, and what no slice saw."""
+
+    volume: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    grid: VolumeGrid
+    unseen: UnseenPart

@@ -25,6 +25,7 @@ from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, refine_slices
 from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
+from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -136,6 +137,25 @@ def register(
         profiles=[sample.profile for sample in samples],
         overlap=overlap,
     )
+
+
+def measured_again(registration: Registration, fill: TemplateFill | None = None) -> Registration:
+    """The registration with what it says of the quality of its poses found anew, for slices with other masks.
+
+    Args:
+        registration: whose slices have masks that registration did not have.
+        fill: stands for what stacks do not show of the head.
+    """
+    slices = bias_corrected(registration.slices)
+    samples = StackSamples.of_all(slices)
+    profiles = [sample.profile for sample in samples]
+    if len(samples) == 1:
+        return replace(registration, profiles=profiles)
+    missing = any(profile.has_missing for profile in profiles)
+    motion = slices.world_from_header()
+    score = held_out_score(slices, samples, motion, fill if missing else None)
+    overlap = overlap_of(slices, samples, motion) if missing else None
+    return replace(registration, held_out=score.correlations, profiles=profiles, overlap=overlap)
 
 
 def _with_rigid_stacks(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,16 +75,11 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
         held_out = None if registration.held_out is None else registration.held_out[present.index(n)]
         ncc = float(np.median(registration.ncc[of_stack]))
         downweighted = float((registration.weight[of_stack] < DOWNWEIGHTED_BELOW).mean())
-        reliable = None
-        if held_out is not None:
-            reliable = held_out >= MIN_HELD_OUT and ncc >= MIN_NCC and downweighted <= MAX_DOWNWEIGHTED_SHARE
         share = correlation = None
         if registration.overlap is not None:
             place = present.index(n)
             share = registration.overlap.stack_share[place]
             correlation = registration.overlap.correlation[place]
-            # the template that stood for what others did not see agrees with any head
-            reliable = bool(reliable) and share >= MIN_OVERLAP_SHARE and correlation >= MIN_OVERLAP_CORRELATION
         missing = {}
         if registration.profiles:
             profile = registration.profiles[present.index(n)]
@@ -93,17 +88,35 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
                 "longest_gap_mm": profile.longest_gap_mm,
                 "is_cut": profile.is_cut,
             }
-        found.append(
-            StackQuality(
-                reliable=reliable,
-                held_out_correlation=held_out,
-                median_slice_ncc=ncc,
-                downweighted_share=downweighted,
-                overlap_share=share,
-                overlap_correlation=correlation,
-                **missing,
-            )
+        one = StackQuality(
+            reliable=None,
+            held_out_correlation=held_out,
+            median_slice_ncc=ncc,
+            downweighted_share=downweighted,
+            overlap_share=share,
+            overlap_correlation=correlation,
+            **missing,
         )
+        found.append(one if held_out is None else replace(one, reliable=not shortfalls(one)))
+    return found
+
+
+def shortfalls(one: StackQuality) -> list[str]:
+    """What is worse of a stack than of registered ones, each with what is good; empty where nothing is."""
+    found = []
+    if one.held_out_correlation is not None and one.held_out_correlation < MIN_HELD_OUT:
+        found.append(f"agreement {one.held_out_correlation:.3g}; good is {MIN_HELD_OUT:g} and above")
+    if one.median_slice_ncc is not None and one.median_slice_ncc < MIN_NCC:
+        found.append(f"its slices agree with the volume by {one.median_slice_ncc:.3g}; good is {MIN_NCC:g} and above")
+    if one.downweighted_share > MAX_DOWNWEIGHTED_SHARE:
+        good = f"good is {MAX_DOWNWEIGHTED_SHARE:.0%} or fewer"
+        found.append(f"{100 * one.downweighted_share:.3g}% of its slices fit badly; {good}")
+    # the template that stood for what others did not see agrees with any head
+    if one.overlap_share is not None and one.overlap_share < MIN_OVERLAP_SHARE:
+        found.append(f"others saw {100 * one.overlap_share:.3g}% of it; good is {MIN_OVERLAP_SHARE:.0%} and above")
+    if one.overlap_correlation is not None and one.overlap_correlation < MIN_OVERLAP_CORRELATION:
+        good = f"good is {MIN_OVERLAP_CORRELATION:g} and above"
+        found.append(f"agreement {one.overlap_correlation:.3g} where others saw it; {good}")
     return found
 
 

@@ -80,12 +80,18 @@ class ReportedResult(ReconstructionResult):
             folder: to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
             run: holds this folder already; one for this call alone when None.
-            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, report.html among them.
+            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, in which all others are.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
         """
-        super().save(folder, replace=replace, run=run, also=also or self._add_page)
+
+        def more(staged: Path) -> None:
+            self._add_page(staged)
+            if also is not None:
+                also(staged)
+
+        super().save(folder, replace=replace, run=run, also=more)
 
     def _add_page(self, folder: Path) -> None:
         """Write the page; without it the volume is no worse, so its failure is told and no more."""
@@ -119,7 +125,7 @@ class ReportedResult(ReconstructionResult):
         # the page is made of the files, as everyone else has them
         with tempfile.TemporaryDirectory(prefix="g3r-report-") as folder:
             saved = Path(folder) / "result"
-            self.save(saved, also=lambda _: None)
+            super().save(saved)
             write_report(saved, self.slices, path)
 
     def _sections(self) -> tuple[tuple[str, str], ...]:

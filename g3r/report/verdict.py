@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.planning.anatomy import NAME_OF
-from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
+from g3r.registration.quality import shortfalls
+from g3r.registration.thresholds import RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
@@ -44,7 +45,7 @@ class Message:
 MESSAGES = {
     "stack failed": Message(
         DO_NOT_USE,
-        "{stack} does not fit the other stacks (agreement {agreement}; good is {good:g} and above)",
+        "{stack} does not fit the other stacks ({shortfalls})",
         "Leave that stack out and run again, or check that it shows the same head and that its mask is right.",
     ),
     "stack not used": Message(
@@ -72,7 +73,7 @@ MESSAGES = {
     ),
     "masks found": Message(
         CHECK,
-        "the brain {masks} of {stacks} found automatically",
+        "the brain {masks} of {stacks} {were} found automatically",
         "Look at masks.png: a mask that misses brain or takes in face leads registration astray.",
     ),
     "whole image": Message(
@@ -166,7 +167,9 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if len(record.stacks) == 1:
         yield "single stack", {}
     if found := [stack.name for stack in record.stacks if stack.mask_from in ("automatic", "command")]:
-        yield "masks found", {"masks": "mask" if len(found) == 1 else "masks", "stacks": _listed(found)}
+        masks, were = ("mask", "was") if len(found) == 1 else ("masks", "were")
+        facts: dict[str, object] = {"masks": masks, "were": were, "stacks": _listed(found)}
+        yield "masks found", facts
     if whole := [stack.name for stack in record.stacks if stack.mask_from in ("whole image", "empty background")]:
         yield "whole image", {"stacks": _listed(whole)}
     if assumed := [stack for stack in record.stacks if stack.thickness_from == "spacing"]:
@@ -186,7 +189,8 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
         return
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
     if quality.reliable is False:
-        yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"good": MIN_HELD_OUT}
+        why = "; ".join(shortfalls(quality))
+        yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"shortfalls": why}
     elif quality.held_out_correlation is not None and quality.held_out_correlation < RETRY_BELOW_CORRELATION:
         yield "stack doubtful", facts | {"good": RETRY_BELOW_CORRELATION}
 

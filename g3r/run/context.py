@@ -1,23 +1,22 @@
-"""Context of a run: stage store, clock, stop request, progress, notes and warnings."""
+"""Context of a run: stage store, clock, stop request, reporter, notes and warnings."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from g3r.run.clock import Clock
 from g3r.run.deadline import Deadline
+from g3r.run.reporter import Reporter
 from g3r.run.stage_store import StageStore
 from g3r.run.stop_request import StopRequest
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, steps done, steps in all)."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class RunContext:
     Args:
         store: keeps what stages give, or has it from an earlier run; by default nothing is kept.
         stop_request: signals that end the run early; None leaves them alone.
-        progress: called with (stage, steps done, steps in all).
+        reporter: is told when stages begin, go on and end, and what they found.
         clock: seconds of each stage.
         notes: remarks for the record.
         warnings: about the result; logged when the result is made.
@@ -51,7 +50,7 @@ class RunContext:
 
     store: StageStore = field(default_factory=StageStore)
     stop_request: StopRequest | None = None
-    progress: Progress = lambda stage, done, total: None
+    reporter: Reporter = field(default_factory=Reporter)
     clock: Clock = field(default_factory=Clock)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -99,6 +98,15 @@ class RunContext:
             self.stopped_at = StoppedAt(str(name), *steps_of(result))
         return result
 
+    @contextmanager
+    def timed(self, name: str) -> Iterator[Callable[[object], None]]:
+        """Run the block as a stage that is not kept; call what it gives with what there is to tell of it."""
+        told: list[object] = []
+        self.reporter.begun(name)
+        with self.clock(name):
+            yield told.append
+        self.reporter.ended(name, told[-1] if told else None)
+
     def deadline(self, deadline: Deadline | None) -> Deadline | None:
         """A deadline that also comes when the stop is requested; None where there is neither."""
         return deadline if self.stop_request is None else self.stop_request.with_deadline(deadline)
@@ -113,7 +121,7 @@ class RunContext:
 
         def report(done: int, total: int) -> None:
             self._position = StoppedAt(str(stage), done, total)
-            self.progress(stage, done, total)
+            self.reporter.progress(stage, done, total)
 
         return report
 
@@ -122,12 +130,15 @@ class RunContext:
         found = self.store.read(name)
         if found is not None:
             self.clock.add(name, found.seconds, found.cpu_seconds)
+            self.reporter.ended(name, found.value, resumed=True)
             return found.value
+        self.reporter.begun(name)
         with self.clock(name):
             value = make()
         value = self.store.as_stored(value)
         if keep():
             self.store.write(name, value, self.clock.seconds[name], self.clock.cpu_seconds[name])
+        self.reporter.ended(name, value)
         return value
 
     def _stop_is_requested(self) -> bool:

@@ -20,9 +20,10 @@ from data_synth.cli import main as simulate
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import G3RError
+from g3r.fitting.observer import FitMoment
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.render import render
-from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry import VolumeGrid
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
@@ -46,10 +47,10 @@ class Watcher:
     def __init__(self) -> None:
         self.clouds: dict[int, GaussianCloud] = {}
 
-    def __call__(self, step: int, cloud: GaussianCloud, pose: RigidPose) -> None:
-        """Take a step."""
-        if step in SHOWN_STEPS:
-            self.clouds[step] = cloud
+    def __call__(self, moment: FitMoment) -> None:
+        """Take a step of the fit to the slices."""
+        if moment.slices is not None and moment.step in SHOWN_STEPS:
+            self.clouds[moment.step] = moment.cloud()
 
 
 def section(cloud: GaussianCloud, result: ReconstructionResult) -> NDArray[np.float32]:

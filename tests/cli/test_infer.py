@@ -24,7 +24,7 @@ from g3r.gaussians import GaussianCloud
 from g3r.output.files import FULL_WEIGHT, MASK_NAMES, OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, ReconstructionSettings
-from tests.faults.small_case import WHOLE
+from tests.faults.small_case import BY_COMMAND, WHOLE
 
 QUICK = ("--preset", "preview", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 
@@ -182,7 +182,7 @@ def plain(given: list[Stack]) -> ReconstructionResult:
 
 def test_from_python_in_three_lines(plain: ReconstructionResult, tmp_path: Path) -> None:
     plain.save(tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == WHOLE
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WHOLE - BY_COMMAND
     assert plain.volume.shape == plain.grid.shape
 
 

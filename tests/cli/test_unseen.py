@@ -56,7 +56,7 @@ def test_blank_leaves_zeros_and_says_so(stack: tuple[Path, Path], tmp_path: Path
     assert said["share"] == pytest.approx(share, abs=1e-6)
     assert said["volume_ml"] == pytest.approx(missing.sum() * 8 / 1000, rel=1e-4)
     assert said["shown"] == "blank"
-    (line,) = [one for one in done.stdout.splitlines() if one.startswith("unseen:")]
+    (line,) = [one for one in done.stdout.splitlines() if one.startswith("verdict:")]
     assert "was left blank" in line
     assert any("was left blank" in one for one in record["warnings"])
 

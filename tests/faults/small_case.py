@@ -35,8 +35,12 @@ WHOLE = {
     "run.json",
     "sections.png",
     "report.html",
+    "log.txt",
 }
 """Files of a result without a prior network."""
+
+BY_COMMAND = {"log.txt"}
+"""Those that the command adds to what a result writes by itself."""
 
 
 @dataclass(frozen=True)

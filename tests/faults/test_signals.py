@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from g3r.acquisition.images import load_volume
+from g3r.cli.terminal import Terminal
 from g3r.gaussians import GaussianCloud
 from g3r.planning.presets import PRESETS
 from tests.faults.small_case import WHOLE, SmallCase, names
@@ -25,16 +25,12 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Sends a signal when a stage has reached a step, as often as is said."""
 
     def choose(stage: str, step: int, number: signal.Signals = signal.SIGINT, times: int = 1) -> None:
-        def progress(name: str, done: int, total: int) -> None:
+        def progress(self: Terminal, name: str, done: int, total: int) -> None:
             if (name, done) == (stage, step):
                 for _ in range(times):
                     signal.raise_signal(number)
 
-        @contextmanager
-        def bars(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-            yield progress
-
-        monkeypatch.setattr("g3r.cli.infer.progress_bars", bars)
+        monkeypatch.setattr(Terminal, "progress", progress)
 
     return choose
 

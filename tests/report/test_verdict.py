@@ -34,7 +34,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
     "failed": (
         stacks_with(stack("c.nii", quality(False, 0.31))),
         DO_NOT_USE,
-        "c.nii does not fit the other stacks (agreement 0.31; good is 0.65 and above)",
+        "c.nii does not fit the other stacks (agreement 0.31; good is 0.65 and above",
     ),
     "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
@@ -52,7 +52,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         "the fit made the volume worse",
     ),
     "rollbacks": (record(n_rollbacks=2), CHECK, "step back 2 times"),
-    "automatic": (stacks_with(stack("c.nii", mask_from="automatic")), CHECK, "mask of c.nii found automatically"),
+    "automatic": (stacks_with(stack("c.nii", mask_from="automatic")), CHECK, "mask of c.nii was found automatically"),
     "whole image": (stacks_with(stack("c.nii", mask_from="whole image")), CHECK, "no mask was used for c.nii"),
     "thickness": (
         record(*(stack(f"{n}.nii", thickness_from="spacing") for n in "abc")),

@@ -1,0 +1,179 @@
+"""How much of a run is done and how long the rest takes: expected seconds, corrected by those that have passed."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, WRITING
+
+BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.7, PREPARING: 3.5}
+"""Seconds of three stacks on two cores, before the first stage that a run keeps."""
+
+AFTER_S = {"volume": 0.1, "prior share": 0.8, "uncertainty": 0.4, WRITING: 1.2}
+
+EXPECTED_S = {
+    "preview": {"registration": 4.5, "coarse volume": 1.0, "prior": 2.5, "fit to prior": 0.4, "fit to slices": 0.5},
+    "fast": {"registration": 5.0, "coarse volume": 1.0, "prior": 2.5, "fit to prior": 0.5, "fit to slices": 0.8},
+    "balanced": {
+        "registration": 5.0,
+        "coarse volume": 1.0,
+        "prior": 2.0,
+        "poses in rounds": 9.0,
+        "fit to prior": 0.7,
+        "held-out slices": 1.2,
+        "fit to slices": 1.2,
+    },
+    "accurate": {
+        "registration": 30.0,
+        "coarse volume": 1.0,
+        "prior": 2.5,
+        "poses in rounds": 10.0,
+        "fit to prior": 0.7,
+        "held-out slices": 1.5,
+        "fit to slices": 1.2,
+    },
+}
+"""The same of each preset, with all programs compiled, by stage in their order."""
+
+COMPILING_S = {
+    "registration": 9.0,
+    "coarse volume": 1.0,
+    "poses in rounds": 27.0,
+    "fit to prior": 3.0,
+    "held-out slices": 2.0,
+}
+"""What stages take longer where numba has nothing compiled yet."""
+
+COMPILING_FIT_S = 22.0
+"""What the fit to the slices takes longer where no round has compiled it before."""
+
+MASK_S = 8.0
+"""For the network to find the brain in one stack."""
+
+ONLY_WITH_PRIOR = ("prior share",)
+
+STEADY_S = 5.0
+"""Seconds that the expectation counts for against what was measured."""
+
+MANY_STEPS = 10
+"""From so many steps on, they tell better than the clock how far a stage is."""
+
+EVEN = 0.7
+"""Share of a stage's expected seconds up to which the clock is believed."""
+
+NEARLY = 0.97
+"""Most that is taken for done of a stage that has not ended."""
+
+
+def needs_compiling() -> bool:
+    """Whether numba will compile: nothing of it lies in the folders that it keeps its results in."""
+    package = Path(__file__).parents[1]
+    folders = [Path(given)] if (given := os.environ.get("NUMBA_CACHE_DIR")) else [package]
+    return not any(next(folder.rglob("kernels*.nbi"), None) for folder in folders)
+
+
+def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[str, float]:
+    """Seconds of each stage of a run, in their order.
+
+    Args:
+        options: of g3r-infer.
+        compiling: whether programs are compiled on the way.
+    """
+    before = dict(BEFORE_S)
+    n_to_find = 0
+    if not (options.whole_image or options.mask_command):
+        given = options.masks or []
+        n_to_find = sum(one == "auto" for one in given) if given else max(len(options.stacks), 3)
+    before[FINDING_MASKS] += MASK_S * n_to_find
+    if options.dry_run:
+        return before
+    stages = before | EXPECTED_S["balanced" if options.time_budget else options.preset] | AFTER_S
+    if options.no_prior:
+        stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_PRIOR}
+    if compiling:
+        stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
+        if "poses in rounds" not in stages:
+            stages["fit to slices"] += COMPILING_FIT_S
+    if options.time_budget:
+        shorter = max(options.time_budget, 1.0) / sum(stages.values())
+        stages = {name: seconds * shorter for name, seconds in stages.items()}
+    return stages
+
+
+class TimeLeft:
+    """Share of a run that is done, and the seconds that are left.
+
+    A stage that no one expected takes no share. Neither figure jumps back: the share never falls.
+
+    Args:
+        expected_s: seconds of each stage, in their order.
+        clock: seconds that only go forwards.
+    """
+
+    def __init__(self, expected_s: Mapping[str, float], clock: Callable[[], float] = time.monotonic) -> None:
+        self.expected_s = dict(expected_s)
+        self.clock = clock
+        self.begun_s = clock()
+        self._stage, self._stage_begun_s = "", self.begun_s
+        self._steps = (0, 0)
+        self._before_s = 0.0
+        self._pace = 1.0
+        self._shown = 0.0
+
+    @property
+    def passed_s(self) -> float:
+        """Seconds since the beginning."""
+        return self.clock() - self.begun_s
+
+    def begun(self, stage: str) -> None:
+        """A stage begins; all before it are over, whether they took place or not."""
+        self._stage, self._stage_begun_s, self._steps = stage, self.clock(), (0, 0)
+        self._pace = self._measured_pace(self._before_s)
+        if stage in self.expected_s:
+            names = list(self.expected_s)
+            self._before_s = sum(self.expected_s[name] for name in names[: names.index(stage)])
+
+    def progress(self, done: int, total: int) -> None:
+        """Steps of the present stage are done, of so many."""
+        self._steps = (done, total)
+
+    def ended(self, stage: str) -> None:
+        """A stage has ended."""
+        self.begun(stage)
+        self._before_s += self.expected_s.get(stage, 0.0)
+        self._stage = ""
+
+    def share(self) -> float:
+        """Of the whole run, from 0 to 1."""
+        total_s = sum(self.expected_s.values())
+        self._shown = max(self._shown, min(self._done_s() / total_s, 1.0)) if total_s > 0 else 1.0
+        return self._shown
+
+    def left_s(self) -> float:
+        """Seconds until the end, as far as can be told."""
+        done_s = self._done_s()
+        return max(0.0, self._measured_pace(done_s) * (sum(self.expected_s.values()) - done_s))
+
+    def _measured_pace(self, done_s: float) -> float:
+        """Seconds that passed for each expected one."""
+        return (self.passed_s + STEADY_S) / (done_s + STEADY_S)
+
+    def _done_s(self) -> float:
+        """Expected seconds of what is done."""
+        expected_s = self.expected_s.get(self._stage, 0.0)
+        if not expected_s:
+            return self._before_s
+        done, total = self._steps
+        share = done / total if total else 0.0
+        if total < MANY_STEPS:
+            share = max(share, _by_the_clock((self.clock() - self._stage_begun_s) / (expected_s * self._pace)))
+        return self._before_s + min(share, NEARLY) * expected_s
+
+
+def _by_the_clock(passed: float) -> float:
+    """Share of a stage by its seconds over the expected ones: even at first, and ever slower after `EVEN`."""
+    return passed if passed < EVEN else 1 - (1 - EVEN) ** 2 / (passed + 1 - 2 * EVEN)
