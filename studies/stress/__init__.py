@@ -1,0 +1,1 @@
+"""Studies of what goes wrong in practice, for docs/stress.md."""

@@ -1,0 +1,122 @@
+"""What is done to simulated stacks that simulation itself does not: wrong headers, wrong masks, wrong stacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_erosion, generate_binary_structure
+
+from g3r.acquisition.stacks import Stack
+
+Stacks = tuple[Stack, ...]
+
+DISC = generate_binary_structure(2, 1)[:, :, None]
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A change of a subject's stacks.
+
+    Attributes:
+        apply: to its stacks; gets those of another subject and a generator, too.
+        without_truth: stacks that have no true place any more.
+    """
+
+    apply: Callable[[Stacks, Stacks, np.random.Generator], Stacks]
+    without_truth: frozenset[int] = frozenset()
+
+
+def first_stacks(n: int) -> Damage:
+    """Only the first `n` stacks."""
+    return Damage(lambda stacks, other, rng: stacks[:n])
+
+
+def stated_thickness(factor: float) -> Damage:
+    """A thickness that is wrong by a factor, in all stacks."""
+    return Damage(
+        lambda stacks, other, rng: tuple(replace(one, thickness_mm=factor * one.thickness_mm) for one in stacks)
+    )
+
+
+def masks_grown(pixels: int) -> Damage:
+    """Masks dilated by some pixels in the plane; eroded where the number is negative."""
+    change = binary_dilation if pixels > 0 else binary_erosion
+
+    def grown(stack: Stack) -> Stack:
+        return replace(stack, mask=change(stack.mask, DISC, iterations=abs(pixels)))
+
+    return Damage(lambda stacks, other, rng: tuple(map(grown, stacks)))
+
+
+def slices_lost(share: float) -> Damage:
+    """Slices without a mask, here and there in all stacks."""
+
+    def lost(stack: Stack, rng: np.random.Generator) -> Stack:
+        return replace(stack, mask=stack.mask & (rng.random(stack.mask.shape[2]) >= share))
+
+    return Damage(lambda stacks, other, rng: tuple(lost(one, rng) for one in stacks))
+
+
+def span_lost(share: float) -> Damage:
+    """The middle of every stack's slices without a mask."""
+
+    def lost(stack: Stack) -> Stack:
+        rows = np.flatnonzero(stack.mask.any((0, 1)))
+        n, first = round(share * len(rows)), round((1 - share) / 2 * len(rows))
+        kept = np.isin(np.arange(stack.mask.shape[2]), rows[first : first + n], invert=True)
+        return replace(stack, mask=stack.mask & kept)
+
+    return Damage(lambda stacks, other, rng: tuple(map(lost, stacks)))
+
+
+def other_contrast() -> Damage:
+    """The last stack with dark fluid and bright tissue."""
+
+    def inverted(stack: Stack) -> Stack:
+        bright = float(np.percentile(stack.image[stack.mask], 99))
+        return replace(stack, image=np.where(stack.image > 0, np.maximum(1.2 * bright - stack.image, 0), 0))
+
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], inverted(stacks[-1])))
+
+
+def slices_reversed() -> Damage:
+    """The last stack with its slices in reverse order: a mirrored head, which no rigid motion makes right."""
+
+    def reversed_(stack: Stack) -> Stack:
+        return replace(stack, image=stack.image[:, :, ::-1], mask=stack.mask[:, :, ::-1])
+
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], reversed_(stacks[-1])), frozenset({2}))
+
+
+def halves_swapped() -> Damage:
+    """The last stack with even slices first, then odd ones: files sorted by time in place of position."""
+
+    def swapped(stack: Stack) -> Stack:
+        order = [*range(0, stack.image.shape[2], 2), *range(1, stack.image.shape[2], 2)]
+        return replace(stack, image=stack.image[:, :, order], mask=stack.mask[:, :, order])
+
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], swapped(stacks[-1])), frozenset({2}))
+
+
+def stack_of_another() -> Damage:
+    """The last stack is one of another head."""
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], other[len(stacks) - 1]), frozenset({2}))
+
+
+def nothing() -> Damage:
+    """None."""
+    return Damage(lambda stacks, other, rng: stacks)
+
+
+def applied(damage: Damage, stacks: Sequence[Stack], other: Sequence[Stack], rng: np.random.Generator) -> Stacks:
+    """The stacks after the damage; see `Damage`.
+
+    Args:
+        damage: to apply.
+        stacks: of a subject.
+        other: of another one.
+        rng: draws what is drawn.
+    """
+    return damage.apply(tuple(stacks), tuple(other), rng)
