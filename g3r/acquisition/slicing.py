@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.file_axes import between
 from g3r.acquisition.planes import FieldsOfView, Planes, Slices
 from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
+from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
 
 MIN_SLICE_PIXELS = 12
@@ -104,6 +107,17 @@ def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
     if not scale > 0:
         raise InputError(f"99th percentile inside the masks is {scale:g}; expected a positive intensity")
     return slices.scaled(1 / scale), scale
+
+
+def by_headers(slices: Slices, stacks: Sequence[Stack]) -> Slices:
+    """The slices with the header poses of their files, to the last digit, which the stacks have rounded.
+
+    Args:
+        slices: of the stacks.
+        stacks: all of them.
+    """
+    header_from_stack = RigidPose.concatenated([between(stack.grid, stack.header_grid) for stack in stacks])
+    return replace(slices, header_pose=header_from_stack.take(slices.stack_id) @ slices.header_pose)
 
 
 def slice_spacing_mm(stack: Slices) -> float:

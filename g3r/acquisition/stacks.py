@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
+from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
 from g3r.acquisition.images import Volume, load_mask, load_volume
 from g3r.acquisition.psf import IN_PLANE_FWHM_RANGE_PIXELS, THICKNESS_RANGE_MM
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
@@ -52,7 +53,8 @@ class Stack:
         name: for messages.
         in_plane_fwhm_pixels: of the PSF along the first and the second axis of the image.
         origin: where the PSF comes from, for the record.
-        slice_axis: axis of the file's image that became the last one.
+        axes: how the file's arrays became these.
+        file_affine: [4, 4] of the file, of which `affine` is the settled one; None where there is no file.
         mask_source, mask_detail: who made the mask, and with what.
 
     Raises:
@@ -68,7 +70,8 @@ class Stack:
     name: str = "stack"
     in_plane_fwhm_pixels: tuple[float, float] = NOMINAL_FWHM_PIXELS
     origin: ProfileOrigin = NOT_SAID
-    slice_axis: int = 2
+    axes: FileAxes = AS_IN_FILE
+    file_affine: NDArray[np.float64] | None = None
     mask_source: MaskSource = "file"
     mask_detail: str = ""
 
@@ -144,17 +147,21 @@ class Stack:
         return VolumeGrid(self.image.shape, self.affine)
 
     @property
+    def header_grid(self) -> VolumeGrid:
+        """The voxel grid as the file's header has it, before it was rounded (`settled`)."""
+        if self.file_affine is None:
+            return self.grid
+        return self.axes.grid_from_file(VolumeGrid(self.mask_as_in_file.shape, self.file_affine))
+
+    @property
     def mask_as_in_file(self) -> NDArray[np.bool_]:
         """The mask with the axes of the file's image."""
-        return np.moveaxis(self.mask, 2, self.slice_axis)
+        return self.axes.to_file(self.mask)
 
     @property
     def affine_as_in_file(self) -> NDArray[np.float64]:
         """The affine [4, 4] that belongs to `mask_as_in_file`."""
-        affine = self.affine.copy()
-        order = [axis for axis in range(3) if axis != self.slice_axis] + [self.slice_axis]
-        affine[:3, order] = self.affine[:3, :3]
-        return affine
+        return self.axes.grid_to_file(self.grid).affine if self.file_affine is None else self.file_affine
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
@@ -171,7 +178,8 @@ def load_stack(
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
     The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third; image, mask
-    and affine are permuted together so that it becomes the last. A slice keeps its number.
+    and affine are turned together so that it becomes the last and rows have one order (`FileAxes`). A slice keeps
+    its number. The affine is rounded to micrometres (`settled`).
 
     Args:
         path: of the NIfTI image.
@@ -196,21 +204,20 @@ def load_stack(
         found = FoundMask(inside=load_mask(mask, volume), source="file")
     if found.source != "whole image" and found.inside.all():
         logger.warning("%s: its mask marks every voxel; expected the brain alone", volume.name)
-    spacing = volume.grid.spacing_mm
-    through = slice_axis(spacing)
-    order = [axis for axis in range(3) if axis != through] + [through]
-    affine = volume.affine.copy()
-    affine[:3, :3] = affine[:3, order]
-    profile = find_slice_profile(path, spacing, through, thickness_mm, profile)
+    axes = FileAxes.of(volume.grid)
+    grid = settled(axes.grid_from_file(volume.grid))
+    spacing = axes.grid_to_file(grid).spacing_mm
+    profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile)
     stack = Stack(
-        image=np.ascontiguousarray(volume.data.transpose(order)),
-        mask=np.ascontiguousarray(found.inside.transpose(order)),
-        affine=affine,
+        image=axes.from_file(volume.data),
+        mask=axes.from_file(found.inside),
+        affine=grid.affine,
         thickness_mm=profile.thickness_mm,
         name=volume.name,
         in_plane_fwhm_pixels=profile.in_plane_fwhm_pixels,
         origin=profile.origin,
-        slice_axis=through,
+        axes=axes,
+        file_affine=volume.affine,
         mask_source=found.source,
         mask_detail=found.detail,
     )
@@ -252,11 +259,6 @@ def load_stacks(
             _check_pair(stack, other, Path(path), Path(other_path))
         stacks.append(stack)
     return stacks
-
-
-def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
-    """The axis across the slices: the one whose spacing is clearly above the others, else the third."""
-    return int(np.argmax(spacing_mm)) if np.max(spacing_mm) > 1.1 * np.median(spacing_mm) else 2
 
 
 def spaced(lengths: NDArray[np.float64]) -> str:

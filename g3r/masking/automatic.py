@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from g3r.acquisition.brain_mask import FoundMask
+from g3r.acquisition.file_axes import FileAxes, settled
 from g3r.acquisition.images import Volume
-from g3r.acquisition.stacks import slice_axis
 from g3r.mask_network.inference import find_brain
 from g3r.mask_network.model import MaskModel
 
@@ -31,12 +31,11 @@ class AutomaticMask:
             path: of the stack; not used.
             volume: that was read from it.
         """
-        spacing_mm = volume.grid.spacing_mm
-        through = slice_axis(spacing_mm)
-        order = [axis for axis in range(3) if axis != through] + [through]
-        image = np.nan_to_num(volume.data.transpose(order), posinf=0.0, neginf=0.0)
-        found = find_brain(image, spacing_mm[order].tolist(), self.model)
+        axes = FileAxes.of(volume.grid)
+        spacing_mm = settled(axes.grid_from_file(volume.grid)).spacing_mm
+        image = np.nan_to_num(axes.from_file(volume.data), posinf=0.0, neginf=0.0)
+        found = find_brain(image, spacing_mm.tolist(), self.model)
         if not found.found:
             return found.reason
         detail = f"{self.model.file_name}, probability of a head {found.presence:.2f}"
-        return FoundMask(inside=np.moveaxis(found.mask, 2, through), source="automatic", detail=detail)
+        return FoundMask(inside=axes.to_file(found.mask), source="automatic", detail=detail)

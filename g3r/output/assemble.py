@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground
+from g3r.acquisition.slicing import by_headers
 from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
 from g3r.fitting.held_out_slices import HeldOutChoice
@@ -177,7 +178,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         prior_grid=volumes.grid,
         cloud=fit.cloud,
         intensity_scale=found.intensity,
-        slices=fit.slices,
+        slices=by_headers(fit.slices, found.stacks),
         gain=fit.gain,
         weight=fit.weight,
         ncc=found.registration.ncc,

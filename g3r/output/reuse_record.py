@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.file_axes import FileAxes
 from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
@@ -29,23 +30,20 @@ class StackGrid:
 
     Attributes:
         grid: with the slices along the third axis.
-        slice_axis: axis of the file's image that became the third one.
+        axes: how the file's arrays become those on the grid.
     """
 
     grid: VolumeGrid
-    slice_axis: int
+    axes: FileAxes
 
     @classmethod
     def of(cls, stack: Stack) -> StackGrid:
         """Those of a stack that was read."""
-        return cls(stack.grid, stack.slice_axis)
+        return cls(stack.header_grid, stack.axes)
 
     def in_file(self) -> VolumeGrid:
         """The grid with the axes of the file."""
-        order = [axis for axis in range(3) if axis != self.slice_axis] + [self.slice_axis]
-        affine, shape = self.grid.affine.copy(), np.empty(3, int)
-        affine[:3, order], shape[order] = self.grid.affine[:3, :3], self.grid.shape
-        return VolumeGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+        return self.axes.grid_to_file(self.grid)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +91,8 @@ class ReuseRecord:
             "intensity_scale": np.float64(self.intensity_scale),
             "stack_shape": np.array([one.grid.shape for one in self.stacks]).reshape(-1, 3),
             "stack_affine": np.array([one.grid.affine for one in self.stacks]).reshape(-1, 4, 4),
-            "stack_slice_axis": np.array([one.slice_axis for one in self.stacks], dtype=np.int64),
+            "stack_slice_axis": np.array([one.axes.slice_axis for one in self.stacks], dtype=np.int64),
+            "stack_flipped": np.array([one.axes.flipped for one in self.stacks], dtype=bool).reshape(-1, 2),
             "stack_id": slices.stack_id,
             "slice_index": slices.slice_index,
             "thickness_mm": slices.thickness_mm,
@@ -139,13 +138,15 @@ def _record(data: dict[str, NDArray[Any]]) -> ReuseRecord:
         slice_index=data["slice_index"],
         thickness_mm=data["thickness_mm"],
     )
-    stacks = zip(data["stack_shape"], data["stack_affine"], data["stack_slice_axis"], strict=True)
+    turned = zip(data["stack_slice_axis"], data["stack_flipped"], strict=True)
+    axes = [FileAxes(int(axis), (bool(first), bool(second))) for axis, (first, second) in turned]
+    stacks = zip(data["stack_shape"], data["stack_affine"], axes, strict=True)
     return ReuseRecord(
         grid=grid,
         support=_bits(data["support"], math.prod(grid.shape)).reshape(grid.shape),
         prior_grid=_grid(data["prior_grid_shape"], data["prior_grid_affine"]),
         intensity_scale=float(data["intensity_scale"]),
-        stacks=tuple(StackGrid(_grid(shape, affine), int(axis)) for shape, affine, axis in stacks),
+        stacks=tuple(StackGrid(_grid(shape, affine), one) for shape, affine, one in stacks),
         slices=slices,
         gain=data["gain"],
         weight=data["weight"],

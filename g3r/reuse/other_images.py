@@ -46,7 +46,7 @@ def load_images(run: FinishedRun, paths: Sequence[str | os.PathLike[str]]) -> li
     for path, stack, name in zip(paths, run.geometry.stacks, run.stack_names, strict=True):
         volume = load_volume(path)
         check_grid(volume, stack.in_file(), f"that of {name} in the run", "image")
-        images.append(np.ascontiguousarray(np.moveaxis(volume.data, stack.slice_axis, 2)))
+        images.append(stack.axes.from_file(volume.data))
     return images
 
 

@@ -8,9 +8,8 @@ import pytest
 
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.area_profile import head_volume_mm3
-from g3r.acquisition.planes import Slices
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.slicing import normalised_slices, slices_from_stacks
+from g3r.acquisition.slicing import by_headers, normalised_slices, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, stacks_of_two, write
@@ -37,8 +36,11 @@ def test_normalised_slices_have_their_99th_percentile_at_one() -> None:
     np.testing.assert_allclose(slices.value * scale, slices_from_stacks(stacks_of_two()).value, rtol=1e-6)
 
 
-def assert_pixels_are_voxels(slices: Slices, image: np.ndarray, affine: np.ndarray, n_masked: int) -> None:
+def assert_pixels_are_voxels(stack: Stack, image: np.ndarray, affine: np.ndarray, n_masked: int) -> None:
     """Every masked pixel of the slices: position and value are those of the voxel it was cut from."""
+    slices = by_headers(slices_from_stacks([stack]), [stack])
+    np.testing.assert_allclose(slices.world_from_header().translation_mm, 0, atol=0.02)  # as they are read
+    slices = slices.with_pose(slices.header_pose)
     world = slices.planes.pixel_world_mm(slices.pixel_index)
     assert len(world) == n_masked
     index = (np.linalg.inv(affine) @ np.c_[world, np.ones(len(world))].T)[:3].T
@@ -58,7 +60,7 @@ def test_pixels_lie_where_the_header_says(tmp_path: Path, name: str) -> None:
     kept = mask.sum((0, 1)) >= 12
     slices = slices_from_stacks([stack])
     stored = nib.Nifti1Image.from_filename(tmp_path / "a.nii.gz").affine  # float32 in the file
-    assert_pixels_are_voxels(slices, image, stored, mask[:, :, kept].sum())
+    assert_pixels_are_voxels(stack, image, stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
     np.testing.assert_allclose(np.linalg.det(slices.planes.rotation), 1, atol=1e-12)
     np.testing.assert_allclose(slices.world_from_header().translation_mm, 0, atol=1e-12)
@@ -80,7 +82,7 @@ def test_slices_on_any_axis_are_found_by_their_distance(tmp_path: Path, through:
     slices = slices_from_stacks([stack])
     kept = mask.sum((0, 1)) >= 12
     stored = nib.Nifti1Image.from_filename(path).affine
-    assert_pixels_are_voxels(slices, image.transpose(order), stored, mask[:, :, kept].sum())
+    assert_pixels_are_voxels(stack, image.transpose(order), stored, mask[:, :, kept].sum())
     assert slices.slice_index.tolist() == np.flatnonzero(kept).tolist()
 
 

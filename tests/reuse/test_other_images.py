@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from data_synth.cli import main as simulate
+from g3r.acquisition.file_axes import FileAxes
 from g3r.acquisition.images import load_mask, load_volume, save_volume
 from g3r.cli.apply import main
 from g3r.errors import InputError
@@ -112,7 +113,7 @@ def test_the_pixels_are_those_that_the_run_used(subject: Path, run: FinishedRun)
 def test_stacks_with_another_slice_axis_are_turned(subject: Path, finished: Path, run: FinishedRun) -> None:
     """The grid in the file of a stack whose slices are along its first axis."""
     stack = run.geometry.stacks[0]
-    turned = type(stack)(stack.grid, 0).in_file()
+    turned = type(stack)(stack.grid, FileAxes(0)).in_file()
     assert turned.shape == (stack.grid.shape[2], *stack.grid.shape[:2])
     np.testing.assert_allclose(turned.world([3, 1, 2]), stack.grid.world([1, 2, 3]))
 

@@ -1,0 +1,130 @@
+"""From the axes of a file to those of a stack, the same for every program that wrote the file.
+
+One acquisition reaches us through different converters. They store rows in either order, and the last digits of their
+affines differ. Search and fit (L1, Adam) amplify the smallest difference until it is as large as their own tolerance,
+some 0.5 % of the range. So pixels come in one order, and geometry is read as finely as it matters and no finer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from g3r.geometry import RigidPose, VolumeGrid
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+QUATERNION_STEP = 5e-5
+"""Of the orientation: at most 0.01 mm at 120 mm from the middle."""
+
+CENTER_STEP_MM = 2.0**-7
+"""Of the middle of the image. A power of two, because sizes with few digits never lie between two multiples of it."""
+
+SPACING_STEP_MM = (1e-6, 1e-6, 1e-4)
+"""Of the voxel size. Pixels have few digits (1.171875 mm); slice distances come from positions with few digits."""
+
+
+@dataclass(frozen=True)
+class FileAxes:
+    """How a file's array becomes one with the slices along the third axis and its rows in the usual order.
+
+    Attributes:
+        slice_axis: axis of the file that becomes the third one. A slice keeps its number.
+        flipped: whether the first and the second axis run backwards.
+    """
+
+    slice_axis: int = 2
+    flipped: tuple[bool, bool] = (False, False)
+
+    @classmethod
+    def of(cls, grid: VolumeGrid) -> FileAxes:
+        """Those of a file: both axes of a slice lead to the right, to the front, or up, whichever is nearest."""
+        through = slice_axis(grid.spacing_mm)
+        axes = cls(through).grid_from_file(grid).affine[:3, :2]
+        main = axes[np.abs(axes).argmax(0), [0, 1]]
+        return cls(through, (bool(main[0] < 0), bool(main[1] < 0)))
+
+    def from_file(self, array: NDArray[Scalar]) -> NDArray[Scalar]:
+        """The array [I, J, K], contiguous, of the file's."""
+        return np.ascontiguousarray(np.moveaxis(array, self.slice_axis, 2)[self._steps])
+
+    def to_file(self, array: NDArray[Scalar]) -> NDArray[Scalar]:
+        """The file's array of one [I, J, K]."""
+        return np.moveaxis(array[self._steps], 2, self.slice_axis)
+
+    def grid_from_file(self, grid: VolumeGrid) -> VolumeGrid:
+        """The grid of `from_file`."""
+        shape, affine = [grid.shape[axis] for axis in self._order], grid.affine.copy()
+        affine[:3, :3] = affine[:3, self._order]
+        return self._turned(VolumeGrid((shape[0], shape[1], shape[2]), affine))
+
+    def grid_to_file(self, grid: VolumeGrid) -> VolumeGrid:
+        """The grid of `to_file`."""
+        grid = self._turned(grid)
+        shape, affine = np.empty(3, int), grid.affine.copy()
+        shape[self._order] = grid.shape
+        affine[:3, self._order] = grid.affine[:3, :3]
+        return VolumeGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+    @property
+    def _order(self) -> list[int]:
+        return [axis for axis in range(3) if axis != self.slice_axis] + [self.slice_axis]
+
+    @property
+    def _steps(self) -> tuple[slice, slice]:
+        first, second = (slice(None, None, -1 if backwards else 1) for backwards in self.flipped)
+        return first, second
+
+    def _turned(self, grid: VolumeGrid) -> VolumeGrid:
+        affine = grid.affine.copy()
+        for axis in np.flatnonzero(self.flipped):
+            affine[:3, 3] += (grid.shape[axis] - 1) * affine[:3, axis]
+            affine[:3, axis] *= -1
+        return VolumeGrid(grid.shape, affine)
+
+
+AS_IN_FILE = FileAxes()
+"""Of an array that is used as it lies in its file."""
+
+
+def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
+    """The axis across the slices: the one whose spacing is clearly above the others, else the third."""
+    return int(np.argmax(spacing_mm)) if np.max(spacing_mm) > 1.1 * np.median(spacing_mm) else 2
+
+
+def settled(grid: VolumeGrid) -> VolumeGrid:
+    """The grid, rounded, so that headers of one acquisition whose last digits differ give the same one.
+
+    No point within 120 mm of the middle moves by more than 0.02 mm. Seldom two headers lie on two sides of a step.
+
+    Args:
+        grid: slices along the third axis.
+    """
+    rotation, mirror = _nearest_rotation(grid)
+    # q and -q are one rotation and are rounded to one
+    quaternion = np.rint(Rotation.from_matrix(rotation).as_quat() / QUATERNION_STEP)
+    rounded = Rotation.from_quat(quaternion).as_matrix() * mirror
+    stretch = (rotation * mirror).T @ grid.affine[:3, :3]  # keeps what shear there is
+    stretch = np.rint(stretch / SPACING_STEP_MM) * SPACING_STEP_MM
+    middle = (np.array(grid.shape) - 1) / 2
+    affine = np.eye(4)
+    affine[:3, :3] = rounded @ stretch
+    affine[:3, 3] = np.rint(grid.center_mm / CENTER_STEP_MM) * CENTER_STEP_MM - affine[:3, :3] @ middle
+    return VolumeGrid(grid.shape, affine)
+
+
+def between(start: VolumeGrid, end: VolumeGrid) -> RigidPose:
+    """The motion (one) that takes a grid to one that `settled` made of it, or back."""
+    frames = [RigidPose(_nearest_rotation(grid)[0][None], grid.center_mm[None]) for grid in (start, end)]
+    return frames[1] @ frames[0].inverse()
+
+
+def _nearest_rotation(grid: VolumeGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The rotation [3, 3] nearest to the axes; factors [3] of its columns that mirror it back where the axes are."""
+    left, _, right = np.linalg.svd(grid.affine[:3, :3] / grid.spacing_mm)
+    mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return left @ right * mirror, mirror
