@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from g3r.acquisition.brain_mask import MaskSource
+from g3r.acquisition.mask_extent import left_out_share
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.sidecar import Axis
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, ProfileOrigin, SliceProfile, ThicknessSource
@@ -31,6 +32,7 @@ class StackRecord:
         spacing_mm: of pixels and slices.
         mask_from, mask_detail: who made the mask, and with what.
         mask_ml: what is marked.
+        left_out_share: of what the image shows, see `acquisition.mask_extent`.
         quality, interleave, n_segments: None where the stack had no slices.
         standard_from_scanner: [4, 4] robust mean motion (RAS, mm) of its slices, from where its header puts them; None
             in scanner space, and where the stack had no slices.
@@ -46,6 +48,7 @@ class StackRecord:
     mask_from: MaskSource = "file"
     mask_detail: str = ""
     mask_ml: float = 0.0
+    left_out_share: float = 0.0
     n_slices: int = 0
     quality: StackQuality | None = None
     interleave: int | None = None
@@ -107,6 +110,7 @@ def stack_records(
             mask_from=stack.mask_source,
             mask_detail=stack.mask_detail,
             mask_ml=round(float(stack.mask.sum()) * stack.grid.voxel_volume_mm3 / 1000, 1),
+            left_out_share=round(left_out_share(stack), 3),
             n_slices=int((stack_id == n).sum()),
             quality=qualities[n],
             interleave=registration.interleave[place[n]] if n in place else None,

@@ -79,6 +79,11 @@ MESSAGES = {
     "whole image": Message(
         CHECK, "no mask was used for {stacks}: the whole image was taken for brain", "Check that only brain is shown."
     ),
+    "mask too small": Message(
+        CHECK,
+        "the mask of {stack} leaves out {share} of what the image shows, and nothing but a brain seems to be in it",
+        "Look whether the mask ends inside the brain: what it leaves out is not in the volume.",
+    ),
     "thickness assumed": Message(
         CHECK,
         "the slice thickness of {stacks} was not stated; the distance of slices was taken ({mm} mm)",
@@ -184,6 +189,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
 
 
 def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
+    if stack.left_out_share:
+        yield "mask too small", {"stack": stack.name, "share": f"{100 * stack.left_out_share:.0f} %"}
     quality = stack.quality
     if quality is None:
         return

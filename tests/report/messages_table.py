@@ -20,6 +20,7 @@ FILLED_IN = {
     "mm": "N",
     "n": "N",
     "where": "interrupted",
+    "share": "N %",
     "what": "brain",
     "shortfalls": "what is bad of it, and what is good",
 }

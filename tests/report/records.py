@@ -23,6 +23,7 @@ def stack(
     *,
     thickness_from: ThicknessSource = "sidecar",
     mask_from: MaskSource = "file",
+    left_out_share: float = 0.0,
 ) -> StackRecord:
     return StackRecord(
         name=name,
@@ -31,6 +32,7 @@ def stack(
         spacing_mm=[0.8, 0.8, 3.3],
         mask_from=mask_from,
         mask_ml=280.0,
+        left_out_share=left_out_share,
         n_slices=30,
         n_downweighted_slices=2,
         quality=found or quality(),

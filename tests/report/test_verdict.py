@@ -53,6 +53,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
     ),
     "rollbacks": (record(n_rollbacks=2), CHECK, "step back 2 times"),
     "automatic": (stacks_with(stack("c.nii", mask_from="automatic")), CHECK, "mask of c.nii was found automatically"),
+    "small mask": (
+        stacks_with(stack("c.nii", left_out_share=0.214)),
+        CHECK,
+        "the mask of c.nii leaves out 21 % of what the image shows",
+    ),
     "whole image": (stacks_with(stack("c.nii", mask_from="whole image")), CHECK, "no mask was used for c.nii"),
     "thickness": (
         record(*(stack(f"{n}.nii", thickness_from="spacing") for n in "abc")),

@@ -1,0 +1,44 @@
+"""Whether a mask ends inside the brain, where the image itself shows how far the brain reaches.
+
+That is so in images without surroundings, such as those of a tool that has cut out the brain. Where skull and mother
+are shown, too, grey values do not tell brain from what lies beside it, and this says nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from g3r.acquisition.stacks import Stack
+
+LEFT_OUT_RANGE = (0.09, 0.4)
+"""Share of an image's content outside its mask at which brain is missing in the mask: a mask that fits leaves out 2 to
+4 %, one that is one pixel of 0.8 mm too small 6 to 8 %, four pixels 18 to 26 % (heads of 24 and 30 weeks of
+docs/stress.md). With more, the image shows something else, too."""
+
+RIM_MM = 6.0
+"""What a mask leaves out lies around it; whatever reaches further is something else."""
+
+MAX_BEYOND = 0.1
+"""Share of what is left out that may lie further away: noise, edges of the image."""
+
+BRIGHT_SHARE = 0.3
+"""Of the median in the mask; what is darker is noise, or nothing."""
+
+
+def left_out_share(stack: Stack) -> float:
+    """Share of what a stack shows that its mask leaves out; 0 where that is little, or more than the brain is shown.
+
+    Only slices with a mask count: others may have been left out on purpose.
+    """
+    used = stack.mask.any((0, 1))
+    image, mask = stack.image[:, :, used], stack.mask[:, :, used]
+    shown = image > BRIGHT_SHARE * float(np.median(image[mask]))
+    outside = shown & ~mask
+    share = np.count_nonzero(outside) / max(np.count_nonzero(shown), 1)
+    low, high = LEFT_OUT_RANGE
+    if not low <= share <= high:
+        return 0.0
+    in_plane_mm = [distance_transform_edt(~one, stack.spacing_mm[:2]) for one in np.moveaxis(mask, 2, 0)]
+    beyond = np.stack(in_plane_mm, 2)[outside] > RIM_MM
+    return float(share) if beyond.mean() < MAX_BEYOND else 0.0
