@@ -254,13 +254,7 @@ STUDY = Study(
     options={
         "--stacks": {"nargs": "+", "type": Path, "default": [], "metavar": "NIFTI", "help": "(none: the test data's)"},
         "--masks": {"nargs": "+", "type": Path, "default": [], "metavar": "NIFTI", "help": "brain masks of --stacks"},
-        "--held-out": {
-            "nargs": "+",
-            "type": Path,
-            "default": [],
-            "metavar": "NIFTI",
-            "help": "repeats, predicted",
-        },
+        "--held-out": {"nargs": "+", "type": Path, "default": [], "metavar": "NIFTI", "help": "repeats, predicted"},
         "--held-out-mask": {"nargs": "+", "type": Path, "default": [], "metavar": "NIFTI", "help": "masks of those"},
         "--thickness": {"type": float, "metavar": "MM", "help": "of all slices (None: of the sidecars)"},
         "--eroded-pixels": {"type": int, "default": ERODED_PIXELS, "metavar": "N", "help": "rim that does not count"},
