@@ -39,7 +39,7 @@ def table_1() -> Iterator[Claim]:
             name = head.split(",")[0]
             yield Claim(
                 text=f"Better {name} than every baseline, in the mask, {kind}",
-                asked="better, asked for; so it is in the paper",
+                asked="better, asked for; " + ("equal in the paper" if head == LPIPS else "so it is in the paper"),
                 block=block,
                 find=ahead(3, head, needed),
                 yes=f"On {kind} g3r has the best {name} in the mask ({{figure}}, the nearest).",

@@ -83,11 +83,11 @@ def ahead(
         if table is None or own is None or n is None:
             return None
         sign = -1 if head == LPIPS else 1
-        gains = {
-            name: sign * (own - other)
-            for name in of or [row["method"] for row in table.rows if row["method"] not in (first, PRIOR)]
-            if (other := value(table.row(name), head)) is not None and value(table.row(name), "subjects") == n
-        }
+        names = of or [row["method"] for row in table.rows if row["method"] not in (first, PRIOR)]
+        known = {name: other for name in names if (other := value(table.row(name), head)) is not None}
+        # means over other subjects are not compared
+        same = [name for name in known if value(table.row(name), "subjects") == n]
+        gains = {name: sign * (own - known[name]) for name in same}
         if not gains:
             return None
         least = min(gains, key=lambda name: gains[name])
@@ -97,7 +97,8 @@ def ahead(
             head, f"{gain:+.3f} {word}"
         )
         holds = gain >= at_least if at_least else gain > 0
-        return Finding(figure=f"{text} {least}", n=int(n), of="subjects", holds=holds, enough=n >= needed)
+        figure = "; without ".join([f"{text} {least}", *(name for name in known if name not in same)])
+        return Finding(figure=figure, n=int(n), of="subjects", holds=holds, enough=n >= needed)
 
     return find
 
