@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from studies.paper.methods import PRIOR, PRODUCT
 from studies.results.blocks import Block, Table
-from studies.results.findings import FEW, NOTICEABLE_DB, Finding, value
+from studies.results.findings import FEW, NOTICEABLE_DB, Finding, table_after, value
 from studies.tables import stacks
 
 Find = Callable[[Block], Finding | None]
@@ -174,6 +174,10 @@ def predicts_better(than: str, head: str) -> Find:
         text = f"{gain:+.2f} dB" if head == PSNR else f"{gain:+.4f}"
         n = int(counted[1])
         figure = f"{text}, {counted[2]} held-out stacks"
+        each = table_after(block, "Every stack") if head == PSNR else None
+        if each:
+            better = [(value(one, f"{PRODUCT}, dB") or 0) > (value(one, f"{than}, dB") or 0) for one in each.rows]
+            figure = f"{text}, better in {sum(better)} of {len(better)} held-out stacks"
         return Finding(figure=figure, n=n, of="subjects", holds=gain > 0, enough=n >= FEW)
 
     return find
