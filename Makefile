@@ -35,7 +35,7 @@ STAMP := $(VENV)/.installed
 # the best checkpoint of the newest run below a folder, or its last one ("best..." sorts before "last")
 best_of = ls "$$(ls -dt $(1)/version_*/checkpoints | head -n 1)"/*.ckpt | head -n 1
 
-.PHONY: help install demo docs docs-serve test test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty clean
+.PHONY: help install demo docs docs-serve test test-slow test-numerics test-faults container-check lint types pretrain tensorboard bench bench-phantom fit-uncertainty results clean
 
 help: ## show this list
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | awk -F'\t' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -133,6 +133,9 @@ bench: install ## kernels, scaling and speed against accuracy, on phantoms or on
 bench-phantom: install ## a small phantom of the size that other methods were timed on: seconds of `fast`
 	$(BIN)/python -m studies.tradeoff.peer_phantom --force --output $(PHANTOM_CASES)/small
 	$(BIN)/g3r-bench trade $(PHANTOM_CASES)/small --presets fast --output runs/bench/phantom $(BENCH_ARGS)
+
+results: install ## docs/results.md anew, from the tables that studies have published in the other pages
+	$(BIN)/python -m studies.results.page
 
 clean: ## remove what the commands above made, the environment excepted
 	rm -rf demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g3r.bench.record import machine, put_between_markers, write_json, write_text
+from g3r.bench.record import machine, machine_line, put_between_markers, write_json, write_text
 from g3r.errors import G3RError, InputError
 from g3r.planning.presets import PRESETS
 from g3r.run.machine import available_cores, use_up_to
@@ -172,7 +172,7 @@ class Study:
         print("\n\n".join(texts.values()))
         for marker, text in texts.items():
             if options.docs:
-                put_between_markers(options.docs, marker, text)
+                put_between_markers(options.docs, marker, stated(text, record["machine"]))
         if self.figure and options.figure:
             self.figure(record, options)
         return 0 if self.verdict is None or self.verdict(record) else 1
@@ -192,6 +192,16 @@ class Study:
         if hasattr(options, "development"):
             found["development"] = options.development
         return found | (self.settings(options) if self.settings else {})
+
+
+def stated(text: str, found: Record) -> str:
+    """Published tables with the machine and the commit of their record, unless they say them already.
+
+    Args:
+        text: in Markdown.
+        found: by `g3r.bench.record.machine`.
+    """
+    return text if "commit " in text or "|" not in text else f"{text}\n\n{machine_line(found)}"
 
 
 def left_text(n_done: int, n_all: int, seconds: float) -> str:

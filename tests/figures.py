@@ -6,6 +6,7 @@ They follow from the tables of docs/tradeoff.md, which studies measure, and from
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 
@@ -15,8 +16,8 @@ from tests.rooms import REPOSITORY
 
 Rows = list[dict[str, str]]
 
-README, PEERS = REPOSITORY / "README.md", REPOSITORY / "docs" / "peers.md"
-TRADEOFF = REPOSITORY / "docs" / "tradeoff.md"
+README, DOCS = REPOSITORY / "README.md", REPOSITORY / "docs"
+PEERS, PAPER, TRADEOFF = DOCS / "peers.md", DOCS / "paper.md", DOCS / "tradeoff.md"
 
 WHAT = {
     "`fast`": "a shorter registration, one fit",
@@ -87,11 +88,16 @@ def measured(preset: str) -> list[str]:
     return [row["PSNR, dB"], f"{float(row['SSIM']):.3f}", f"{float(row['CPU seconds']):.0f}"]
 
 
-def peers_table() -> str:
+def peers_table(presets: Sequence[str] = ("`fast`", "`balanced`")) -> str:
     """g3r and another program on one case."""
     lines = [[f"{NESVOR[0]}, {NESVOR[1]}", *NESVOR[2:]]]
-    lines += [[f"g3r {preset}", *measured(preset)] for preset in ("`fast`", "`balanced`")]
+    lines += [[f"g3r {preset}", *measured(preset)] for preset in presets]
     return markdown_table(["method", "PSNR, dB", "SSIM", "CPU seconds"], lines)
+
+
+def elsewhere_table() -> str:
+    """The other program alone."""
+    return peers_table(())
 
 
 def short_peers_table() -> str:
@@ -108,6 +114,7 @@ TABLES = {
     (README, "presets"): presets_table,
     (README, "peers"): short_peers_table,
     (PEERS, "peers"): peers_table,
+    (PAPER, "paper-elsewhere"): elsewhere_table,
     (messages_table.DOCUMENT, messages_table.MARKER): messages_table.table,
 }
 """By document and marker."""

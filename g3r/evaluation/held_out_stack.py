@@ -8,6 +8,7 @@ cutting a volume at its mask neither helps nor hurts.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,28 @@ class StackPrediction:
         return {"stack": self.stack, **self.figures(), "slices": [asdict(one) for one in self.slices]}
 
 
+@dataclass(frozen=True, kw_only=True)
+class PredictedPixels:
+    """A stack in the poses that were found for it in a volume, and its slices as the volume predicts them.
+
+    Attributes:
+        slices: K slices in their poses.
+        value: [P] pixels as the volume predicts them, in its own intensities.
+        seen: [P] share of each pixel's PSF that lies where the volume counts.
+        search_correlation: see `StackPrediction`.
+    """
+
+    slices: Slices
+    value: NDArray[np.float32]
+    seen: NDArray[np.float32]
+    search_correlation: float
+
+    def image(self, pixels: NDArray[Any], k: int) -> NDArray[Any]:
+        """Slice `k` [H, W] of one value per pixel [P]."""
+        planes = self.slices.planes
+        return pixels[planes.offset[k] : planes.offset[k + 1]].reshape(tuple(planes.shape[k]))
+
+
 def predict_stack(
     volume: Volume,
     stack: Stack,
@@ -97,6 +120,18 @@ def predict_stack(
     Raises:
         InputError: a volume or a stack that cannot be used, or a stack that is not found in the volume.
     """
+    found = predicted_pixels(volume, stack, support=support, seed=seed)
+    return score_prediction(found, stack.name, volume.name, eroded_pixels)
+
+
+def predicted_pixels(
+    volume: Volume, stack: Stack, *, support: NDArray[np.bool_] | None = None, seed: int = 0
+) -> PredictedPixels:
+    """Find the slices of a stack in a volume, and simulate them there; for arguments see `predict_stack`.
+
+    Raises:
+        InputError: a volume or a stack that cannot be used.
+    """
     data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
     shown = data != 0 if support is None else support & (data != 0)
     scale = float(np.percentile(data[shown], DATA_RANGE_PERCENTILE)) if shown.any() else 0.0
@@ -106,19 +141,33 @@ def predict_stack(
     # the whole volume: slices do not fit one that was cut
     slices, found = place_in_volume(slices, data / np.float32(scale), volume.grid, np.random.default_rng(seed))
     predicted, seen = (_simulated(one, slices, volume) for one in (data, shown.astype(np.float32)))
+    return PredictedPixels(slices=slices, value=predicted, seen=seen, search_correlation=found)
+
+
+def score_prediction(found: PredictedPixels, stack: str, volume: str, eroded_pixels: int) -> StackPrediction:
+    """Compare a stack with its prediction.
+
+    Args:
+        found: the prediction.
+        stack: its name.
+        volume: name of the volume.
+        eroded_pixels: at the rim of the mask that do not count.
+
+    Raises:
+        InputError: the stack is not found in the volume.
+    """
+    slices = found.slices
     data_range = float(np.percentile(slices.masked_value, DATA_RANGE_PERCENTILE))
     scores, n_eroded = [], 0
-    offset = slices.planes.offset
     for k in range(len(slices)):
-        shape, pixels = tuple(slices.planes.shape[k]), slice(offset[k], offset[k + 1])
-        inside = _eroded(slices.mask[pixels].reshape(shape), eroded_pixels)
-        counted = inside & (seen[pixels].reshape(shape) > MIN_SUPPORT)
+        inside = _eroded(found.image(slices.mask, k), eroded_pixels)
+        counted = inside & (found.image(found.seen, k) > MIN_SUPPORT)
         n_eroded += int(inside.sum())
         if counted.sum() >= MIN_PIXELS:
             scores.append(
                 score_slice(
-                    predicted[pixels].reshape(shape),
-                    slices.value[pixels].reshape(shape),
+                    found.image(found.value, k),
+                    found.image(slices.value, k),
                     counted,
                     spacing_mm=slices.planes.spacing_mm[k],
                     data_range=data_range,
@@ -127,12 +176,14 @@ def predict_stack(
             )
     if not scores:
         raise InputError(
-            f"{stack.name}: no slice of {MIN_PIXELS} pixels lies where {volume.name} shows something "
-            f"(correlation {found:.2f}); check that both show the same brain"
+            f"{stack}: no slice of {MIN_PIXELS} pixels lies where {volume} shows something "
+            f"(correlation {found.search_correlation:.2f}); check that both show the same brain"
         )
-    n_counted = sum(one.n_pixels for one in scores)
     return StackPrediction(
-        stack=stack.name, slices=tuple(scores), counted_share=n_counted / n_eroded, search_correlation=found
+        stack=stack,
+        slices=tuple(scores),
+        counted_share=sum(one.n_pixels for one in scores) / n_eroded,
+        search_correlation=found.search_correlation,
     )
 
 

@@ -17,7 +17,7 @@ from studies.paper.methods import measure_methods
 from studies.paper.peers import measure_peer, peer
 from studies.paper.scores import why_no_lpips
 from studies.paper.subjects import N_SUBJECTS, PaperSubject, atlas_heads, phantom_heads
-from studies.paper.tables import CONDITIONS, main_tables, measured_elsewhere, stages_table, variants_table
+from studies.paper.tables import CONDITIONS, main_tables, stages_table, variants_table
 from studies.tables import stacks
 
 STACK_NUMBERS = (3, 2, 1)
@@ -84,8 +84,7 @@ def tables(record: Record) -> dict[str, str]:
         "paper-variants": variants_table(record),
         "paper-stages": stages_table(record),
     }
-    elsewhere = {"paper-elsewhere": measured_elsewhere()}
-    return {f"{name}{suffix(record)}": text for name, text in texts.items()} | elsewhere
+    return {f"{name}{suffix(record)}": text for name, text in texts.items()}
 
 
 STUDY = Study(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from studies.harness import DOCS, Record, Row
+from studies.harness import Record, Row
 from studies.paper.ablation import VARIANTS
 from studies.paper.methods import METHODS, NO_NETWORK, PRODUCT, UNCONSTRAINED
 from studies.tables import Cell, details, spread, stacks, table
@@ -148,13 +147,6 @@ def variant_values(rows: Iterable[Row], name: str, n_stacks: int) -> list[float]
 
 def _variant_cell(rows: Sequence[Row], n_stacks: int) -> Cell:
     return lambda line: spread(variant_values(rows, line["name"], n_stacks))
-
-
-def measured_elsewhere(document: Path = DOCS / "peers.md") -> str:
-    """The rows of other programs in a document, which were measured on another case."""
-    text = document.read_text(encoding="utf-8")
-    rows = text.split("<!-- peers:begin -->")[1].split("<!-- peers:end -->")[0].strip().splitlines()
-    return "\n".join(rows[:2] + [row for row in rows[2:] if not row.startswith("| g3r")])
 
 
 def stages_table(record: Record) -> str:

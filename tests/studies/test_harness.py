@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from g3r.bench.record import machine_line
 from g3r.errors import InputError
-from studies.harness import Study, Task, resumed
+from studies.harness import Study, Task, resumed, stated
 from studies.tables import details, spread, table
 
 FOLDER = Path(__file__).resolve().parents[2] / "studies"
@@ -54,7 +55,10 @@ def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path: Path, capsy
     assert study.main(["2", "3", "4", *output, "--docs", str(tmp_path / "page.md")]) == 0
     assert "1 rows kept" in capsys.readouterr().out
     lines = "| n | squared |\n| --- | ---: |\n| 2 | 4 |\n| 3 | 9 |"
-    assert (tmp_path / "page.md").read_text() == PAGE.replace("old", lines)
+    machine = json.loads((tmp_path / "out" / "squares.json").read_text())["machine"]
+    assert (tmp_path / "page.md").read_text() == PAGE.replace("old", f"{lines}\n\n{machine_line(machine)}")
+    assert stated("| of commit 1 |", machine) == "| of commit 1 |"
+    assert stated("Not measured yet.", machine) == "Not measured yet."
     assert (tmp_path / "out" / "squares.md").read_text() == lines + "\n"
     assert study.main(["9", *output]) == 1  # the verdict
 

@@ -1,0 +1,216 @@
+"""Claims that other pages measure: verdicts, presets, prior and gate, masks, what no slice saw, another program."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from g3r.report.verdict import USE
+from studies.results.blocks import Block
+from studies.results.findings import FEW, NOTICEABLE_DB, Claim, Finding, column, paired, shares, table_after, value
+
+MEANS = "mean gain over the quicker one"
+"""The last row of the table of presets, where each is compared with the one before it."""
+
+SEEDS = 3
+"""Trainings of a variant that show more than their own chance."""
+
+
+def warned(bad: bool) -> Claim:
+    """What the verdict says of bad runs, or of good ones."""
+
+    def find(block: Block) -> Finding | None:
+        table = table_after(block, "Every run")
+        runs = [row for row in table.rows if (row["bad"] == "bad") == bad] if table else []
+        said = sum(not row["verdict"].startswith(f"{USE}:") for row in runs)
+        if not runs:
+            return None
+        return shares(said, len(runs), 0.95, "runs") if bad else shares(len(runs) - said, len(runs), 0.95, "runs")
+
+    kind = "bad" if bad else "good"
+    what = "is warned about" if bad else "gets no warning"
+    return Claim(
+        text=f"A {kind} run (more than 5 % of the brain off by more than 2 mm, or under 20 dB) {what}"
+        if bad
+        else f"A {kind} run {what}",
+        asked="at least 95 %, asked for" if bad else "at least 95 %, asked for: at most 5 % warned",
+        block="stress-sweep",
+        find=find,
+        yes=f"The verdict is right about {kind} runs: {{figure}}.",
+        no=f"The verdict is wrong about {kind} runs too often: it is right about {{figure}}.",
+    )
+
+
+def preset_gain(preset: str, over: str, n_stacks: int) -> Claim:
+    """What a slower preset has over a quicker one.
+
+    Args:
+        preset: the slower.
+        over: the quicker.
+        n_stacks: of the subjects.
+    """
+
+    def three(block: Block) -> Finding | None:
+        table = block.tables[0]
+        said = re.match(r"([-+][\d.]+) \(least ([-+][\d.]+)\)", (table.row(MEANS) or {}).get(f"`{preset}`, dB", ""))
+        n = len(column(table.rows, f"`{preset}`, dB")) - 1
+        if said is None:
+            return None
+        holds = float(said[1]) >= NOTICEABLE_DB
+        figure = f"{said[1]} dB, least {said[2]}"
+        return Finding(figure=figure, n=n, of="subjects", holds=holds, enough=n >= FEW)
+
+    def fewer(block: Block) -> Finding | None:
+        rows = [row for row in block.tables[0].rows if row["stacks"] == str(n_stacks)]
+        found = {(row["subject"], row["preset"].strip("`")): value(row, "volume") or 0.0 for row in rows}
+        names = dict.fromkeys(name for name, _ in found)
+        known = [name for name in names if (name, preset) in found and (name, over) in found]
+        return paired([(found[name, preset], found[name, over]) for name in known], NOTICEABLE_DB, FEW)
+
+    return Claim(
+        text=f"`{preset}` is better than `{over}`, {n_stacks} stacks",
+        asked=f"{NOTICEABLE_DB:g} dB or more in the mean",
+        block="presets" if n_stacks == 3 else "fewer-stacks",
+        find=three if n_stacks == 3 else fewer,
+        yes=f"From {n_stacks} stacks `{preset}` is better than `{over}`: {{figure}}.",
+        no=f"From {n_stacks} stacks `{preset}` is no better than `{over}`: {{figure}}.",
+    )
+
+
+def preset_limit(preset: str) -> Claim:
+    """Seconds of the whole command and decibels below `accurate`, against their limits in the table."""
+
+    def find(block: Block) -> Finding | None:
+        table = next((table for table in block.tables if table.rows and "at most" in table.rows[0]), None)
+        rows = [row for row in table.rows if row["preset"] == f"`{preset}`"] if table else []
+        if not rows:
+            return None
+        seconds, limit = column(rows, "seconds"), column(rows, "at most")[0]
+        heads = list(rows[0])
+        loss = column(rows, "dB less than `accurate`")
+        allowed = column(rows, heads[-1])
+        figure = f"{max(seconds):.1f} s of {limit:g} s"
+        if loss:
+            figure += f", {max(loss):.2f} dB of {allowed[0]:g} dB less than `accurate`"
+        holds = max(seconds) <= limit and all(one <= most for one, most in zip(loss, allowed, strict=True))
+        # each case has to stay below, so that two can show that it fails and not that it always holds
+        return Finding(figure=figure, n=len(rows), of="cases", holds=holds, enough=not holds or len(rows) >= FEW)
+
+    return Claim(
+        text=f"`{preset}` stays within its limits of time and loss",
+        asked="in every case; the limits stand in the table",
+        block="trade",
+        find=find,
+        yes=f"`{preset}` stays within its limits ({{figure}}).",
+        no=f"`{preset}` breaks a limit ({{figure}}).",
+    )
+
+
+def with_prior(first: str, second: str, n_stacks: int, what: str) -> Claim:
+    """What a row of the ablation of the prior has over another.
+
+    Args:
+        first: the row.
+        second: the other.
+        n_stacks: of the subjects.
+        what: is claimed to help.
+    """
+    words = f"{n_stacks} stack{'s' * (n_stacks != 1)}"
+
+    def find(block: Block) -> Finding | None:
+        table, counted = block.tables[0], re.search(r"(\d+) subjects", block.text)
+        one, other = (value(table.row(name), f"{words}: dB") for name in (first, second))
+        if one is None or other is None or counted is None:
+            return None
+        n, gain = int(counted[1]), round(one - other, 2)
+        return Finding(figure=f"{gain:+.2f} dB", n=n, of="subjects", holds=gain >= NOTICEABLE_DB, enough=n >= FEW)
+
+    return Claim(
+        text=f"{what} helps, {words}, mild motion, atlas volumes",
+        asked=f"{NOTICEABLE_DB:g} dB or more; it helps in the paper",
+        block="ablation",
+        find=find,
+        yes=f"{what} helps from {words} in mild motion ({{figure}}).",
+        no=f"{what} brings next to nothing from {words} in mild motion ({{figure}}).",
+    )
+
+
+def over_coarse(words: str, at_least: float) -> Claim:
+    """What V_prior has over V_coarse at true poses.
+
+    Args:
+        words: number of stacks as the table writes it.
+        at_least: decibels that were asked for.
+    """
+
+    def find(block: Block) -> Finding | None:
+        found = re.search(rf"{words} ([-+][\d.]+) dB \([^,)]*, (\d+) cases\)", block.text)
+        if found is None:
+            return None
+        gain, n = float(found[1]), int(found[2])
+        return Finding(figure=f"{gain:+.2f} dB", n=n, of="cases", holds=gain >= at_least, enough=n >= FEW)
+
+    return Claim(
+        text=f"V_prior is above V_coarse at true poses, {words}",
+        asked=f"{at_least:g} dB or more, asked for",
+        block="alone",
+        find=find,
+        yes=f"At true poses V_prior is as far above V_coarse from {words} as was asked for ({{figure}}).",
+        no=f"At true poses V_prior is less above V_coarse from {words} than was asked for ({{figure}}).",
+    )
+
+
+def gate(head: str, where: str) -> Claim:
+    """What density in F and as a gate brings.
+
+    Args:
+        head: of the column.
+        where: in words.
+    """
+
+    def find(block: Block) -> Finding | None:
+        table = block.tables[0]
+        with_it, without = table.row("coverage, in F, gate"), table.row("neither")
+        one, other = value(with_it, head), value(without, head)
+        seeds = [value(row, "seeds") for row in (with_it, without)]
+        if one is None or other is None:
+            return None
+        n, gain = int(min(seed or 0 for seed in seeds)), round(one - other, 2)
+        holds = gain >= NOTICEABLE_DB
+        return Finding(figure=f"{gain:+.2f} dB", n=n, of="seeds", holds=holds, enough=n >= SEEDS)
+
+    return Claim(
+        text=f"Density in the network and as its gate helps {where}",
+        asked=f"{NOTICEABLE_DB:g} dB or more; in the paper's Table 2 it brings 0.46 of SSIM and 0.02 dB from one stack",
+        block="gate",
+        find=find,
+        yes=f"Density helps the prior network {where} ({{figure}}).",
+        no=f"Density does not help the prior network {where} ({{figure}}).",
+    )
+
+
+def verdicts() -> Iterator[Claim]:
+    """Whether g3r says when a volume may not be used."""
+    yield warned(bad=True)
+    yield warned(bad=False)
+
+
+def presets() -> Iterator[Claim]:
+    """Speed against accuracy."""
+    yield preset_gain("balanced", "fast", 3)
+    yield preset_gain("accurate", "balanced", 3)
+    yield preset_gain("accurate", "balanced", 2)
+    for name in ("preview", "fast", "balanced", "accurate"):
+        yield preset_limit(name)
+
+
+def prior() -> Iterator[Claim]:
+    """The prior, its distillation and its gate."""
+    for n in (1, 2, 3):
+        yield with_prior("with distillation", "fit without prior", n, "The prior with distillation")
+    for n in (1, 2, 3):
+        yield with_prior("with distillation", "prior as initialisation", n, "Distillation, beside initialisation,")
+    yield over_coarse("one stack", 3.0)
+    yield over_coarse("3 stacks", 2.0)
+    yield gate("all", "over the whole brain")
+    yield gate("c of 0 to 0.05", "where no slice looked")

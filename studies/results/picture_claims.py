@@ -1,0 +1,178 @@
+"""Claims about masks, about what no slice saw, and beside another program."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from statistics import mean
+
+from studies.results.blocks import Block, number
+from studies.results.findings import FEW, Claim, Finding, column, paired, shares, value
+
+
+def counted(
+    block: str, pattern: str, at_least: float, text: str, *, of: str, asked: bool = False, reverse: bool = False
+) -> Claim:
+    """A share that a sentence above a table gives.
+
+    Args:
+        block: with the sentence.
+        pattern: with groups `hits` and `n`.
+        at_least: share that is asked for.
+        text: the claim.
+        of: what is counted.
+        asked: somebody asked for that share.
+        reverse: the sentence counts those that are wrong.
+    """
+
+    def find(found_in: Block) -> Finding | None:
+        found = re.search(pattern, found_in.text)
+        if found is None:
+            return None
+        hits, n = int(found["hits"]), int(found["n"])
+        return shares(n - hits if reverse else hits, n, at_least, of)
+
+    return Claim(
+        text=text,
+        asked=f"at least {at_least * 100:.0f} %{', asked for' * asked}",
+        block=block,
+        find=find,
+        yes=f"{text}: in {{figure}}.",
+        no=f"{text}: only in {{figure}}.",
+    )
+
+
+def real_masks() -> Claim:
+    """Overlap with masks that people drew."""
+
+    def find(block: Block) -> Finding | None:
+        rows = block.tables[0].rows
+        n = len({row["stack"].split("_")[0] for row in rows})
+        dice = column(rows, "Dice")
+        figure = f"Dice {mean(dice):.3f}, least {min(dice):.3f}, {len(dice)} stacks"
+        return Finding(figure=figure, n=n, of="subjects", holds=mean(dice) >= 0.9, enough=n >= FEW)
+
+    return Claim(
+        text="Masks found in real stacks are as people draw them",
+        asked="Dice 0.9 or more",
+        block="masks-real",
+        find=find,
+        yes="Masks found in real stacks are close to those that people draw ({figure}).",
+        no="Masks found in real stacks are not those that people draw ({figure}).",
+    )
+
+
+def cost_of_masks() -> Claim:
+    """What is lost by masks that were found, beside true ones, without the rim that differs by design."""
+
+    def find(block: Block) -> Finding | None:
+        pairs = []
+        for row in block.tables[0].rows:
+            true, _, found = (number(part) or 0.0 for part in row["without the outer 2 mm, dB"].split("/"))
+            pairs.append((found, true))
+        return paired(pairs, -0.5, FEW, "cases")
+
+    return Claim(
+        text="Masks that are found cost the inner brain little",
+        asked="at most 0.5 dB in the mean",
+        block="masks-cases",
+        find=find,
+        yes="Masks that are found cost the inner brain little ({figure}).",
+        no="Masks that are found cost the inner brain more than little ({figure}).",
+    )
+
+
+def fill(first: str, second: str, text: str) -> Claim:
+    """What one fill of the unseen part has over another.
+
+    Args:
+        first: the one.
+        second: the other.
+        text: the claim.
+    """
+
+    def find(block: Block) -> Finding | None:
+        n = re.search(r"(\d+) with an unseen part", block.text)
+        one, other = (value(block.tables[0].row(name), "unseen part, dB") for name in (first, second))
+        if n is None or one is None or other is None:
+            return None
+        holds, enough = one > other, int(n[1]) >= FEW
+        return Finding(figure=f"{one - other:+.2f} dB", n=int(n[1]), of="subjects", holds=holds, enough=enough)
+
+    return Claim(
+        text=text,
+        asked="better",
+        block="unseen-sweep",
+        find=find,
+        yes=f"{text} ({{figure}}).",
+        no=f"It is not so that {text[0].lower()}{text[1:]} ({{figure}}).",
+    )
+
+
+def noticed() -> Claim:
+    """Subjects with missing slices whose poses are wrong."""
+
+    def find(block: Block) -> Finding | None:
+        found = re.search(r"Median TRE under 1 mm: (\d+) of (\d+); of the others (\d+) without a warning", block.text)
+        if found is None:
+            return None
+        others, silent = int(found[2]) - int(found[1]), int(found[3])
+        return shares(others - silent, others, 0.95, "subjects") if others else None
+
+    return Claim(
+        text="Missing slices: wrong poses are warned about",
+        asked="at least 95 %",
+        block="unseen-sweep",
+        find=find,
+        yes="Where missing slices make poses wrong, there is a warning ({figure}).",
+        no="Where missing slices make poses wrong, a warning is missing too often ({figure} warned).",
+    )
+
+
+def nesvor() -> Iterator[Claim]:
+    """One case that was run by both."""
+
+    def compared(head: str, unit: str, sign: int) -> Claim:
+        def find(block: Block) -> Finding | None:
+            rows = block.tables[0].rows
+            own = next((value(row, head) for row in rows if row["method"] == "g3r `balanced`"), None)
+            other = next((value(row, head) for row in rows if row["method"].startswith("NeSVoR")), None)
+            if own is None or other is None:
+                return None
+            figure = f"{own:g} against {other:g} {unit}"
+            return Finding(figure=figure, n=1, of="cases", holds=sign * (own - other) > 0, enough=False)
+
+        what = "nearer to the truth" if sign > 0 else "quicker"
+        text = f"g3r is {what} than NeSVoR on a CPU"
+        return Claim(text=text, asked="it is", block="peers", find=find, yes=f"{text}.", no=f"{text}: it is not.")
+
+    yield compared("PSNR, dB", "dB", 1)
+    yield compared("CPU seconds", "CPU seconds", -1)
+
+
+def masks() -> Iterator[Claim]:
+    """Masks that nobody drew."""
+    heads = r"(?P<n>\d+) stacks with a head: found in (?P<hits>\d+)"
+    none = r"(?P<n>\d+) stacks without a head: in (?P<hits>\d+) of them one was found"
+    yield counted("masks-simulated", heads, 0.95, "A head is found where there is one", of="simulated stacks")
+    yield counted(
+        "masks-simulated", none, 0.95, "None is found where there is none", of="simulated stacks", reverse=True
+    )
+    yield real_masks()
+    yield cost_of_masks()
+
+
+def unseen() -> Iterator[Claim]:
+    """Slices that are missing."""
+    block = "unseen-sweep"
+    within, under = (
+        "Missing slices: brain volume within 3 % of the truth",
+        "Missing slices: median pose error under 1 mm",
+    )
+    volume = r"Brain volume within 3% of the truth: (?P<hits>\d+) of (?P<n>\d+)"
+    poses = r"Median TRE under 1 mm: (?P<hits>\d+) of (?P<n>\d+)"
+    yield counted(block, volume, 0.95, within, of="subjects", asked=True)
+    yield counted(block, poses, 0.9, under, of="subjects", asked=True)
+    yield noticed()
+    yield fill("V_prior", "template", "The network fills an unseen part better than the template alone")
+    yield fill("volume", "nothing", "What is shown of an unseen part is better than nothing")
