@@ -35,10 +35,10 @@ def left_out_share(stack: Stack) -> float:
     image, mask = stack.image[:, :, used], stack.mask[:, :, used]
     shown = image > BRIGHT_SHARE * float(np.median(image[mask]))
     outside = shown & ~mask
-    share = np.count_nonzero(outside) / max(np.count_nonzero(shown), 1)
+    share = float(outside.sum()) / max(float(shown.sum()), 1.0)
     low, high = LEFT_OUT_RANGE
     if not low <= share <= high:
         return 0.0
     in_plane_mm = [distance_transform_edt(~one, stack.spacing_mm[:2]) for one in np.moveaxis(mask, 2, 0)]
     beyond = np.stack(in_plane_mm, 2)[outside] > RIM_MM
-    return float(share) if beyond.mean() < MAX_BEYOND else 0.0
+    return share if beyond.mean() < MAX_BEYOND else 0.0
