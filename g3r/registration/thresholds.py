@@ -44,6 +44,11 @@ MIN_NCC = 0.75
 """So is one whose slices have a lower median correlation with the volume: at least 0.93 for stacks in place,
 0.8 with a bias field of 0.15, 0.4 to 0.73 for the worst stack of failures."""
 
+MAX_NCC_BELOW_OTHERS = 0.06
+"""A stack whose slices correlate by more than this less than those of the best one is doubtful: 0.00 to 0.03 for stacks
+of one head, noisy (SNR 5), biased or badly ordered ones among them, 0.03 for real ones with found masks, 0.08 for a
+stack of another head that passed everything else (docs/stress.md)."""
+
 MIN_OVERLAP_CORRELATION = 0.6
 """So is one with a lower correlation over the pixels that other stacks saw, where any stack lacks slices: 0.70 to 0.82
 for nine stacks that ended within 1.1 mm (median), 0.07 to 0.48 for stacks 5 to 13 mm off (one of a wrong pair 0.61).

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.planning.anatomy import NAME_OF
 from g3r.registration.quality import shortfalls
-from g3r.registration.thresholds import RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
@@ -60,6 +60,11 @@ MESSAGES = {
         CHECK,
         "{stack} agrees only just with the other stacks ({agreement}; good is {good:g} and above)",
         "Look for doubled edges in the volume, and at the slices below.",
+    ),
+    "stack unlike others": Message(
+        CHECK,
+        "the slices of {stack} agree with the volume by {ncc}, those of another stack by {best}",
+        "Check that the stack shows the same head on the same day, and look at its slices below.",
     ),
     "unseen": Message(CHECK, "{line}", "Nothing can be said of a lesion there; the part is outlined in the viewer."),
     "volume check": Message(CHECK, "{line}", "Look at the slices below: measured and predicted should be alike."),
@@ -161,6 +166,7 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     """Names of messages, and what is filled in."""
     for stack in record.stacks:
         yield from _of_stack(stack)
+    yield from _unlike_others(record)
     unseen = record.unseen.line() if record.unseen else None
     if record.unseen and unseen:
         yield "unseen" if record.unseen.usable else "unseen too much", {"line": unseen}
@@ -200,6 +206,16 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"shortfalls": why}
     elif quality.held_out_correlation is not None and quality.held_out_correlation < RETRY_BELOW_CORRELATION:
         yield "stack doubtful", facts | {"good": RETRY_BELOW_CORRELATION}
+
+
+def _unlike_others(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
+    """Stacks that passed every test of their own, but agree less with the volume than the best one does."""
+    ncc = [stack.quality.median_slice_ncc if stack.quality else None for stack in record.stacks]
+    best = max((one for one in ncc if one is not None), default=0.0)
+    for stack, own in zip(record.stacks, ncc, strict=True):
+        failed = stack.quality is not None and stack.quality.reliable is False
+        if own is not None and not failed and own < best - MAX_NCC_BELOW_OTHERS:
+            yield "stack unlike others", {"stack": stack.name, "ncc": f"{own:.2f}", "best": f"{best:.2f}"}
 
 
 def _agreement(stack: StackRecord) -> str:

@@ -21,6 +21,8 @@ FILLED_IN = {
     "n": "N",
     "where": "interrupted",
     "share": "N %",
+    "ncc": "N",
+    "best": "N",
     "what": "brain",
     "shortfalls": "what is bad of it, and what is good",
 }

@@ -38,6 +38,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
     ),
     "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
+    "unlike": (
+        stacks_with(stack("c.nii", StackQuality(True, 0.81, 0.82, 0.0))),
+        CHECK,
+        "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
+    ),
     "single": (record(stack("a.nii", quality(None, None))), CHECK, "single stack"),
     "unseen": (record(unseen=unseen(0.1)), CHECK, "10 % of the brain was not seen"),
     "unseen too much": (
@@ -115,6 +120,12 @@ def test_a_warning_with_words_of_its_own_is_not_said_twice() -> None:
     ]
     found = record(stack("a.nii"), stack("b.nii", quality(False, 0.2)), unseen=share, n_rollbacks=1, warnings=lines)
     assert len(verdict_of(found).reasons) == 3
+
+
+def test_stacks_that_agree_about_as_well_as_each_other_are_not_mentioned() -> None:
+    assert verdict_of(stacks_with(stack("c.nii", StackQuality(True, 0.8, 0.9, 0.0)))).word == USE
+    failed = verdict_of(stacks_with(stack("c.nii", StackQuality(False, 0.4, 0.5, 0.0))))
+    assert len(failed.reasons) == 1
 
 
 def test_slivers_are_not_mentioned() -> None:
