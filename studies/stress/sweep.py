@@ -182,13 +182,19 @@ def tables(record: Record) -> dict[str, str]:
         f"Preset `{record['preset']}`, {len(rows)} runs. Of {len(bad)} bad ones the verdict was *do not use*, or a "
         f"refusal, in {_count(bad, _is_refused)}, *check* in {_count(bad, _is_check)} and *use* in "
         f"{_count(bad, _is_use)}. Of {len(good)} good ones it was *use* in {_count(good, _is_use)}, *check* in "
-        f"{_count(good, _is_check)} and *do not use* in {_count(good, _is_refused)}."
+        f"{_count(good, _is_check)} and *do not use* in {_count(good, _is_refused)}; in "
+        f"{_count(good, _says_unseen)} of these because a part of the brain was not seen."
     )
     return {"stress-sweep": "\n\n".join([text, table(summary, SUMMARY), details("Every run", table(rows, EACH))])}
 
 
 def _is_use(row: Row) -> bool:
     return row["word"] == USE
+
+
+def _says_unseen(row: Row) -> bool:
+    """Whether the verdict says that the volume is incomplete, which pose errors and PSNR do not count as bad."""
+    return not _is_use(row) and "not seen by any slice" in row["reason"]
 
 
 def _is_refused(row: Row) -> bool:
