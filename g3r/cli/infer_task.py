@@ -127,7 +127,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
         InputError: something in the files or options cannot be used.
     """
     earlier = _earlier(options)
-    slices, masked, left_out = None, None, list[str]()
+    slices, masked = None, None
     if options.slices:
         reporter.begun(LOADING)
         slices = load_slices(options, earlier)
@@ -135,7 +135,6 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
     else:
         reporter.begun(FINDING_MASKS)
         masked = masked_stacks(options, networks.get("mask"))
-        left_out = masked.left_out
         reporter.begun(LOADING)
         stacks = _load(options, masked, earlier)
     reporter.begun(PREPARING)
@@ -149,7 +148,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
     reconstructor = GaussianReconstructor(
         networks.get("prior"), settings, pose_checkpoint=networks.get("pose"), device=options.device
     )
-    of_stacks = slice_hashes(slices) if slices else _stack_hashes(options, masked)
+    of_stacks = _stack_hashes(options, masked) if masked else slice_hashes(slices) if slices else ((), ())
     inputs = _inputs(of_stacks, masked, reconstructor, networks.get("mask"))
     memory = plan_for_stacks(
         stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
@@ -163,7 +162,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
         n_threads=n_threads,
         plan=_plan(options, memory.settings, earlier),
         slices=slices,
-        warnings=left_out + (earlier.differences(inputs) if earlier else []),
+        warnings=(masked.left_out if masked else []) + (earlier.differences(inputs) if earlier else []),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.geometry import RigidPose
-from g3r.registration.atlas_frame import Orientation, standard_orientation
+from g3r.registration.atlas_frame import Orientation, present_orientation, standard_orientation
 from g3r.registration.atlas_search import AtlasPlacement, place_in_atlas, template_fits
 from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.estimate import Registration, segments_of
@@ -23,11 +24,17 @@ from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import fitted_in_place
 from g3r.registration.unseen import TemplateFill
 
+logger = logging.getLogger(__name__)
+
 GIVEN = "given poses"
 """In place of the name of an initialisation."""
 
 JUMP_MM = 3.0
 """Neighbours whose poses differ by more are of two motion segments; every slice has a pose of its own."""
+
+SAME_CORRELATION = 0.01
+"""Slices that correlate with the template by no less than this below the best are in standard orientation: it is known
+no better, and poses of a run in standard space keep their frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,20 +132,19 @@ def measure(
 def _orientation(
     posed: Slices, settings: RegistrationSettings, template: AtlasTemplate
 ) -> tuple[AtlasPlacement | None, Orientation | None]:
-    """The one motion of all slices to the template: searched in all orientations, and from where they are.
-
-    A head that is in standard orientation already stays near it, though the search may find it elsewhere.
-    """
+    """The one motion of all slices to the template; none where they are there already."""
     as_headers = replace(posed, header_pose=posed.planes.pose)
     if not template_fits(as_headers, template):
         return None, None
     samples = StackSamples.of_all(as_headers, settings.n_candidates)
     rng = np.random.default_rng([settings.seed, 0])
     placed = place_in_atlas(as_headers, samples, template, rng)
-    starts = (placed.motion(len(posed), samples), RigidPose.identity(len(posed)))
-    found = [standard_orientation(as_headers, placed.templates, start, rng) for start in starts]
-    good = [one for one in found if one is not None]
-    return placed, max(good, key=lambda one: one.correlation) if good else None
+    here = present_orientation(as_headers, placed.templates)
+    found = standard_orientation(as_headers, placed.templates, placed.motion(len(posed), samples), rng)
+    logger.info("given poses: correlation %.3f with the template where they are", here.correlation)
+    if found is not None and here.correlation >= found.correlation - SAME_CORRELATION:
+        return placed, here
+    return placed, found
 
 
 def _fill(placed: AtlasPlacement | None, orientation: Orientation | None) -> TemplateFill | None:

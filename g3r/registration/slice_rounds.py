@@ -28,7 +28,8 @@ MIN_ROUNDS = 3
 """One round for each voxel size, whatever the deadline."""
 
 N_ROUNDS_IN_PLACE = 3
-"""Of gains and weights without poses; more change neither by a hundredth."""
+"""Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
+volume is made without them."""
 
 
 @dataclass(frozen=True, kw_only=True)

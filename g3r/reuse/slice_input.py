@@ -110,8 +110,7 @@ def load_slice_folder(path: str | os.PathLike[str], thickness_mm: Sequence[float
         raise InputError(
             f"{len(thickness_mm)} thicknesses for {len(groups)} stacks ({_told(groups)}); give one, or one per stack"
         )
-    given = thickness_mm or [None]
-    given = [given[n % len(given)] for n in range(len(groups))]
+    given = [thickness_mm[n % len(thickness_mm)] if thickness_mm else None for n in range(len(groups))]
     kept = [n for n, group in enumerate(groups) if any(one.mask.any() for one in group.files)]
     if not kept:
         raise InputError(f"{folder}: no slice shows brain (all masks are empty); expected masks that mark it with 1")
