@@ -140,13 +140,18 @@ def _runs(files: Sequence[SliceFile]) -> list[list[SliceFile]]:
     runs: list[list[SliceFile]] = [[files[0]]]
     for n, one in enumerate(files[1:], 1):
         run = runs[-1]
-        next_ones = files[n + 1 : n + 3]
-        strays = not any(_leaves(run, other) for other in next_ones)
-        if not _same_lengths(one, run[0]) or (_leaves(run, one) and not strays):
+        if not _same_lengths(one, run[0]) or (_leaves(run, one) and not _strays(run, one, files[n + 1 : n + 3])):
             runs.append([one])
         else:
             run.append(one)
     return runs
+
+
+def _strays(run: list[SliceFile], one: SliceFile, next_ones: Sequence[SliceFile]) -> bool:
+    """Whether a slice that leaves a run is alone: the next ones go on with the run, or begin one without it."""
+    if not any(_leaves(run, other) for other in next_ones):
+        return True
+    return float(angle_deg(one.rotation, next_ones[0].rotation)) > SAME_STACK_DEG
 
 
 def _leaves(run: list[SliceFile], one: SliceFile) -> bool:
@@ -216,21 +221,25 @@ def _places(passes: list[list[SliceFile]]) -> NDArray[np.int64]:
     usual = max(1, int(np.median(apart[1:]))) if len(run) > 1 else 1
     skipped = apart > usual
     along = _along_mm(run, _frame(run))
+    place = np.arange(len(run))
     gap = slope(along, number / usual)
-    steps = np.ones(len(run), np.int64)
-    steps[0] = 0
-    for n in range(1, len(run)):
-        jump = _jump(along, n, gap)
-        if skipped[n] or jump >= HOLE_STEPS:
-            steps[n] = max(1, min(int(np.rint(jump)), MAX_SLICE_NUMBER))
-    return np.cumsum(steps)
+    for _ in range(2):  # holes lengthen the steps until they are known
+        steps = np.ones(len(run), np.int64)
+        for n in range(1, len(run)):
+            jump = _jump(along, n, gap)
+            if skipped[n] or jump >= HOLE_STEPS:
+                steps[n] = max(1, min(int(np.rint(jump)), MAX_SLICE_NUMBER))
+        place = np.cumsum(steps) - 1
+        gap = slope(along, place)
+    return np.asarray(place, np.int64)
 
 
 def _jump(along_mm: NDArray[np.float64], n: int, gap_mm: float) -> float:
-    """Steps from slice n - 1 to slice n, by three slices on either side."""
+    """Steps from slice n - 1 to slice n, by three slices on either side; hardly more than these two are apart."""
     if gap_mm == 0:
         return 1.0
     before, after = along_mm[max(0, n - 3) : n], along_mm[n : n + 3]
     end = np.median(before + gap_mm * np.arange(len(before) - 1, -1, -1))
     start = np.median(after - gap_mm * np.arange(len(after)))
-    return float((start - end) / gap_mm)
+    apart = (along_mm[n] - along_mm[n - 1]) / gap_mm  # the hole may be at a neighbour
+    return float(min((start - end) / gap_mm, apart + 1))

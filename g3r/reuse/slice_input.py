@@ -64,11 +64,6 @@ class SliceFolder:
         """Slices that the folder holds."""
         return sum(len(group.files) for group in self.groups)
 
-    @property
-    def grouped_by(self) -> str:
-        """Who decided which slices are of one stack, in words."""
-        return "as index.tsv says" if self.index_path else "grouped by their headers"
-
 
 def read_slice_folder(
     path: str | os.PathLike[str], thickness_mm: Sequence[float] | None = None
