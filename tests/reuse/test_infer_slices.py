@@ -14,12 +14,14 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import load_volume
-from g3r.acquisition.slicing import slices_from_stacks
+from g3r.acquisition.slicing import normalised_slices, slices_from_stacks
 from g3r.cli.infer import main
 from g3r.evaluation.metrics import score
 from g3r.geometry import RigidPose
 from g3r.output.files import MASK_NAMES, OUTPUT_NAMES
-from g3r.registration.given import GIVEN
+from g3r.planning.presets import PRESETS
+from g3r.pose_network.model import PoseModel
+from g3r.registration.given import GIVEN, measure
 from g3r.reuse.finished_run import FinishedRun
 from g3r.reuse.slice_input import read_slice_folder
 from tests.cli.test_infer import QUICK as WITH_THICKNESS
@@ -41,7 +43,7 @@ def moved(exported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = ELSEWHERE.rotation[0], ELSEWHERE.translation_mm[0]
     for path in (exported / "slices").iterdir():
-        image = nib.load(path)
+        image = nib.Nifti1Image.from_filename(path)
         nib.save(nib.Nifti1Image(np.asarray(image.dataobj), matrix @ image.affine), folder / path.name)
     return folder
 
@@ -90,6 +92,17 @@ def test_the_volume_is_as_good_as_that_of_the_run_and_leads_back(subject: Path, 
     assert np.rad2deg(Rotation.from_matrix(turn.rotation[0]).magnitude()) < 12
 
 
+def test_slices_in_standard_orientation_stay(exported: Path, run: FinishedRun) -> None:
+    """The volume of poses from standard space lies where that of their run does."""
+    stacks, given = read_slice_folder(exported)
+    slices, _ = normalised_slices(stacks)
+    found = measure(slices, given, PRESETS["preview"].registration, template=PoseModel.load(None).template)
+    assert found.orientation is not None
+    assert run.registration.correlation_with_template is not None
+    assert found.orientation.correlation > run.registration.correlation_with_template - 0.05
+    np.testing.assert_allclose(found.slices.planes.center_mm, run.geometry.slices.planes.center_mm, atol=1e-4)
+
+
 def test_the_record_says_where_poses_come_from(again: Path, moved: Path) -> None:
     text = (again / "run.json").read_text()
     assert str(moved) not in text
@@ -128,7 +141,7 @@ def test_poses_that_are_wrong_are_noticed(exported: Path, tmp_path: Path, capsys
     for number in range(14):
         for name in (f"{number}.nii.gz", f"mask_{number}.nii.gz"):
             path = tmp_path / "in" / "slices" / name
-            image = nib.load(path)
+            image = nib.Nifti1Image.from_filename(path)
             nib.save(nib.Nifti1Image(np.asarray(image.dataobj), wrong @ image.affine), path)
     words = ["--slices", str(tmp_path / "in"), "--keep-poses", "--space", "scanner", *QUICK]
     assert main([*words, "--output", str(tmp_path / "out")]) == 0

@@ -95,7 +95,7 @@ def test_odd_stacks_keep_their_poses(gap: str, tmp_path: Path, rng: np.random.Ge
     write_stack(tmp_path, affines)
     if gap == "stray":
         for name in ("7.nii.gz", "mask_7.nii.gz"):
-            image = nib.load(tmp_path / name)
+            image = nib.Nifti1Image.from_filename(tmp_path / name)
             far = image.affine.copy()
             far[:3, 3] += [300, 0, 40]
             nib.save(nib.Nifti1Image(np.asarray(image.dataobj), far), tmp_path / name)
