@@ -37,6 +37,7 @@ class SliceFile:
         image: [I, J] float32.
         mask: [I, J] bool; may be empty.
         affine: [4, 4] RAS mm from index, as in the header.
+        remarks: on the header.
     """
 
     number: int
@@ -45,6 +46,7 @@ class SliceFile:
     image: NDArray[np.float32]
     mask: NDArray[np.bool_]
     affine: NDArray[np.float64]
+    remarks: tuple[str, ...] = ()
 
     @cached_property
     def spacing_mm(self) -> NDArray[np.float64]:
@@ -137,7 +139,13 @@ def read_slice(path: Path, mask_path: Path | None, number: int) -> SliceFile:
         raise InputError(f"{path.name}: {n_bad} values inside the mask are not finite; repair or mask them out")
     image = np.where(np.isfinite(volume.data), volume.data, np.float32(0))
     return SliceFile(
-        number=number, path=path, mask_path=mask_path, image=image[:, :, 0], mask=mask[:, :, 0], affine=volume.affine
+        number=number,
+        path=path,
+        mask_path=mask_path,
+        image=image[:, :, 0],
+        mask=mask[:, :, 0],
+        affine=volume.affine,
+        remarks=volume.remarks,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from g3r.acquisition.images import Volume, check_grid
 from g3r.acquisition.slice_profile import ProfileOrigin
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
@@ -23,6 +24,7 @@ from g3r.errors import InputError
 from g3r.geometry import RigidPose
 from g3r.registration import GivenPoses
 from g3r.registration.atlas_frame import motion_to_headers
+from g3r.reuse.finished_run import FinishedRun
 from g3r.reuse.slice_files import read_index, read_slices, slice_folder_of
 from g3r.reuse.slice_groups import SliceGroup, grouped_by_headers, grouped_by_index, slope
 
@@ -124,13 +126,38 @@ def load_slice_folder(path: str | os.PathLike[str], thickness_mm: Sequence[float
     )
 
 
+def images_of_run(run: FinishedRun, path: str | os.PathLike[str]) -> list[NDArray[np.float32]]:
+    """Images [I, J, K] of the stacks that a run made of a folder of slices.
+
+    Args:
+        run: of these slices.
+        path: of the folder.
+
+    Raises:
+        InputError: see `read_slice_folder`, or the run was made of other slices.
+    """
+    stacks, _ = read_slice_folder(path)
+    if [stack.name for stack in stacks] != run.stack_names:
+        raise InputError(
+            f"{path}: holds {', '.join(stack.name for stack in stacks)}, the run was made of "
+            f"{', '.join(run.stack_names)}; pass the folder of its --slices"
+        )
+    for stack, found in zip(stacks, run.geometry.stacks, strict=True):
+        volume = Volume(stack.image, stack.affine, stack.name)
+        check_grid(volume, found.in_file(), f"that of {stack.name} in the run", "slices")
+    return [stack.image for stack in stacks]
+
+
 def _notes(groups: Sequence[SliceGroup], indexed: bool) -> list[str]:
     by = "index.tsv" if indexed else "their headers"
     notes = [f"slices with given poses, grouped into stacks by {by}: {_told(groups)}"]
-    unmasked = [one for group in groups for one in group.files if one.mask_path is None]
-    if unmasked:
-        n_all = sum(len(group.files) for group in groups)
-        notes.append(f"{len(unmasked)} of {n_all} slices have no mask: their pixels above zero are taken for brain")
+    files = [one for group in groups for one in group.files]
+    if n_unmasked := sum(one.mask_path is None for one in files):
+        notes.append(f"{n_unmasked} of {len(files)} slices have no mask: their pixels above zero are taken for brain")
+    remarked = [one for one in files if one.remarks]
+    if remarked:
+        also = f" (and of {len(remarked) - 1} more slices)" if len(remarked) > 1 else ""
+        notes.append(f"{remarked[0].path.name}: {remarked[0].remarks[0]}{also}")
     return notes
 
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.images import load_volume
 from g3r.acquisition.slicing import normalised_slices, slices_from_stacks
+from g3r.cli.export_poses import main as export_poses
 from g3r.cli.infer import main
 from g3r.evaluation.metrics import score
 from g3r.geometry import RigidPose
@@ -23,6 +24,7 @@ from g3r.planning.presets import PRESETS
 from g3r.pose_network.model import PoseModel
 from g3r.registration.given import GIVEN, measure
 from g3r.reuse.finished_run import FinishedRun
+from g3r.reuse.slice_folder import slice_affines
 from g3r.reuse.slice_input import read_slice_folder
 from tests.cli.test_infer import QUICK as WITH_THICKNESS
 from tests.reuse.runs import truth_from_run
@@ -131,6 +133,26 @@ def test_kept_poses_are_those_of_the_files(exported: Path, tmp_path: Path) -> No
     assert run.space == "scanner"
     assert any("poses in the fit" in term.term for term in run.record.inactive_terms)
     assert any("by index.tsv" in note for note in run.record.notes)
+
+
+def test_the_slices_go_out_again_with_their_last_poses(
+    again: Path, moved: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(again), "--format", "nesvor", "--output", str(tmp_path / "out"), "--slices"]
+    assert export_poses([*words, str(moved)]) == 0
+    run = FinishedRun.load(again)
+    affines = slice_affines(run.geometry.slices)
+    for k, affine in enumerate(affines):
+        folders = (moved, tmp_path / "out" / "slices")
+        first, last = (nib.Nifti1Image.from_filename(folder / f"{k}.nii.gz") for folder in folders)
+        np.testing.assert_array_equal(np.asarray(first.dataobj), np.asarray(last.dataobj))
+        np.testing.assert_allclose(last.affine, affine, atol=1e-4)
+    # those of the index have other places: the same slices by other numbers
+    shutil.rmtree(tmp_path / "out")
+    capsys.readouterr()
+    assert export_poses([*words, str(exported)]) == 3
+    assert "slices grid" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_poses_that_are_wrong_are_noticed(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -140,6 +140,17 @@ def test_without_masks_positive_pixels_are_taken(tmp_path: Path, rng: np.random.
     assert bare.poses.notes[1] == "39 of 39 slices have no mask: their pixels above zero are taken for brain"
 
 
+def test_headers_of_two_opinions_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_stack(tmp_path, poses(AXIAL, 11, rng))
+    written = nib.Nifti1Image.from_filename(tmp_path / "5.nii.gz")
+    image = nib.Nifti1Image(np.asarray(written.dataobj), written.affine)
+    image.set_qform(np.diag([2.0, 2, 3, 1]), code=1)
+    nib.save(image, tmp_path / "5.nii.gz")
+    found = load_slice_folder(tmp_path)
+    assert found.poses.notes[1].startswith("5.nii.gz: sform and qform differ by up to ")
+    assert found.poses.notes[1].endswith("; the sform is used")
+
+
 def test_a_stack_of_one_slice_and_one_without_brain(tmp_path: Path, rng: np.random.Generator) -> None:
     write_stack(tmp_path, poses(AXIAL, 11, rng))
     blank = np.zeros((30, 34))
