@@ -35,8 +35,13 @@ RESTART_STEPS, RESTART_SHARE = 3.0, 0.5
 """A stack starts again where a slice lies behind the last one by more than this many steps, and by more than this share
 of the length so far; motion alone moves slices by less."""
 
-HOLE_STEPS = 2.5
-"""Between slices of consecutive numbers, others are missing from this many steps on; motion explains shorter ones."""
+HOLE_STEPS, HOLE_TURN_DEG = 2.0, 5.0
+"""Between slices of consecutive numbers, others are missing where these are further apart by so many steps, by far more
+than any go backwards, and turned by less than this: motion turns slices and goes both ways. A hole that is taken for
+motion does no harm, since poses are given; motion that is taken for a hole would make the head longer."""
+
+REACH = 4
+"""Slices so near to each other say how long a step is, before holes are known."""
 
 PASS_THICKNESSES = 1.5
 """Slices whose steps are at least so many thicknesses may be one pass of an interleaved stack."""
@@ -116,9 +121,18 @@ def grouped_by_headers(files: Sequence[SliceFile]) -> list[SliceGroup]:
     return found
 
 
-def slope(along_mm: NDArray[np.float64], place: NDArray[np.float64] | NDArray[np.int64]) -> float:
-    """Median over all pairs of the distance [K] over the difference of their numbers [K]; 0 for a single one."""
+def slope(along_mm: NDArray[np.float64], place: NDArray[np.int64], reach: int | None = None) -> float:
+    """Median over pairs of the distance over the difference of their numbers; 0 for a single one.
+
+    Args:
+        along_mm: [K].
+        place: [K] ascending numbers.
+        reach: only pairs that are at most so many slices apart; all when None.
+    """
     first, second = np.triu_indices(len(place), 1)
+    if reach is not None:
+        near = second - first <= reach
+        first, second = first[near], second[near]
     steps = (along_mm[second] - along_mm[first]) / (place[second] - place[first])
     return float(np.median(steps)) if len(steps) else 0.0
 
@@ -217,21 +231,34 @@ def _places(passes: list[list[SliceFile]]) -> NDArray[np.int64]:
         return place - place.min()
     run = passes[0]
     number = np.array([one.number for one in run], np.int64)
-    apart = np.diff(number, prepend=number[0])
-    usual = max(1, int(np.median(apart[1:]))) if len(run) > 1 else 1
-    skipped = apart > usual
+    usual = max(1, int(np.median(np.diff(number)))) if len(run) > 1 else 1
+    by_number = np.maximum(np.diff(number, prepend=number[0] - usual) // usual, 1)
+    place = np.cumsum(by_number) - 1
     along = _along_mm(run, _frame(run))
-    place = np.arange(len(run))
-    gap = slope(along, number / usual)
-    for _ in range(2):  # holes lengthen the steps until they are known
-        steps = np.ones(len(run), np.int64)
-        for n in range(1, len(run)):
-            jump = _jump(along, n, gap)
-            if skipped[n] or jump >= HOLE_STEPS:
-                steps[n] = max(1, min(int(np.rint(jump)), MAX_SLICE_NUMBER))
-        place = np.cumsum(steps) - 1
-        gap = slope(along, place)
-    return np.asarray(place, np.int64)
+    gap = slope(along, place, REACH)
+    steps = np.where(by_number > 1, by_number, _steps_by_position(run, along, gap, by_number))
+    return np.asarray(np.cumsum(steps) - 1, np.int64)
+
+
+def _steps_by_position(
+    run: list[SliceFile], along_mm: NDArray[np.float64], gap_mm: float, by_number: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Step [K] to each slice from the one before: above 1 where a hole is far longer than motion makes jumps.
+
+    Args:
+        run: of K slices.
+        along_mm: [K] along the normal.
+        gap_mm: of one step.
+        by_number: [K] steps as the numbers have them.
+    """
+    steps = np.ones(len(run), np.int64)
+    beyond = np.array([_jump(along_mm, n, gap_mm) if n else 1.0 for n in range(len(run))]) - by_number
+    backwards = float(np.max(-beyond, initial=0.0))
+    for n in np.flatnonzero(beyond >= max(HOLE_STEPS, 3 * backwards)):
+        before, after = _frame(run[max(0, n - 3) : n]), _frame(run[n : n + 3])
+        if float(angle_deg(before, after)) < HOLE_TURN_DEG:
+            steps[n] = 1 + min(int(np.rint(beyond[n])), MAX_SLICE_NUMBER)
+    return steps
 
 
 def _jump(along_mm: NDArray[np.float64], n: int, gap_mm: float) -> float:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.reuse.slice_files import SliceFile
 from g3r.reuse.slice_groups import SliceGroup, grouped_by_headers
-from tests.reuse.slice_writer import AXIAL, CORONAL, SAGITTAL, THICKNESS_MM, poses
+from tests.reuse.slice_writer import AXIAL, CORONAL, SAGITTAL, poses
 
 Affine = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def test_a_slice_that_went_astray_is_no_stack(at: int, rng: np.random.Generator)
 
 def test_slices_that_were_left_out_leave_holes(rng: np.random.Generator) -> None:
     """By their numbers, or by a jump where the rest was numbered anew."""
-    affines = poses(AXIAL, 20, rng, mm=0.3)
+    affines = poses(AXIAL, 20, rng, deg=1, mm=0.3)
     kept = [k for k in range(20) if k not in (4, 9, 10, 11)]
     (by_number,) = grouped([affines[k] for k in kept], kept)
     np.testing.assert_array_equal(by_number.place, kept)
@@ -129,10 +129,18 @@ def test_slices_that_were_left_out_leave_holes(rng: np.random.Generator) -> None
     np.testing.assert_array_equal(every_tenth.place, np.arange(20))
 
 
-def test_a_motion_of_two_slices_makes_no_hole(rng: np.random.Generator) -> None:
-    affines = poses(AXIAL, 20, rng, mm=0.3)
-    jerk = [shifted(one, 2) if k >= 10 else one for k, one in enumerate(affines)]
-    for one in jerk[10:]:
-        one[:3, 3] -= [0, 0, 0.6 * THICKNESS_MM]
+@pytest.mark.parametrize("deg", [0.0, 10.0])
+def test_motion_makes_no_hole(deg: float, rng: np.random.Generator) -> None:
+    """A jerk of four slices and back, and one that stays and turns the head."""
+    affines = poses(AXIAL, 24, rng, deg=1, mm=0.3)
+    back = 24 if deg else 16
+    jerk = [turned(shifted(one, 3), deg, 0) if 8 <= k < back else one for k, one in enumerate(affines)]
     (found,) = grouped(jerk)
+    np.testing.assert_array_equal(found.place, np.arange(24))
+
+
+def test_a_slice_far_back_is_no_new_stack(rng: np.random.Generator) -> None:
+    affines = poses(AXIAL, 20, rng)
+    affines[14] = shifted(affines[14], -11)
+    (found,) = grouped(affines)
     np.testing.assert_array_equal(found.place, np.arange(20))
