@@ -254,7 +254,7 @@ def _steps_by_position(
     steps = np.ones(len(run), np.int64)
     beyond = np.array([_jump(along_mm, n, gap_mm) if n else 1.0 for n in range(len(run))]) - by_number
     backwards = float(np.max(-beyond, initial=0.0))
-    for n in np.flatnonzero(beyond >= max(HOLE_STEPS, 3 * backwards)):
+    for n in np.flatnonzero(beyond >= max(HOLE_STEPS, 3 * backwards)).tolist():
         before, after = _frame(run[max(0, n - 3) : n]), _frame(run[n : n + 3])
         if float(angle_deg(before, after)) < HOLE_TURN_DEG:
             steps[n] = 1 + min(int(np.rint(beyond[n])), MAX_SLICE_NUMBER)
