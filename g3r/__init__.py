@@ -16,13 +16,18 @@ from g3r.run.kernel_cache import ensure_kernel_cache
 if TYPE_CHECKING:
     from g3r.acquisition.stacks import load_stack
     from g3r.reconstruct import GaussianReconstructor
+    from g3r.reuse.slice_input import read_slice_folder
 
-__all__ = ["GaussianReconstructor", "__version__", "load_stack"]
+__all__ = ["GaussianReconstructor", "__version__", "load_stack", "read_slice_folder"]
 
 ensure_kernel_cache()  # before any kernel is declared
 
 # Resolved on first use (PEP 562), so that `import g3r` stays quick and pulls no torch.
-_HOME = {"GaussianReconstructor": "g3r.reconstruct", "load_stack": "g3r.acquisition.stacks"}
+_HOME = {
+    "GaussianReconstructor": "g3r.reconstruct",
+    "load_stack": "g3r.acquisition.stacks",
+    "read_slice_folder": "g3r.reuse.slice_input",
+}
 
 
 def __getattr__(name: str) -> object:

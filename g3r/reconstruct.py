@@ -12,7 +12,6 @@ from g3r.acquisition.stacks import Stack
 from g3r.checkpoints.device import on_device
 from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
-from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
 from g3r.fitting.mask_agreement import REFINED
@@ -25,18 +24,17 @@ from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
 from g3r.output.assemble import StageResults, assemble
 from g3r.planning.plan import FixedPlan, Plan
-from g3r.planning.presets import ReconstructionSettings, adapted, preset
+from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
 from g3r.pose_network.model import PoseModel
 from g3r.prior.model import Prior
-from g3r.registration import Registration, RegistrationSettings, register
+from g3r.registration import GivenPoses, Registration, RegistrationSettings, register
 from g3r.registration.atlas_search import template_fits
+from g3r.registration.given import measure
 from g3r.registration.quality import unknown_orientation_note
 from g3r.report.reported_result import ReportedResult
 from g3r.run.context import RunContext
 from g3r.run.deadline import Deadline
-
-RESOLUTION_RANGE_MM = (0.3, 3.0)
 
 
 class GaussianReconstructor:
@@ -63,13 +61,11 @@ class GaussianReconstructor:
         device: str = "auto",
         observer: FitObserver | None = None,
     ) -> None:
-        self.settings, self.observer = preset(settings) if isinstance(settings, str) else settings, observer
-        low, high = RESOLUTION_RANGE_MM
-        if not low <= self.settings.resolution_mm <= high:
-            raise InputError(f"resolution {self.settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
+        self.settings, self.observer = settings_of(settings), observer
         self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
         search, found = self.settings.registration, pose_checkpoint or set_of(checkpoint)
         self.pose_model = PoseModel.load(found) if search.template or search.network else None
+        self.template = self.pose_model.template if self.pose_model else None
         self.device = on_device(device, self.prior, self.pose_model)
         self.subject_prior = SubjectPrior(
             network=self.prior,
@@ -80,7 +76,7 @@ class GaussianReconstructor:
     def reconstruct(
         self,
         stacks: Sequence[Stack],
-        registration: Registration | None = None,
+        registration: Registration | GivenPoses | None = None,
         *,
         plan: Plan | None = None,
         run: RunContext | None = None,
@@ -89,8 +85,8 @@ class GaussianReconstructor:
 
         Args:
             stacks: one or more, of one head.
-            registration: what `register_stacks` found for the same stacks, to fit several times to one registration;
-                found here when None. Slices of a single stack still move to the prior volume afterwards.
+            registration: what `register_stacks` found for the same stacks, or poses that `read_slice_folder` read with
+                them; found here when None. Slices of a single stack still move to the prior volume afterwards.
             plan: settings and deadlines; the reconstructor's settings without a deadline when None.
             run: stage store, stop request and reporter. A stop request during the fit gives the volume so far
                 (`record.partial`); else `KeyboardInterrupt` passes through.
@@ -148,24 +144,28 @@ class GaussianReconstructor:
             deadline: when the search has to end.
         """
         settings = settings or self.settings.registration
-        template = self.pose_model.template if self.pose_model else None
-        proposals = {}
+        proposals, template = {}, self.template
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
         if self.pose_model is not None and settings.network and not spare:
             proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
-    def _poses(self, slices: Slices, given: Registration | None, plan: Plan, run: RunContext) -> Registration:
+    def _poses(
+        self, slices: Slices, given: Registration | GivenPoses | None, plan: Plan, run: RunContext
+    ) -> Registration:
         """The slices in their poses."""
-        if given is not None:
+        asked, report = plan.settings.registration, run.report(Stage.REGISTRATION)
+        if isinstance(given, GivenPoses):
+            run.notes += given.notes
+            poses = run.stage(Stage.REGISTRATION, lambda: measure(slices, given, asked, report, template=self.template))
+        elif given is not None:
             run.notes.append("registration was given, not estimated here")
             with run.timed(Stage.REGISTRATION) as tell:
                 tell(poses := with_pixels_of(slices, given))
         else:
-            deadline, report = plan.for_registration(), run.report(Stage.REGISTRATION)
-            asked = plan.settings.registration
+            deadline = plan.for_registration()
             poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, asked, report, deadline))
-        if plan.settings.registration.standard_orientation and poses.orientation is None:
+        if asked.standard_orientation and poses.orientation is None:
             run.notes.append(unknown_orientation_note(slices))
         return poses
 

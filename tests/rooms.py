@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "uncertainty": "geometry acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
-    "reuse": "geometry acquisition gaussians output",
+    "reuse": "geometry acquisition gaussians registration output",
     "report": "geometry run acquisition registration planning output reuse",
     "bids": "run acquisition",
     "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output report",

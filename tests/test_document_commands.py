@@ -31,6 +31,7 @@ NETWORKS = ("prior", "pose", "mask")
 STAND_INS = {
     "DICOM",
     "DIR",
+    "nesvor",
     *(f"{plane}{mask}.nii.gz" for plane in PLANES for mask in ("", "-mask")),
     *(f"case/{name}-{n}.nii.gz" for name in ("stack", "mask") for n in range(3)),
     *(f"{network}.safetensors" for network in NETWORKS),
@@ -44,8 +45,9 @@ def name_of(one: Shown) -> str:
 
 @pytest.fixture(scope="module")
 def folder(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stand-ins: small stacks that show nothing but brain, masks, the same as DICOM, weights."""
+    """Stand-ins: small stacks that show nothing but brain, masks, the same as DICOM, slices with poses, weights."""
     from tests.dicom.dicom_files import Study
+    from tests.reuse.slice_writer import write_three
 
     folder = tmp_path_factory.mktemp("stand-ins")
     shutil.copytree(subject, folder / "case")
@@ -60,6 +62,7 @@ def folder(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         study.write(data, image.affine, 3 + 2 * n)
     for name in NETWORKS:
         shutil.copy(REPOSITORY / "g3r" / "checkpoints" / "weights" / f"{name}.safetensors", folder)
+    write_three(folder / "nesvor" / "slices", np.random.default_rng(1))
     (folder / "DIR").symlink_to(folder / "DICOM")
     assert all((folder / name).exists() for name in STAND_INS)
     return folder
@@ -68,7 +71,7 @@ def folder(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def inputs(words: list[str]) -> list[str]:
     """Words of a line of `g3r-infer` that are to be files."""
     ends = (".nii.gz", ".safetensors")
-    beside = [words[words.index(option) + 1] for option in ("--dicom", "--config") if option in words]
+    beside = [words[words.index(option) + 1] for option in ("--dicom", "--slices", "--config") if option in words]
     return [word for word in words if word.endswith(ends)] + beside
 
 

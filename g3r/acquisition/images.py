@@ -71,13 +71,22 @@ def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.boo
         InputError: as `load_volume`, or a mask on another grid (other shape, or corners more than half a
             voxel away), or an empty one, or an image.
     """
+    inside = read_mask(path, reference)
+    if not inside.any():
+        raise InputError(f"{Path(path).name}: mask is empty; expected the brain to be marked with 1")
+    return inside
+
+
+def read_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.bool_]:
+    """As `load_mask`, but the mask may be empty: not every slice shows the brain.
+
+    Raises:
+        InputError: as `load_mask`.
+    """
     mask = load_volume(path)
     check_grid(mask, reference.grid, f"that of {reference.name}", "mask")
     _check_mask_values(mask)
-    inside = np.nan_to_num(mask.data) > 0.5
-    if not inside.any():
-        raise InputError(f"{mask.name}: mask is empty; expected the brain to be marked with 1")
-    return inside
+    return np.nan_to_num(mask.data) > 0.5
 
 
 def check_grid(found: Volume, expected: VolumeGrid, of: str, kind: str) -> None:

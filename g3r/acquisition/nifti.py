@@ -43,6 +43,9 @@ HEADERS_AGREE_VOXELS = 0.5
 NO_SIZE = "setting 0 dims to 1"
 """nibabel's message for a pixdim of zero, where only an sform gives the voxel size."""
 
+NO_ORIENTATION = "header holds no orientation (sform_code and qform_code are 0); axes are taken as they are"
+"""Remark on an image whose place in space is unknown."""
+
 NiftiImage = nib.Nifti1Image | nib.Nifti2Image | nib.Nifti1Pair
 
 
@@ -142,7 +145,7 @@ def orientation_remarks(image: NiftiImage, grid: VolumeGrid) -> list[str]:
     header = image.header
     sform, qform = int(header["sform_code"]), int(header["qform_code"])
     if sform <= 0 and qform <= 0:
-        return ["header holds no orientation (sform_code and qform_code are 0); axes are taken as they are"]
+        return [NO_ORIENTATION]
     if sform <= 0 or qform <= 0:
         return []
     try:

@@ -22,8 +22,9 @@ LENGTHS_AGREE = 0.02
 
 NOMINAL_FWHM_PIXELS = (IN_PLANE_FWHM_PIXELS, IN_PLANE_FWHM_PIXELS)
 
-ThicknessSource = Literal["option", "sidecar", "spacing"]
-"""Who gave the thickness: the user, the scanner, or nobody, so that it is the distance of slices."""
+ThicknessSource = Literal["option", "sidecar", "header", "spacing"]
+"""Who gave the thickness: the user, the scanner, the headers of single slices, or nobody, so that it is the distance of
+slices."""
 
 
 @dataclass(frozen=True, kw_only=True)

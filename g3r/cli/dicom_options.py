@@ -44,7 +44,7 @@ class DicomInput:
 
 
 def add_input_options(parser: argparse._ActionsContainer) -> None:
-    """Where the stacks are: NIfTI files, or a folder of DICOM."""
+    """Where the stacks are: NIfTI files, a folder of DICOM, or one of slices."""
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--stacks", nargs="+", metavar="NIFTI", help="one file per stack")
     source.add_argument(
@@ -52,6 +52,12 @@ def add_input_options(parser: argparse._ActionsContainer) -> None:
         metavar="DIR",
         help="in place of --stacks: folder of one examination, whose 2D T2-weighted series are listed, chosen and "
         "converted (needs the dicom extra); --dry-run shows the list",
+    )
+    source.add_argument(
+        "--slices",
+        metavar="DIR",
+        help="in place of --stacks: folder of slices whose headers hold their poses (N.nii.gz, mask_N.nii.gz), as "
+        "NeSVoR and g3r-export-poses --format nesvor write them; poses are not searched",
     )
     parser.add_argument(
         "--series", nargs="+", metavar="N", help="with --dicom: numbers of the series to take, in place of the choice"

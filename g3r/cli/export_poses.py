@@ -24,12 +24,14 @@ def build_parser() -> argparse.ArgumentParser:
         help="itk: a .tfm per slice; mirtk: a rigid .dof per slice; nesvor: a folder of slices with poses in their "
         "headers, and the slices that the model predicts",
     )
-    parser.add_argument(
+    pixels = parser.add_mutually_exclusive_group()
+    pixels.add_argument(
         "--stacks",
         nargs="+",
         metavar="NIFTI",
         help="of the run, in its order: their pixels for --format nesvor (without them only predicted slices)",
     )
+    pixels.add_argument("--slices", metavar="DIR", help="the same of a run that was made with g3r-infer --slices DIR")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder to write; new or empty")
     return parser
 
@@ -38,8 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     parser = build_parser()
     options = parsed(parser, argv)
-    if options.stacks and options.format != "nesvor":
-        parser.error(f"--stacks and --format {options.format} exclude each other: such files hold no pixels")
+    for name in ("stacks", "slices"):
+        if getattr(options, name) and options.format != "nesvor":
+            parser.error(f"--{name} and --format {options.format} exclude each other: such files hold no pixels")
     return told(PROG, lambda: _export(options))
 
 
@@ -51,9 +54,14 @@ def _export(options: argparse.Namespace) -> str:
     from g3r.reuse.finished_run import FinishedRun
     from g3r.reuse.other_images import load_images, slices_of
     from g3r.reuse.pose_export import write_slice_folders, write_transforms
+    from g3r.reuse.slice_input import images_of_run
 
     run = FinishedRun.load(options.run)
-    measured = slices_of(run.geometry, load_images(run, options.stacks)) if options.stacks else None
+    measured = None
+    if options.stacks:
+        measured = slices_of(run.geometry, load_images(run, options.stacks))
+    elif options.slices:
+        measured = slices_of(run.geometry, images_of_run(run, options.slices))
     try:
         with OutputFolder(options.output) as output, output.result() as folder:
             if options.format == "nesvor":

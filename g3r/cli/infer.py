@@ -132,7 +132,8 @@ def _reconstructed(
     ):
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, reporter=reporter)
-        result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, plan=task.plan, run=run)
+        poses = task.slices.poses if task.slices else None
+        result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, poses, plan=task.plan, run=run)
         result = _with_command(result, options, task)
         terminal.begun(WRITING)
 

@@ -10,6 +10,7 @@ from g3r._version import __version__
 from g3r.cli.completion import HelpFormatter, parsed
 from g3r.cli.dicom_options import add_dicom_output_options, add_input_options, check_dicom_options
 from g3r.cli.mask_options import add_mask_options, check_mask_options
+from g3r.cli.slice_options import add_slice_options, check_slice_options
 from g3r.planning import PRESET_NAMES
 from g3r.planning.anatomy import ANATOMIES, FETAL_BRAIN, GENERIC
 
@@ -24,7 +25,8 @@ DEFAULTS = {
 """Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
 
 USAGE = """%(prog)s --stacks NIFTI [NIFTI ...] --output DIR [options]
-       %(prog)s --dicom DIR --output DIR [options]"""
+       %(prog)s --dicom DIR --output DIR [options]
+       %(prog)s --slices DIR --output DIR [options]"""
 
 DESCRIPTION = """\
 Reconstruct one isotropic fetal brain volume from stacks of thick slices.
@@ -68,13 +70,14 @@ def build_parser() -> argparse.ArgumentParser:
 def _add_input(parser: argparse.ArgumentParser) -> None:
     stacks = parser.add_argument_group("stacks")
     add_input_options(stacks)
+    add_slice_options(stacks)
     stacks.add_argument(
         "--thickness",
         nargs="+",
         type=float,
         metavar="MM",
         help="slice thickness, one for all or one per stack (default: what the JSON sidecar beside each stack says, or "
-        "else the distance of slices)",
+        "else the distance of slices; with --slices, what their headers say)",
     )
     add_mask_options(parser.add_argument_group("what is brain"))
 
@@ -176,10 +179,11 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """The options as they hold, defaults filled in; ends the program with 2 where they cannot go together."""
     parser = build_parser()
     options = parsed(parser, argv)
+    check_slice_options(parser, options)
     check_dicom_options(parser, options)
     n_stacks = len(options.stacks)
     check_mask_options(parser, options)
-    if options.thickness is not None and len(options.thickness) not in (1, n_stacks):
+    if options.thickness is not None and not options.slices and len(options.thickness) not in (1, n_stacks):
         parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
     if options.seed is not None and options.seed < 0:
         parser.error(f"--seed {options.seed}; expected 0 or above")
@@ -219,7 +223,7 @@ def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace)
 
 
 PATHS = ("stacks", "masks", "config", "ckpt", "pose_ckpt", "mask_ckpt")
-FOLDERS = ("output", "dicom", "dicom_out", "dicom_reference", "tensorboard")
+FOLDERS = ("output", "dicom", "slices", "dicom_out", "dicom_reference", "tensorboard")
 """Options that name files, and folders."""
 
 

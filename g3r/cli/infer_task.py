@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g3r.cli.mask_options import given_masks, mask_weights_path, masked_stacks, needs_network
+from g3r.cli.slice_options import load_slices, slice_hashes
 from g3r.errors import InputError
 from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from g3r.planning.plan import Plan
     from g3r.planning.presets import ReconstructionSettings
     from g3r.reconstruct import GaussianReconstructor
+    from g3r.reuse.slice_input import SliceFolder
+    from g3r.run.provenance import FileHash
     from g3r.run.reporter import Reporter
 
 STARTED_S = time.monotonic()
@@ -41,6 +44,7 @@ class Task:
         inputs: hashes of all files.
         n_threads: in use.
         plan: settings and deadlines of the run.
+        slices: that the stacks were made of; None where these were given.
         warnings: stacks that are left out, and what differs from the run that --config names.
         notes: for the record.
     """
@@ -53,12 +57,17 @@ class Task:
     n_threads: int
     plan: Plan
     warnings: list[str]
+    slices: SliceFolder | None = None
     notes: list[str] = field(default_factory=list)
 
     def told(self) -> Iterator[tuple[str, dict[str, object]]]:
         """Lines of `stage_words` on the input, and what is filled in."""
         n_stacks, sources = len(self.stacks), [stack.mask_source for stack in self.stacks]
         n_given = sources.count("file")
+        if self.slices is not None:
+            by = "index.tsv" if self.slices.index_path else "their headers"
+            yield "slices", {"n_slices": self.slices.n_slices, "n_stacks": n_stacks, "by": by}
+            return
         n_found = n_stacks - n_given - sources.count("whole image") - sources.count("empty background")
         facts: dict[str, object] = {"n_given": n_given, "n_found": n_found, "n_stacks": n_stacks}
         if not n_given and not n_found:
@@ -118,10 +127,16 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
         InputError: something in the files or options cannot be used.
     """
     earlier = _earlier(options)
-    reporter.begun(FINDING_MASKS)
-    masked = masked_stacks(options, networks.get("mask"))
-    reporter.begun(LOADING)
-    stacks = _load(options, masked, earlier)
+    slices, masked = None, None
+    if options.slices:
+        reporter.begun(LOADING)
+        slices = load_slices(options, earlier)
+        stacks = slices.stacks
+    else:
+        reporter.begun(FINDING_MASKS)
+        masked = masked_stacks(options, networks.get("mask"))
+        reporter.begun(LOADING)
+        stacks = _load(options, masked, earlier)
     reporter.begun(PREPARING)
     from g3r.planning.memory_limit import plan_for_stacks
     from g3r.reconstruct import GaussianReconstructor
@@ -133,7 +148,8 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
     reconstructor = GaussianReconstructor(
         networks.get("prior"), settings, pose_checkpoint=networks.get("pose"), device=options.device
     )
-    inputs = _inputs(options, masked, reconstructor, networks.get("mask"))
+    of_stacks = _stack_hashes(options, masked) if masked else slice_hashes(slices) if slices else ((), ())
+    inputs = _inputs(of_stacks, masked, reconstructor, networks.get("mask"))
     memory = plan_for_stacks(
         stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
     )
@@ -145,7 +161,8 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
         inputs=inputs,
         n_threads=n_threads,
         plan=_plan(options, memory.settings, earlier),
-        warnings=masked.left_out + (earlier.differences(inputs) if earlier else []),
+        slices=slices,
+        warnings=(masked.left_out if masked else []) + (earlier.differences(inputs) if earlier else []),
     )
 
 
@@ -159,7 +176,7 @@ def _earlier(options: argparse.Namespace) -> RunRecord | None:
     if earlier.partial:
         raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a complete result")
     n_then, n_now = len(earlier.stacks), len(options.stacks)
-    if n_then != n_now and not options.thickness:
+    if n_then != n_now and not options.thickness and not options.slices:
         raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
     return earlier
 
@@ -177,7 +194,7 @@ def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord 
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:
-    from g3r.planning.presets import PRESETS, for_anatomy
+    from g3r.planning.presets import PRESETS, for_anatomy, keeping_poses
 
     preset = PRESETS[options.preset]
     if options.time_budget is not None:
@@ -191,12 +208,24 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         use_prior=not options.no_prior,
         fill_unseen=options.unseen == "fill",
     )
-    return for_anatomy(settings, options.anatomy)
+    settings = for_anatomy(settings, options.anatomy)
+    return keeping_poses(settings) if options.keep_poses else settings
+
+
+def _stack_hashes(
+    options: argparse.Namespace, masked: MaskedStacks
+) -> tuple[tuple[FileHash, ...], tuple[FileHash, ...]]:
+    """Of stacks and of masks."""
+    from g3r.acquisition.brain_mask import FoundMask
+    from g3r.run.provenance import FileHash
+
+    masks = (one.hash() if isinstance(one, FoundMask) else FileHash.of(one) for one in masked.masks)
+    return tuple(FileHash.of(options.stacks[n]) for n in masked.kept), tuple(masks)
 
 
 def _inputs(
-    options: argparse.Namespace,
-    masked: MaskedStacks,
+    of_stacks: tuple[tuple[FileHash, ...], tuple[FileHash, ...]],
+    masked: MaskedStacks | None,
     reconstructor: GaussianReconstructor,
     mask_weights: WeightsFile | None,
 ) -> Inputs:
@@ -205,10 +234,11 @@ def _inputs(
     from g3r.run.provenance import FileHash
 
     prior, pose = reconstructor.prior, reconstructor.pose_model
-    asked = any(isinstance(one, FoundMask) and one.source == "automatic" for one in masked.masks)
+    masks = masked.masks if masked else []
+    asked = any(isinstance(one, FoundMask) and one.source == "automatic" for one in masks)
     return Inputs(
-        stacks=tuple(FileHash.of(options.stacks[n]) for n in masked.kept),
-        masks=tuple(one.hash() if isinstance(one, FoundMask) else FileHash.of(one) for one in masked.masks),
+        stacks=of_stacks[0],
+        masks=of_stacks[1],
         prior=FileHash(prior.file_name, prior.file_sha256) if prior else None,
         pose_network=FileHash(pose.file_name, pose.file_sha256) if pose else None,
         mask_network=FileHash(mask_weights.path.name, mask_weights.sha256) if mask_weights and asked else None,

@@ -85,7 +85,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     """
     before = dict(BEFORE_S)
     n_to_find = 0
-    if not (options.whole_image or options.mask_command):
+    if not (options.whole_image or options.mask_command or options.slices):
         given = options.masks or []
         n_to_find = sum(one == "auto" for one in given) if given else max(len(options.stacks), 3)
     before[FINDING_MASKS] += MASK_S * n_to_find

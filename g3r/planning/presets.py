@@ -17,6 +17,8 @@ from g3r.planning.anatomy import FETAL_BRAIN, Anatomy
 from g3r.prior.inference import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings
 
+RESOLUTION_RANGE_MM = (0.3, 3.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionSettings:
@@ -144,6 +146,29 @@ def preset(name: str) -> ReconstructionSettings:
     if name not in PRESETS:
         raise InputError(f"preset {name!r}; expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+def keeping_poses(settings: ReconstructionSettings) -> ReconstructionSettings:
+    """The settings without any step that moves slices against each other."""
+    return replace(
+        settings,
+        registration=replace(settings.registration, segments=False),
+        pose_rounds=settings.pose_rounds.at_most(0),
+        slice_stage=replace(settings.slice_stage, optimise_poses=False),
+    )
+
+
+def settings_of(given: ReconstructionSettings | str) -> ReconstructionSettings:
+    """Settings, or those of a preset by its name.
+
+    Raises:
+        InputError: an unknown preset, or a resolution outside 0.3-3 mm.
+    """
+    settings = preset(given) if isinstance(given, str) else given
+    low, high = RESOLUTION_RANGE_MM
+    if not low <= settings.resolution_mm <= high:
+        raise InputError(f"resolution {settings.resolution_mm:g} mm; expected {low:g} to {high:g} mm")
+    return settings
 
 
 def for_anatomy(settings: ReconstructionSettings, anatomy: Anatomy) -> ReconstructionSettings:

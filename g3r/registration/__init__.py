@@ -17,10 +17,13 @@
 Where stacks lack slices (`acquisition.area_profile` says which), the template stands for what other stacks did not
 see (`unseen`), and `overlap` measures how far stacks prove each other's poses.
 
+Where poses come from elsewhere, `given` takes the place of steps 2 to 4 and measures what they measure.
+
 `prior_registration` is used later, for single stacks alone: their slices move towards the prior volume.
 """
 
 from g3r.registration.estimate import Registration, register
+from g3r.registration.given import GivenPoses
 from g3r.registration.settings import RegistrationSettings
 
-__all__ = ["Registration", "RegistrationSettings", "register"]
+__all__ = ["GivenPoses", "Registration", "RegistrationSettings", "register"]

@@ -69,6 +69,19 @@ def standard_orientation(
     return Orientation(motion @ slices.planes.pose, best, template.weeks, template.scale)
 
 
+def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> Orientation:
+    """How well slices fit the atlas templates where they are.
+
+    Args:
+        slices: at their poses.
+        templates: atlas templates of the subject's size; the one that fits best decides.
+    """
+    pixels, still = SearchPixels.of(slices), RigidPose.identity(1)
+    found = [(float(correlation(pixels.moments(one.volume, one.grid, still).sum(1))[0]), one) for one in templates]
+    best, template = max(found, key=lambda one: one[0])
+    return Orientation(slices.planes.pose, best, template.weeks, template.scale)
+
+
 def _moved_to(
     template: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
 ) -> tuple[float, RigidPose]:

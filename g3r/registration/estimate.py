@@ -105,7 +105,7 @@ def register(
     else:
         search_deadline = deadline.part(SEARCH_SHARE) if deadline else None
         found = GlobalSearch(slices, samples, settings, template).run(proposals or {}, search_deadline)
-    n_segments, interleave = _segments_of(samples, found.motion)
+    n_segments, interleave = segments_of(samples, found.motion)
     rounds = replace(settings, n_rounds=0) if single else settings
     rounds_deadline = deadline.part(ROUNDS_SHARE) if deadline else None
     missing = not single and any(sample.profile.has_missing for sample in samples)
@@ -201,13 +201,21 @@ def _with_rigid_stacks(
     return kept, held_out_score(slices, samples, refined, fill).correlations
 
 
-def _segments_of(samples: list[StackSamples], motion: RigidPose) -> tuple[list[int], list[int | None]]:
-    """Number of motion segments of each stack, and the interleave under which they are fewest."""
+def segments_of(
+    samples: list[StackSamples], motion: RigidPose, same_mm: float = SAME_PLACE_MM
+) -> tuple[list[int], list[int | None]]:
+    """Number of motion segments of each stack, and the interleave under which they are fewest.
+
+    Args:
+        samples: the thinned pixels of each stack.
+        motion: [K] world from header of all slices.
+        same_mm: slices that motions move apart by less are of one segment.
+    """
     n_segments, interleave = [], list[int | None]()
     for sample in samples:
         own = motion.take(sample.rows)
         order = estimate_interleave(sample, own)
         moves = changes_in_time(own, sample.slice_index, sample.pixels.center_mm, order)
-        n_segments.append(1 + int((moves > SAME_PLACE_MM).sum()))
+        n_segments.append(1 + int((moves > same_mm).sum()))
         interleave.append(order if n_segments[-1] > 1 else None)
     return n_segments, interleave

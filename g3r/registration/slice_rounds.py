@@ -17,6 +17,7 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.settings import RegistrationSettings
+from g3r.registration.similarity import GAIN_RANGE
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.run.deadline import Deadline, timed_steps
 
@@ -25,6 +26,10 @@ logger = logging.getLogger(__name__)
 
 MIN_ROUNDS = 3
 """One round for each voxel size, whatever the deadline."""
+
+N_ROUNDS_IN_PLACE = 3
+"""Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
+volume is made without them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +101,42 @@ def refine_slices(
     progress(n_rounds, n_rounds)
     ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm)
     return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
+
+
+def fitted_in_place(
+    slices: Slices, settings: RegistrationSettings, progress: Callable[[int, int], None] = lambda done, total: None
+) -> FittedSlices:
+    """Gains, weights and correlations of slices that stay where they are, as `refine_slices` finds them.
+
+    Slices of a single stack, which explain themselves, keep a gain and a weight of 1, as there.
+
+    Args:
+        slices: at their poses.
+        settings: voxel of the volume, number of pixels.
+        progress: called with the rounds done and their total.
+    """
+    voxel, n_rounds = settings.finest_voxel_mm, N_ROUNDS_IN_PLACE if slices.n_stacks > 1 else 0
+    gain, weight = np.ones(len(slices)), np.ones(len(slices))
+    stride = max(1, round(len(slices.pixel_index) / settings.max_pixels))
+    grid, volume = grid_around(slices, voxel), None
+    history: list[dict[str, float]] = []
+    for number in range(n_rounds):
+        progress(number, n_rounds)
+        volume = _volume_of(slices, grid, gain, weight, volume, 0.03, stride)
+        model = SliceModel(slices, volume, grid, stride=stride)
+        width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
+        fit = model.evaluate(slices.planes, gain, width)
+        yy, mm, ym = fit.moments[:, 3:].T
+        log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE))
+        gain = np.exp(log_gain - log_gain.mean())
+        fit = model.evaluate(slices.planes, gain, width)
+        weight = slice_weights(fit.loss)
+        ncc = float(np.median(fit.ncc))
+        history.append({"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": ncc, "moved": 0})
+        logger.info("slices in place, round %d: residual %.4f", number + 1, width / 2)
+    progress(max(n_rounds, 1), max(n_rounds, 1))
+    ncc_of_all = correlation_with_all(slices, gain, weight, voxel)
+    return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc_of_all, history=history)
 
 
 def _volume_of(

@@ -11,6 +11,7 @@ from g3r.registration.thresholds import MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 THICKNESS_FROM = {
     "option": "given by the user",
     "sidecar": "from the scanner's sidecar",
+    "header": "from the headers of the slices",
     "spacing": "assumed: the distance of slices",
 }
 MASK_FROM = {

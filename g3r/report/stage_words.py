@@ -37,6 +37,7 @@ DOING = {
 
 LINES = {
     "stacks": (LOADING, "{n_stacks:stack}, {n_slices:slice} {thickness} thick"),
+    "slices": (LOADING, "{n_slices:slice} with given poses, in {n_stacks:stack} by {by}"),
     "thickness unknown": (LOADING, "the thickness of {n:stack} is not stated: look at the warnings"),
     "masks given": (FINDING_MASKS, "your {n_given:mask} will be used"),
     "masks found": (FINDING_MASKS, "found in {n_found} of {n_stacks:stack}; look at masks.png"),

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from g3r.cli.export_poses import main as export_poses
 from g3r.reuse.finished_run import FinishedRun
+from tests.cli.test_infer import files
 from tests.reuse.runs import reconstruct
 
 
@@ -22,3 +24,12 @@ def finished(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(finished: Path) -> FinishedRun:
     """The same, read."""
     return FinishedRun.load(finished)
+
+
+@pytest.fixture(scope="session")
+def exported(subject: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its slices with their poses, as NeSVoR has them; tests do not write to it."""
+    out = tmp_path_factory.mktemp("exported") / "nesvor"
+    stacks = [str(path) for path in files(subject, "stack")]
+    assert export_poses([str(finished), "--format", "nesvor", "--stacks", *stacks, "--output", str(out)]) == 0
+    return out

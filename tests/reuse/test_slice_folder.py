@@ -20,12 +20,9 @@ TOLERANCE_MM = 1e-4
 THICKNESS_MM = 4.0
 
 
-@pytest.fixture(scope="module")
-def folder(subject: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("exported") / "nesvor"
-    stacks = [str(path) for path in files(subject, "stack")]
-    assert main([str(finished), "--format", "nesvor", "--stacks", *stacks, "--output", str(out)]) == 0
-    return out
+@pytest.fixture
+def folder(exported: Path) -> Path:
+    return exported
 
 
 def images(folder: Path, prefix: str = "") -> list[nib.Nifti1Image]:
