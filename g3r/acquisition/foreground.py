@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_fill_holes, gaussian_filter, label
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
 from g3r.acquisition.planes import Slices
@@ -34,6 +34,9 @@ CORE_SHARE = 1 / 2
 """The same share for the mask that is written: the edge of a mask, so that its volume is right."""
 
 THIN_MARGIN_VOXELS = 2
+
+FLAT = 1e-6
+"""In voxels: what is nearer to a face of the hull lies on it."""
 
 LIKELY, POSSIBLE = 0.5, 0.25
 """Brain probability of an unseen voxel, to be in the mask, and to be shown: a voxel of the rim that is left out costs
@@ -131,17 +134,27 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
 
 
 def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the voxels asked for [I, J, K] lie inside the convex hull of a mask; none where it is flat."""
+    """Which of the voxels asked for [I, J, K] lie inside the convex hull of a mask; none where it is flat.
+
+    Each line of voxels along the third axis crosses the hull once, between the nearest of its half-spaces on either
+    side: as exact as asking every voxel, and a hundred times faster.
+    """
     within = np.zeros_like(brain)
     within[:, :, 1:-1] = brain[:, :, :-2] & brain[:, :, 2:]
     surface = np.argwhere(brain & ~within)
-    result = np.zeros(brain.shape, bool)
-    low, high = surface.min(0), surface.max(0) + 1
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    index = np.argwhere(asked[box]) + low
     try:
-        inside = Delaunay(surface[:: max(1, len(surface) // 4000)]).find_simplex(index) >= 0
+        faces = np.unique(np.round(ConvexHull(surface).equations, 9), axis=0)  # triangles in one plane
     except QhullError:
-        return result
-    result[tuple(index[inside].T)] = True
-    return result
+        return np.zeros(brain.shape, bool)
+    i, j = np.indices(brain.shape[:2])
+    low, high = np.full(brain.shape[:2], -np.inf), np.full(brain.shape[:2], np.inf)
+    for a, b, c, d in faces:
+        beyond = a * i + b * j + d
+        if abs(c) < FLAT:
+            high = np.where(beyond > FLAT, -np.inf, high)
+        elif c > 0:
+            high = np.minimum(high, -beyond / c)
+        else:
+            low = np.maximum(low, -beyond / c)
+    k = np.arange(brain.shape[2])
+    return np.asarray(asked & (k >= low[:, :, None] - FLAT) & (k <= high[:, :, None] + FLAT))

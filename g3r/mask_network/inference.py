@@ -45,6 +45,8 @@ BESIDE_MM = 14.0
 """Further slices on each side of what was found."""
 FLIPS: tuple[tuple[int, ...], ...] = ((), (2, 3))
 """Axes of a tensor along which the images are mirrored for further estimates."""
+WIDE_FLIPS = (*FLIPS, (2,), (3,))
+"""The same from afar, where few pixels cost little and a wrong place costs everything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +90,11 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
         return _nothing(image.shape, refused)
     network = model.network
     coarse, boxes = _boxes(network, image, spacing)
-    tried = [_mask_in(network, image, spacing, low, high) for low, high in boxes]
-    # from near and from afar it should look like a brain
-    scores = [float((probability * coarse)[mask].sum()) for mask, probability in tried]
-    if not any(scores):
+    tried = [one for low, high in boxes if (one := _mask_in(network, image, spacing, low, high))[0].any()]
+    if not tried:
         return _nothing(image.shape, "no head found: nothing in the image looks like a brain")
+    # from near and from afar it should look like a brain: what does not from afar counts against it
+    scores = [float((probability * (2 * coarse - 1))[mask].sum()) for mask, probability in tried]
     # again about what was outlined: the place was a rough one
     best, _ = tried[int(np.argmax(scores))]
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
@@ -170,7 +172,7 @@ def _boxes(network: MaskNetwork, image: Image, spacing: Array) -> tuple[Image, l
     same = np.eye(image.shape[2], dtype=np.float32)
     sizes = list(zip(image.shape[:2], spacing[:2], at, strict=True))
     wide = along_axes(image, [*(axis_weights(n, mm, a, step) for n, mm, a in sizes), same])
-    probability = _probability(network, wide, FLIPS)
+    probability = _probability(network, wide, WIDE_FLIPS)
     back = [axis_weights(len(a), step, np.arange(n) * mm - a[0], mm) for n, mm, a in sizes]
     # the crop's size in the plane is never less than `CROP_MM`
     reach = np.array([0.0, 0.0, APART_MM])
