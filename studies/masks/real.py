@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from g3r.acquisition.images import load_mask, load_volume
+from g3r.acquisition.stacks import load_stack
 from g3r.errors import InputError
 from studies.harness import Record, Row, Study, Task
 from studies.masks.overlap import EACH, OPTIONS, line, scored, settings
@@ -48,9 +48,8 @@ def measure(stack: Path, mask: Path, options: argparse.Namespace) -> Row:
         mask: file of the mask drawn by hand.
         options: of the command.
     """
-    image = load_volume(stack)
-    true = load_mask(mask, image)
-    return scored(image.data, true, image.grid.spacing_mm.tolist(), options.masks)
+    true = load_stack(stack, mask)  # rows in the order in which the product asks the network, too
+    return scored(true.image, true.mask, true.spacing_mm.tolist(), options.masks)
 
 
 def tables(record: Record) -> dict[str, str]:
