@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
-from g3r.mask_network.mask_shape import as_people_draw, cleaned, without_outgrowths
+from g3r.mask_network.mask_shape import as_people_draw, cleaned, without_doubtful_ends, without_outgrowths
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -100,6 +100,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
     mask = without_outgrowths(cleaned(probability > LEAST_PROBABILITY, spacing), probability, spacing)
+    mask = without_doubtful_ends(mask, probability)
     volume_ml = float(mask.sum() * spacing.prod() / 1000)
     presence = float(probability[mask].mean()) if mask.any() else 0.0
     if volume_ml < MIN_VOLUME_ML or presence < MIN_PRESENCE:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.mask_network.mask_shape import RIM_MM, as_people_draw, cleaned, without_outgrowths
+from g3r.mask_network.mask_shape import RIM_MM, as_people_draw, cleaned, without_doubtful_ends, without_outgrowths
 
 SPACING_MM = np.array([0.8, 1.1, 3.0])
 
@@ -61,3 +61,13 @@ def test_one_slice_or_none_is_not_judged(slices: slice) -> None:
     mask = np.zeros((30, 30, 5), dtype=bool)
     mask[5:25, 8:20, slices] = True
     np.testing.assert_array_equal(without_outgrowths(mask, np.ones(mask.shape), SPACING_MM), mask)
+
+
+def test_doubtful_sections_at_the_ends_go_and_those_between_stay() -> None:
+    mask = np.zeros((20, 20, 9), bool)
+    mask[5:15, 5:15, 1:8] = True
+    probability = np.where(mask, np.array([0, 0.4, 0.5, 0.9, 0.3, 0.9, 0.8, 0.55, 0]), 0).astype(np.float32)
+    kept = without_doubtful_ends(mask, probability)
+    assert np.flatnonzero(kept.any((0, 1))).tolist() == [3, 4, 5, 6]
+    np.testing.assert_array_equal(kept[:, :, 3:7], mask[:, :, 3:7])
+    assert not without_doubtful_ends(mask, probability * 0.5).any()
