@@ -124,7 +124,9 @@ class Page:
         return Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
 
     def pixels(self, selector: str) -> np.ndarray:
-        """The same of an element as numbers [H, W, 3]."""
+        """The same of an element as numbers [H, W, 3], whole: it is brought into the window."""
+        self.evaluate(f"document.querySelector({selector!r}).scrollIntoView({{block: 'center'}})")
+        self.wait("true", 0.3)
         return np.asarray(self.picture(selector), dtype=float)
 
     def _next(self) -> dict[str, Any]:

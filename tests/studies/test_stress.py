@@ -79,4 +79,4 @@ def test_the_table_counts_words_by_what_they_were_said_of() -> None:
     rows = {str(n): row(*one) for n, one in enumerate(words)}
     text = sweep.tables({"preset": "fast", "rows": rows})["stress-sweep"]
     assert "Of 3 bad ones the verdict was *do not use*, or a refusal, in 2, *check* in 0 and *use* in 1." in text
-    assert "Of 3 good ones it was *use* in 2, *check* in 1 and *do not use* in 0." in text
+    assert "Of 3 good ones it was *use* in 2, *check* in 1 and *do not use* in 0; " in text
