@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.bias_field import StackBiasField
 from g3r.geometry import VolumeGrid
 
 INSIDE = 0.99
 """Share of a pixel in the brain from which on it counts."""
 MAX_PIXELS = 400_000
 """Pixels that are asked at most; more do not change the third digit."""
+N_ROUNDS = 2
+"""Gains of slices and fields of stacks are found in turn; a third round does not change the third digit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +27,8 @@ class VolumeCheck:
 
     Attributes:
         volume, prior, coarse: root mean square error of the masked pixels that the finished volume, V_prior and
-            V_coarse predict, as a share of their own root mean square.
+            V_coarse predict, each with gains and bias fields of its own, as a share of the root mean square of the
+            pixels.
     """
 
     volume: float
@@ -90,7 +94,10 @@ def _residual(
     slices: Slices,
     weight: NDArray[np.float64],
 ) -> float:
-    """Weighted error after one gain a slice, relative to the intensities; 0 where no pixel counts. See `check_volume`.
+    """Weighted error after a gain for each slice and a bias field for each stack, relative to the intensities.
+
+    Slices show the bias fields of their stacks. V_coarse and V_prior are means over them, and still hold what stacks
+    share; the finished volume is free of them. Without fields of their own the purest volume would explain least.
 
     Args:
         volume: [I, J, K].
@@ -98,13 +105,65 @@ def _residual(
         grid: of both.
         slices: K slices.
         weight: [K].
+
+    Returns:
+        The share, 0 where no pixel counts. See `check_volume`.
     """
     index = slices.pixel_index[:: 1 + len(slices.pixel_index) // MAX_PIXELS]
     operator = VoxelOperator(slices.planes, grid, index)
     number, measured = operator.plane, slices.value[index].astype(np.float64)
     counts = weight[number] * (operator.forward(support.astype(np.float32)) > INSIDE)
     predicted = operator.forward(volume).astype(np.float64)
-    across, own = (np.bincount(number, counts * predicted * one, len(slices)) for one in (measured, predicted))
-    gain = np.divide(across, own, where=own > 0, out=np.zeros_like(own))
-    error, all_of_it = counts @ (gain[number] * predicted - measured) ** 2, counts @ measured**2
+    terms, stack_id = StackBiasField(slices).basis[:, index].astype(np.float64), slices.stack_id[number]
+    shown = predicted
+    for _ in range(N_ROUNDS):
+        gain = _gains(shown, measured, counts, number, len(slices))
+        shown = predicted * _fields(gain * predicted, measured, counts, stack_id, terms)
+    fitted = _gains(shown, measured, counts, number, len(slices)) * shown
+    error, all_of_it = counts @ (fitted - measured) ** 2, counts @ measured**2
     return round(math.sqrt(error / all_of_it), 4) if all_of_it > 0 else 0.0
+
+
+def _gains(
+    predicted: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    number: NDArray[np.integer],
+    n_slices: int,
+) -> NDArray[np.float64]:
+    """The best gain of its slice for each pixel [P]; 0 where a volume shows nothing.
+
+    Args:
+        predicted: intensities [P].
+        measured: intensities [P].
+        counts: weights [P].
+        number: of the slice of each pixel [P].
+        n_slices: in all.
+    """
+    across, own = (np.bincount(number, counts * predicted * one, n_slices) for one in (measured, predicted))
+    return np.divide(across, own, where=own > 0, out=np.zeros_like(own))[number]
+
+
+def _fields(
+    predicted: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    stack_id: NDArray[np.integer],
+    terms: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The best bias field of its stack at each pixel [P], as a factor.
+
+    Args:
+        predicted: intensities [P].
+        measured: intensities [P].
+        counts: weights [P].
+        stack_id: of each pixel [P].
+        terms: of the fields [5, P], see `StackBiasField`.
+    """
+    field = np.ones_like(predicted)
+    for stack in np.unique(stack_id):
+        own = stack_id == stack
+        root = np.sqrt(counts[own])
+        design, error = root * terms[:, own] * predicted[own], root * (measured - predicted)[own]
+        field[own] += np.linalg.lstsq(design @ design.T, design @ error, rcond=None)[0] @ terms[:, own]
+    return field

@@ -17,7 +17,7 @@ from g3r.geometry.grid import on_grid
 from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
-from tests.fitting.scene import BALL, GRID, make_slices, true_volume
+from tests.fitting.scene import BALL, GRID, INDEX, make_slices, true_volume
 from tests.numerics.fits import SETTINGS, small_stacks
 
 ONES = np.ones(24)
@@ -52,6 +52,21 @@ def test_gains_and_units_do_not_matter() -> None:
     truth = true_volume()
     scaled = check(truth * np.float32(1e-6), truth, slices=make_slices(np.linspace(0.5, 2, 24)))
     assert scaled.volume == pytest.approx(check(truth, truth).volume, abs=0.003)
+
+
+def test_bias_fields_of_the_slices_are_not_held_against_a_volume_without_them() -> None:
+    """V_prior is made of biased slices and shows their bias; the fit divides it out."""
+    slices, truth = make_slices(), true_volume()
+    steepness = 0.03 * np.array([1.0, -0.3, 0.5])
+    biased = slices.value * np.exp(slices.planes.pixel_world_mm() @ steepness).astype(np.float32)
+    rng = np.random.default_rng(0)
+    noisy = truth + 0.2 * truth.std() * rng.normal(size=truth.shape)
+    with_bias = (noisy * np.exp(GRID.world(INDEX) @ steepness)).astype(np.float32)
+    found = check(truth, with_bias, slices=replace(slices, value=biased))
+    assert not found.falls_back
+    assert found.volume < 0.05  # fields are of second order; an exponential is not
+    wrong = check(np.roll(truth, 2, 0), with_bias, slices=replace(slices, value=biased))
+    assert wrong.falls_back
 
 
 def test_slices_without_weight_do_not_count() -> None:
