@@ -23,8 +23,9 @@ WORKING_VOXEL_MM = 2.4
 CONTROL_POINTS = 4
 """Of the cubic B-spline along each axis, of which four are the fewest: about a quadratic over the head."""
 
-ITERATIONS = (20, 10)
-"""Largest numbers on one level of control points and on the next, twice as fine."""
+ITERATIONS = (100, 10)
+"""Largest numbers on one level of control points and on the next, twice as fine. Weak fields converge in 20 on the
+first level, strong ones need more; more on the second take anatomy for a field (heads of docs/stress.md)."""
 
 MIN_VOXELS = 200
 """Fewer working voxels have no histogram."""

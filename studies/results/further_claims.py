@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from g3r.report.verdict import USE
 from studies.results.blocks import Block
 from studies.results.findings import FEW, NOTICEABLE_DB, Claim, Finding, column, paired, shares, table_after, value
+from studies.stress.sweep import FALSE
 
 MEANS = "mean gain over the quicker one"
 """The last row of the table of presets, where each is compared with the one before it."""
@@ -38,6 +39,25 @@ def warned(bad: bool) -> Claim:
         find=find,
         yes=f"The verdict is right about {kind} runs: {{figure}}.",
         no=f"The verdict is wrong about {kind} runs too often: it is right about {{figure}}.",
+    )
+
+
+def false_alarms() -> Claim:
+    """How many good runs are warned about although nothing is wrong with their stacks."""
+
+    def find(block: Block) -> Finding | None:
+        table = table_after(block, "Every run")
+        runs = [row for row in table.rows if row["bad"] != "bad"] if table else []
+        said = sum(row["warning"] == FALSE for row in runs)
+        return shares(len(runs) - said, len(runs), 0.95, "runs") if runs else None
+
+    return Claim(
+        text="A good run gets no false alarm: a warning that names nothing that is wrong with its stacks",
+        asked="at least 95 %",
+        block="stress-sweep",
+        find=find,
+        yes="False alarms are rare: {figure} of the good runs have none.",
+        no="False alarms are too frequent: only {figure} of the good runs have none.",
     )
 
 
@@ -193,6 +213,7 @@ def verdicts() -> Iterator[Claim]:
     """Whether g3r says when a volume may not be used."""
     yield warned(bad=True)
     yield warned(bad=False)
+    yield false_alarms()
 
 
 def presets() -> Iterator[Claim]:

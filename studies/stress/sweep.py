@@ -36,6 +36,12 @@ FIRST_SEED = 91_000
 BAD_MM, BAD_SHARE, BAD_PSNR_DB = 2.0, 0.05, 20.0
 """A result is bad if more than this share of the brain in its slices is further off, or if the volume is worse."""
 
+LAST = "stack-2.nii.gz"
+"""The stack that is spoilt where one is."""
+
+TRUE, FALSE = "true", "false alarm"
+"""What a warning is: it names a fault of the stacks, or nothing that is wrong with them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
@@ -47,6 +53,7 @@ class Condition:
         motion: of the head.
         taken: settings of the stacks (`StackSettings`) that differ.
         damage: to the stacks afterwards.
+        fault: words of a verdict that names what is wrong here, right also where the volume is good.
     """
 
     what: str
@@ -54,6 +61,7 @@ class Condition:
     motion: str = "moderate"
     taken: Mapping[str, Any] = field(default_factory=dict)
     damage: Damage = field(default_factory=damage.nothing)
+    fault: str = ""
 
     @property
     def name(self) -> str:
@@ -66,7 +74,8 @@ def _conditions() -> Iterator[Condition]:
     for motion in ("none", "mild", "severe"):
         yield Condition(what="motion", level=motion, motion=motion)
     for n in (2, 1):
-        yield Condition(what="stacks", level=str(n), damage=damage.first_stacks(n))
+        alone = "a single stack" if n == 1 else ""
+        yield Condition(what="stacks", level=str(n), damage=damage.first_stacks(n), fault=alone)
     for gap_mm in (1.1, 2.2):
         yield Condition(what="gap", level=f"{gap_mm:g} mm", taken={"gap_mm": gap_mm})
     for mm in (3.3, 4.4):
@@ -80,11 +89,12 @@ def _conditions() -> Iterator[Condition]:
     for factor in (0.7, 1.3):
         yield Condition(what="stated thickness", level=f"{factor - 1:+.0%}", damage=damage.stated_thickness(factor))
     for pixels in (-4, -2, -1, 1, 2, 4):
-        yield Condition(what="masks", level=f"{pixels:+d} pixels", damage=damage.masks_grown(pixels))
-    yield Condition(what="one stack", level="of another contrast", damage=damage.other_contrast())
-    yield Condition(what="one stack", level="slices in reverse order", damage=damage.slices_reversed())
-    yield Condition(what="one stack", level="slices sorted by time", damage=damage.halves_swapped())
-    yield Condition(what="one stack", level="of another head", damage=damage.stack_of_another())
+        leave_out = "the mask of" if pixels < 0 else ""
+        yield Condition(what="masks", level=f"{pixels:+d} pixels", damage=damage.masks_grown(pixels), fault=leave_out)
+    yield Condition(what="one stack", level="of another contrast", damage=damage.other_contrast(), fault=LAST)
+    yield Condition(what="one stack", level="slices in reverse order", damage=damage.slices_reversed(), fault=LAST)
+    yield Condition(what="one stack", level="slices sorted by time", damage=damage.halves_swapped(), fault=LAST)
+    yield Condition(what="one stack", level="of another head", damage=damage.stack_of_another(), fault=LAST)
 
 
 CONDITIONS = tuple(_conditions())
@@ -183,7 +193,9 @@ def tables(record: Record) -> dict[str, str]:
         f"refusal, in {_count(bad, _is_refused)}, *check* in {_count(bad, _is_check)} and *use* in "
         f"{_count(bad, _is_use)}. Of {len(good)} good ones it was *use* in {_count(good, _is_use)}, *check* in "
         f"{_count(good, _is_check)} and *do not use* in {_count(good, _is_refused)}; in "
-        f"{_count(good, _says_unseen)} of these because a part of the brain was not seen."
+        f"{_count(good, _says_unseen)} of these because a part of the brain was not seen. Of the warnings about good "
+        f"ones {_count(good, lambda row: _warning(row) == TRUE)} name what is wrong with the stacks, "
+        f"{_count(good, lambda row: _warning(row) == FALSE)} are false alarms."
     )
     return {"stress-sweep": "\n\n".join([text, table(summary, SUMMARY), details("Every run", table(rows, EACH))])}
 
@@ -195,6 +207,14 @@ def _is_use(row: Row) -> bool:
 def _says_unseen(row: Row) -> bool:
     """Whether the verdict says that the volume is incomplete, which pose errors and PSNR do not count as bad."""
     return not _is_use(row) and "not seen by any slice" in row["reason"]
+
+
+def _warning(row: Row) -> str:
+    """Whether a warning names a fault that the stacks have; empty where there is none."""
+    if _is_use(row):
+        return ""
+    fault = next(one.fault for one in CONDITIONS if one.name == f"{row['what']}: {row['level']}")
+    return TRUE if _says_unseen(row) or (fault and fault in row["reason"]) else FALSE
 
 
 def _is_refused(row: Row) -> bool:
@@ -234,6 +254,7 @@ EACH: dict[str, Cell] = {
     "poses mm": "{median_mm:.2f}",
     "off": "{off_share:.0%}",
     "bad": lambda row: "bad" if row["bad"] else "-",
+    "warning": lambda row: _warning(row) or "-",
     "verdict": "{reason}",
 }
 

@@ -80,3 +80,17 @@ def test_the_table_counts_words_by_what_they_were_said_of() -> None:
     text = sweep.tables({"preset": "fast", "rows": rows})["stress-sweep"]
     assert "Of 3 bad ones the verdict was *do not use*, or a refusal, in 2, *check* in 0 and *use* in 1." in text
     assert "Of 3 good ones it was *use* in 2, *check* in 1 and *do not use* in 0; " in text
+    assert "0 name what is wrong with the stacks, 1 are false alarms." in text
+
+
+def test_a_warning_that_names_the_fault_is_no_false_alarm() -> None:
+    def warning(what: str, level: str, reason: str, word: str = "check") -> str:
+        row = {"what": what, "level": level, "word": word, "reason": reason, "bad": False}
+        return sweep.table([row], {"warning": sweep.EACH["warning"]}).splitlines()[-1].strip("| ")
+
+    assert warning("masks", "-2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == sweep.TRUE
+    assert warning("masks", "+2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == sweep.FALSE
+    assert warning("one stack", "of another head", "do not use: stack-2.nii.gz does not fit") == sweep.TRUE
+    assert warning("one stack", "of another head", "do not use: stack-0.nii.gz does not fit") == sweep.FALSE
+    assert warning("gap", "2.2 mm", "check: 3 % of the brain was not seen by any slice (4 ml)") == sweep.TRUE
+    assert warning("nothing", sweep.CONDITIONS[0].level, "use: all is well", "use") == "-"
