@@ -13,6 +13,7 @@ from data_synth.mask_head import SceneHead, filled_head, scene_head
 from data_synth.mask_labels import Tissue, draw_intensities
 from data_synth.mask_slicing import image_slices
 from data_synth.mask_surroundings import Surroundings, draw_surroundings
+from g3r.acquisition.file_axes import AS_IN_FILE
 from g3r.acquisition.stacks import Stack
 from g3r.evaluation.case import SimulatedCase
 from g3r.geometry import RigidPose, VolumeGrid
@@ -123,7 +124,8 @@ def _widened(stack: Stack) -> Stack:
     pad = [(int(missing[0]),) * 2, (int(missing[1]),) * 2, (SLICES_BEYOND,) * 2]
     affine = stack.affine.copy()
     affine[:3, 3] -= affine[:3, :3] @ [float(before) for before, _ in pad]
-    return replace(stack, image=np.pad(stack.image, pad), mask=np.pad(stack.mask, pad), affine=affine)
+    image, mask = np.pad(stack.image, pad), np.pad(stack.mask, pad)
+    return replace(stack, image=image, mask=mask, affine=affine, file_affine=None, axes=AS_IN_FILE)
 
 
 def _slice_poses(stack: Stack) -> RigidPose:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from g3r.acquisition.slicing import by_headers, slices_from_stacks
 from g3r.errors import InputError
+from g3r.evaluation.case import load_case
 from g3r.mask_network import inference
 from studies.harness import Row
 from studies.masks import overlap, real, simulated
+from studies.masks.surrounded import SLICES_BEYOND, surrounded
 
 
 def found_mask(mask: np.ndarray, spacing_mm: np.ndarray) -> inference.BrainMask:
@@ -68,3 +72,14 @@ def test_real_stacks_need_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     (tmp_path / "real").mkdir()
     with pytest.raises(InputError, match="no stack with a mask"):
         real.stacks_with_masks()
+
+
+def test_stacks_in_surroundings_keep_their_brain_in_its_place(subject: Path) -> None:
+    case = load_case(subject)
+    stacks = surrounded(case, seed=1)
+    assert all(stack.image[~stack.mask].any() for stack in stacks)
+    slices = by_headers(slices_from_stacks(stacks), stacks)
+    moved = replace(slices, slice_index=slices.slice_index - SLICES_BEYOND)
+    still, before = case.pose_error(moved), case.header_error()
+    assert still.median_mm == pytest.approx(before.median_mm, abs=0.05)
+    assert max(still.per_slice_mm.values()) == pytest.approx(max(before.per_slice_mm.values()), abs=0.1)
