@@ -29,7 +29,7 @@ BLUR_VOXELS = 0.4
 LATTICE_MM = 13.0
 """Distance of the control points of the deformation."""
 
-AFFINE_STEPS, DEFORMATION_STEPS = 30, 70
+AFFINE_STEPS, DEFORMATION_STEPS = 15, 35
 STEP_MM = 0.8
 """First step of Adam, in mm at the rim of a head; it falls to a tenth."""
 
