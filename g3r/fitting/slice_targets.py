@@ -18,12 +18,13 @@ class SliceModel:
     """How a slice follows from the volume.
 
     Args:
-        through_plane, in_plane: width of the profile over the nominal one (`psf_variance_mm2`).
+        through_plane, in_plane: width of the profile over the nominal one (`psf_variance_mm2`). Slices that share a
+            blur in plane say nothing about it (the volume takes it up), so that width is set, not measured.
         surroundings: whether what lies beside the brain is taken out of the pixels of its rim.
     """
 
     through_plane: float = 0.95
-    in_plane: float = 1.0
+    in_plane: float = 0.75
     surroundings: bool = True
 
 

@@ -123,7 +123,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         share_probes=1,
         registration=replace(_QUICK_SEARCH, n_rounds=5, finest_voxel_mm=1.4, max_pixels=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=70),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=55),
     ),
     "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(

@@ -19,6 +19,7 @@ WITHOUT: dict[str, Mapping[str, Any]] = {
     "common bias field": {"common_bias_field": False},
     "surroundings": {"slice_model.surroundings": False},
     "measured profile": {"held_out": None, "slice_model.through_plane": 1.0},
+    "less width in plane": {"slice_model.in_plane": 1.0},
     "prior in the volume": {"prior_weight": 0.0},
     "prior at the rim": {"prior_rim_mm": 0.0},
 }

@@ -8,7 +8,16 @@ import pytest
 
 from g3r.bench.record import machine
 from g3r.planning.presets import PRESETS, changed
-from studies.tradeoff import convergence, memory, peer_phantom, pose_rounds, presets, slice_model, time_budgets
+from studies.tradeoff import (
+    convergence,
+    in_plane,
+    memory,
+    peer_phantom,
+    pose_rounds,
+    presets,
+    slice_model,
+    time_budgets,
+)
 from studies.tradeoff.convergence import STEPS, WAYS, steps_to_near
 from studies.tradeoff.presets_figure import draw_presets
 
@@ -57,7 +66,10 @@ def test_each_part_of_the_slice_model_is_left_out_once_and_all_of_them_together(
     scores = {name: {"psnr_db": 30.0 - n, "ssim": 0.9} for n, name in enumerate(slice_model.VARIANTS)}
     row = {"n_stacks": 3, "scores": scores, "prior": {name: scores[name] for name in ("as shipped", "none of these")}}
     text = slice_model.tables({"preset": "balanced", "weights": "w", "rows": {"one": row}})["slice-model"]
-    assert "| one | 3 | 30.00 | 29.00 | 28.00 | 27.00 | 26.00 | 25.00 | 24.00 | 0.900 / 0.900 | 30.00 / 24.00 |" in text
+    assert (
+        "| one | 3 | 30.00 | 29.00 | 28.00 | 27.00 | 26.00 | 25.00 | 24.00 | 23.00 | 0.900 / 0.900 | 30.00 / 23.00 |"
+        in text
+    )
     assert slice_model.line("one", row).startswith("one: as shipped 30.00, without common bias field 29.00")
 
 
@@ -144,3 +156,14 @@ def test_rounds_are_shown_side_by_side() -> None:
     text = pose_rounds.tables({"preset": "balanced", "weights": "w", "rows": {"one, 2": row}})["pose-rounds"]
     assert "| one | 2 | 30.00 | 31.00 | 32.00 | 30.00 | 31.00 | 32.00 | 0.30 | 0.20 | 0.10 | 1 |" in text
     assert pose_rounds.line("one, 2", row) == "one, 2: 0 rounds 30.00, 1 rounds 31.00, 2 rounds 32.00"
+
+
+def test_widths_in_plane_have_a_table_of_cases_and_one_of_real_stacks() -> None:
+    scores = {f"width {width:g}": 30.0 + width for width in in_plane.WIDTHS}
+    predicted = {width: {f"{judged:g}": psnr - judged for judged in in_plane.JUDGED} for width, psnr in scores.items()}
+    rows: dict[str, dict[str, Any]] = {"one": {"psnr_db": scores}, "real, without two": {"predicted_db": predicted}}
+    text = in_plane.tables({"preset": "fast", "rows": rows})["in-plane"]
+    assert "| one | 31.00 | 30.85 | 30.75 |" in text
+    assert "| without two | 0.3 | 30.70 | 30.55 | 30.45 |" in text
+    assert text.count("| without two |") == len(in_plane.JUDGED)
+    assert in_plane.line("real", rows["real, without two"]).startswith("real: width 1: 30.70, width 0.85: 30.55")
