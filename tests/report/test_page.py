@@ -68,13 +68,15 @@ def test_the_page_is_one_small_file_that_may_ask_nobody(text: str) -> None:
 
 
 def test_the_name_is_nowhere_not_even_packed(text: str, finished: Path) -> None:
-    words = [b"DOE", b"JANE", b"pytest-of", str(finished.parent).encode()]
+    words = [b"DOE^", b"JANE", b"pytest-of", str(finished.parent).encode()]
     packed = [image.to_bytes() for image in images(text).values()]
     packed += [base64.b64decode(one) for one in re.findall(r"data:image/png;base64,([^\"]+)", text)]
-    for content in (text.encode(), *packed):
-        # the viewer is not of this project and holds all sorts of letters
-        own = content.replace((files("g3r.report") / "page" / "niivue.umd.js").read_bytes(), b"")
-        assert [word for word in words if word in own] == []
+    # the viewer is not of this project, and letters that stand for bytes spell all sorts of words
+    own = text.replace((files("g3r.report") / "page" / "niivue.umd.js").read_text(encoding="utf-8"), "")
+    own = re.sub(r"[A-Za-z0-9+/]{200,}={0,2}", "", own)
+    assert len(own) < len(text) / 2
+    for content in (own.encode(), *packed):
+        assert [word for word in words if word in content] == []
 
 
 def test_the_copies_show_what_the_files_hold(text: str, finished: Path) -> None:
