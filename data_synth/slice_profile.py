@@ -1,5 +1,8 @@
 """The slice profile of the simulator: how pixels average over the volume, in plane and through the slice.
 
+Of the three profiles only `gaussian` is the model's. With the two others a pixel averages over its own area in plane:
+k-space that was filled up to the pixel's resolution passes it all, where the model's Gaussian halves what is fine.
+
 The volume is read by trilinear interpolation, which itself blurs. The sample positions are drawn together by
 just that much, so that the profile seen by the slices has the stated variance.
 """
@@ -64,7 +67,7 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
         resolution_mm: in-plane pixel spacing.
         thickness_mm: slice thickness.
         profile: `gaussian` has the variance of the model's PSF; `box` is flat with soft edges; `sinc` is that of a
-            truncated sinc pulse, steep with ripples.
+            truncated sinc pulse, steep with ripples. In plane the two latter are a box of one pixel.
         voxel_mm: voxel size of the volume that is read.
 
     Returns:
@@ -73,6 +76,8 @@ def profile_nodes(resolution_mm: float, thickness_mm: float, profile: Profile, v
     """
     blur_mm2 = TRILINEAR_VARIANCE * voxel_mm**2
     target = psf_variance_mm2([resolution_mm] * 2, thickness_mm)
+    if profile != "gaussian":
+        target[:2] = resolution_mm**2 / 12
     axes = []
     for axis in range(3):
         reach = 5.2 * np.sqrt(target[axis])

@@ -28,6 +28,10 @@ BRIGHT = 1000.0
 STRETCH = 0.05
 """Each axis of a subject is longer or shorter by at most this share."""
 
+SIMULATOR = 2
+"""Of the slices in the cache; to be raised when the same settings give other slices. Since 2 a pixel of the `box` and
+`sinc` profiles averages over its own area in plane."""
+
 RECORD_NAME = "simulation.json"
 
 THICKNESS_MM = {"sb28-mild-gap": 3.0}
@@ -163,12 +167,14 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
     """
     folder = cache / spec.name
-    record = asdict(spec)
+    record = asdict(spec) | {"simulator": SIMULATOR}
     if folder.is_dir():
         path = folder / RECORD_NAME
         found = json.loads(path.read_text(encoding="utf-8")).get("spec") if path.is_file() else None
         if found != record:
-            raise InputError(f"{folder}: made by another specification; remove it or choose another --cache")
+            raise InputError(
+                f"{folder}: made by another specification or simulator; remove it or choose another --cache"
+            )
         return folder
     rng = np.random.default_rng(spec.seed)
     truth = stretched(cropped(spec.truth(atlas), 4), spec, rng)

@@ -27,6 +27,19 @@ class SliceModel:
     in_plane: float = 0.75
     surroundings: bool = True
 
+    def applied(self, slices: Slices, widths: Sequence[float] | None = None) -> Slices:
+        """The slices with the profile of the model in place of the nominal one.
+
+        Args:
+            slices: K slices with the nominal profile.
+            widths: of each stack's profile through the plane, where the data say them, in place of the model's.
+        """
+        _, stack = np.unique(slices.stack_id, return_inverse=True)
+        through = np.broadcast_to(self.through_plane if widths is None else np.asarray(widths), slices.n_stacks)[stack]
+        in_plane = np.full(len(slices), self.in_plane)
+        variance = slices.planes.psf_var_mm2 * np.stack([in_plane, in_plane, through], axis=1) ** 2
+        return replace(slices, planes=replace(slices.planes, psf_var_mm2=variance))
+
 
 @dataclass(frozen=True)
 class SliceTarget:
@@ -47,12 +60,7 @@ def slice_target(
         model: of the slices.
         widths: of each stack's profile through the plane, where the data say them, in place of the model's.
     """
-    slices = prior.volumes.slices
-    _, stack = np.unique(slices.stack_id, return_inverse=True)
-    through = np.broadcast_to(model.through_plane if widths is None else np.asarray(widths), slices.n_stacks)[stack]
-    in_plane = np.full(len(slices), model.in_plane)
-    variance = slices.planes.psf_var_mm2 * np.stack([in_plane, in_plane, through], axis=1) ** 2
-    slices = replace(slices, planes=replace(slices.planes, psf_var_mm2=variance))
+    slices = model.applied(prior.volumes.slices, widths)
     if not model.surroundings:
         return SliceTarget(slices, slices.mask.astype(np.float32))
     slices, share = without_surroundings(slices, prior.support, prior.volumes.grid, prior.gain, weight)

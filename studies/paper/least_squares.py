@@ -3,7 +3,8 @@
     minimise over V:  sum_p w_p (A V - y)_p^2  +  s r sum of rho(grad V)
 
 rho is the square (Tikhonov), or the length with a rounded tip (total variation). The second is solved as a sequence of
-weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own operator, r the mean coverage of a voxel.
+weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own operator with the profile of the product's
+fit, r the mean coverage of a voxel.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.slice_targets import SliceModel
 
 Array = NDArray[np.float32]
 
@@ -49,7 +51,7 @@ def least_squares_volume(
         weight: [K] slice weights.
         regulariser: how it is kept smooth.
     """
-    slices, grid = volumes.slices, volumes.grid
+    slices, grid = SliceModel().applied(volumes.slices), volumes.grid
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     pixel_weight = weight[slices.pixel_plane].astype(np.float32)
     value = (slices.masked_value / gain[slices.pixel_plane]).astype(np.float32)

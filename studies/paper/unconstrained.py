@@ -1,8 +1,8 @@
 """A baseline: Gaussians fitted to the slices alone, as GSVR does it, without prior volume and without stage 1.
 
 Seeds at random, or where the scattered volume changes most; round ones, as bright as that volume; then Adam on
-Gaussians, poses and gains with the L1 loss over the masked pixels. The renderer is g3r's, with the amplitude as
-Eq. 5 prints it or with the exact one.
+Gaussians, poses and gains with the L1 loss over the masked pixels. The renderer and the profile of the slices are
+those of the product, the amplitude is as Eq. 5 prints it or exact.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_gradient_magnitude
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.parameters import LearningRates
 from g3r.fitting.schedules import cosine_decay
+from g3r.fitting.slice_targets import SliceModel
 from g3r.gaussians import GaussianCloud
 from g3r.gaussians.overlap import OverlapList, find_overlaps
 from g3r.gaussians.render import CUTOFF_SIGMA, moved_planes, render
@@ -61,7 +62,8 @@ def fit_unconstrained(
         settings: seeds, amplitudes, steps.
         rng: draws the seeds.
     """
-    slices, planes = volumes.slices, volumes.slices.planes
+    slices = SliceModel().applied(volumes.slices)
+    planes = slices.planes
     cloud = seeds(volumes, spacing_mm, settings.seeding, rng)
     target = torch.from_numpy(slices.value)
     pixel_weight = torch.from_numpy(slices.mask * weight[planes.plane_id()].astype(np.float32))
