@@ -14,12 +14,13 @@ from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
+from g3r.fitting.lattice_mean import fit_lattices
 from g3r.fitting.mask_agreement import REFINED
 from g3r.fitting.observer import FitObserver
 from g3r.fitting.pose_rounds import PoseRounds, RefinedPoses, refine_in_rounds
 from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_targets import distillation_target, fit_to_prior
-from g3r.fitting.slice_stage import SliceFit, fit_slices
+from g3r.fitting.prior_targets import fit_to_prior
+from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
 from g3r.output.assemble import StageResults, assemble
@@ -105,7 +106,6 @@ class GaussianReconstructor:
         prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
         held_out = self._held_out(cloud, prior, poses, plan, run)
-        fit = self._fit_to_slices(cloud, prior, poses, held_out, plan, run)
         found = StageResults(
             stacks=stacks,
             registration=poses,
@@ -114,7 +114,7 @@ class GaussianReconstructor:
             intensity=intensity * prior.scale,
             cloud=cloud,
             held_out=held_out,
-            fit=fit,
+            fit=self._fit_to_slices(cloud, prior, poses, held_out, plan, run),
             prior_record=self.prior.record() if self.prior else None,
             pose_record=self.pose_model.record() if self.pose_model else None,
         )
@@ -185,8 +185,7 @@ class GaussianReconstructor:
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
         # V_prior of several stacks is made anew after each round, the last time with all views
-        is_replaced = n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) > 0
-        views = 1 if is_replaced else plan.settings.prior_views
+        views = 1 if n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) else plan.settings.prior_views
         prior = run.stage(Stage.PRIOR, lambda: self.subject_prior.of(volumes, poses, views, tiling))
         if n_stacks > 1:
             return prior
@@ -279,22 +278,23 @@ class GaussianReconstructor:
         if cloud is None:
             return None
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
-        stage, widths = settings.slice_stage, held_out.widths if held_out else None
+        widths, n_steps = held_out.widths if held_out else None, settings.slice_stage.n_steps
 
         def fit() -> SliceFit:
             target = slice_target(prior, poses.weight, settings.slice_model, widths)
-            return fit_slices(
-                cloud.cloud,
-                target.slices,
-                gain=prior.gain,
+            return fit_lattices(
+                cloud,
+                prior,
+                target,
+                settings.n_lattices,
                 weight=poses.weight,
-                prior=distillation_target(prior) if settings.use_prior and settings.distillation else None,
-                settings=stage,
+                distillation=settings.use_prior and settings.distillation,
+                prior_stage=settings.prior_stage,
+                slice_stage=settings.slice_stage,
                 rng=stage_rng(settings.seed, Stage.FIT_TO_SLICES),
-                pixel_weight=target.pixel_weight,
                 progress=run.report(Stage.FIT_TO_SLICES),
                 deadline=run.deadline(plan.for_fit_to_slices()),
                 observer=self.observer,
             )
 
-        return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, lambda result: (len(result.history), stage.n_steps))
+        return run.stoppable_stage(Stage.FIT_TO_SLICES, fit, lambda result: (len(result.history), n_steps))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g3r.acquisition.coarse_volume import confidence
 from g3r.fitting.initial_volumes import PriorVolume
@@ -26,6 +27,7 @@ def fit_to_prior(
     progress: Callable[[int, int], None],
     deadline: Deadline | None,
     observer: FitObserver | None = None,
+    shift: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
 ) -> PriorCloud:
     """Gaussians seeded in the prior volume and fitted to it (G3R Eq. 8).
 
@@ -37,9 +39,10 @@ def fit_to_prior(
         progress: called with (steps done, steps in all).
         deadline: when the fit has to end.
         observer: sees the fit at its steps.
+        shift: [3] of the lattice; see `seed_cloud`.
     """
     grid = prior.volumes.grid
-    seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm)
+    seeds = seed_cloud(prior.values, prior.support, grid, spacing_mm, shift)
     target = VolumeTarget.of(prior.values, prior.support.astype(np.float32), grid)
     cloud, history = fit_prior(seeds, target, stage, rng, progress=progress, deadline=deadline, observer=observer)
     return PriorCloud(cloud, history, spacing_mm)

@@ -79,6 +79,7 @@ class SliceFit:
         weight: [K] slice weights.
         history: terms of the loss of each step, with `rollback` where the divergence guard went back.
         bias_field: [n_stacks][5] coefficients (see `StackBiasField`); empty where it was not estimated.
+        further: clouds of fits on other lattices, whose mean with `cloud` is the volume (`fitting.lattice_mean`).
     """
 
     cloud: GaussianCloud
@@ -87,6 +88,7 @@ class SliceFit:
     weight: NDArray[np.float64]
     history: list[dict[str, float]]
     bias_field: list[list[float]]
+    further: tuple[GaussianCloud, ...] = ()
 
 
 def fit_slices(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,7 +21,11 @@ MAX_ANISOTROPY = 1.6
 
 
 def seed_cloud(
-    volume: NDArray[np.float32], mask: NDArray[np.bool_], grid: VolumeGrid, spacing_mm: float
+    volume: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    grid: VolumeGrid,
+    spacing_mm: float,
+    shift: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
 ) -> GaussianCloud:
     """Gaussians on a body-centred lattice inside the mask, shaped by the local structure of a volume.
 
@@ -31,6 +37,7 @@ def seed_cloud(
         mask: [I, J, K], foreground.
         grid: their grid.
         spacing_mm: edge of the lattice cell per Gaussian (its volume to the power 1/3).
+        shift: [3] of the lattice, in edges of its cubes, from 0 to 1.
 
     Returns:
         A cloud with its origin in the middle of the grid.
@@ -45,7 +52,7 @@ def seed_cloud(
     strength = gaussian_filter(np.sqrt((gradient**2).sum(0)), spacing_mm / voxel)
     corners = grid.world(np.argwhere(mask))
     low, high = corners.min(0), corners.max(0)
-    points = _inside(_lattice(low, high, spacing_mm), mask, grid)
+    points = _inside(_lattice(low, high, spacing_mm, np.asarray(shift)), mask, grid)
     log_scale, quaternion = _shapes(gradient, grid, points, spacing_mm, strength)
     # a lattice of Gaussians of mean volume h^3 adds up to amplitude (2 pi)^1.5 s1 s2 s3 / h^3
     overlap = (2 * np.pi) ** 1.5 * np.exp(log_scale.sum(1)) / spacing_mm**3
@@ -58,10 +65,12 @@ def seed_cloud(
     return GaussianCloud.of([tensor(points - origin), tensor(log_scale), tensor(quaternion), tensor(amplitude)], origin)
 
 
-def _lattice(low: NDArray[np.float64], high: NDArray[np.float64], spacing_mm: float) -> NDArray[np.float64]:
+def _lattice(
+    low: NDArray[np.float64], high: NDArray[np.float64], spacing_mm: float, shift: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Body-centred cubic points [N, 3], one per spacing^3."""
     edge = spacing_mm * 2 ** (1 / 3)
-    axes = [np.arange(a, b + edge, edge) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(a, b + edge, edge) for a, b in zip(low - shift * edge, high, strict=True)]
     cube = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return np.concatenate([cube, cube + edge / 2])
 

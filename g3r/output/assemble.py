@@ -17,6 +17,7 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.lattice_mean import mean_cloud
 from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_weight import ended_early, prior_weight
@@ -91,7 +92,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     qualities = stack_qualities(found.registration, len(found.stacks))
     run.warnings += pose_warnings(found.registration, qualities, found.stacks)
     grid = volumes.grid.respaced(settings.resolution_mm)
-    fit = found.fit or _no_fit(found)
+    cloud = mean_cloud(fit := found.fit or _no_fit(found))
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.timed(Stage.VOLUME) as tell:
         mask, support = _masks_on(grid, found.prior, fit)
@@ -106,13 +107,13 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             rim_mm=settings.prior_rim_mm if settings.use_prior else 0.0,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
         )
-        volume, left_to_prior, seen = mixture.volume(fit.cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
+        volume, left_to_prior, seen = mixture.volume(cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
         if not np.isfinite(volume).all():
             raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         check = _check(volume, mixture, found, fit) if settings.use_prior else None
         if check is not None and check.falls_back:
             mixture = replace(mixture, least_weight=1.0)
-            volume, left_to_prior = mixture.volume(fit.cloud, grid), mixture.left_to_prior(grid)
+            volume, left_to_prior = mixture.volume(cloud, grid), mixture.left_to_prior(grid)
         unseen = mask & ~seen
         unseen_part = UnseenPart.of(
             unseen,
@@ -141,8 +142,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                     cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
-                prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share)
-                prior_share = prior_share.astype(np.float32)
+                prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share).astype(np.float32)
                 release_memory()
         with run.timed(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
@@ -176,7 +176,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         coarse=volumes.coarse * intensity,
         density=volumes.density,
         prior_grid=volumes.grid,
-        cloud=fit.cloud,
+        cloud=cloud,
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
         gain=fit.gain,
@@ -281,7 +281,7 @@ def _record(
         registration=RegistrationRecord.of(found.registration, qualities, fit.slices),
         bias_field=fit.bias_field,
         common_bias_rms=found.prior.volumes.field_rms,
-        n_gaussians=len(fit.cloud),
+        n_gaussians=len(fit.cloud) + sum(len(cloud) for cloud in fit.further),
         pose_rounds=found.rounds,
         held_out=found.held_out,
         gaussian_spacing_mm=found.cloud.spacing_mm if found.cloud else None,

@@ -88,7 +88,7 @@ def estimate_memory(
     projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
     prior_projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.prior_stage.projection_bytes)
-    outputs = volumes + OUTPUTS_PER_VOXEL * output + cloud
+    outputs = volumes + OUTPUTS_PER_VOXEL * output + settings.n_lattices * cloud
     stages = {
         Stage.LOADING: base,
         Stage.REGISTRATION: base + REGISTRATION_PER_PIXEL * n_pixels + 4 * (1 + buffers) * voxels,

@@ -34,6 +34,7 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
+        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume.
         held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
@@ -57,6 +58,7 @@ class ReconstructionSettings:
     prior_stage: PriorStageSettings = field(default_factory=PriorStageSettings)
     slice_model: SliceModel = field(default_factory=SliceModel)
     slice_stage: SliceStageSettings = field(default_factory=SliceStageSettings)
+    n_lattices: int = 1
     held_out: HeldOutSettings | None = field(default_factory=HeldOutSettings)
     prior_weight: float = 0.3
     prior_rim_mm: float = 0.8
@@ -128,6 +130,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(
         _BALANCED,
+        n_lattices=6,
         # three stacks have found their poses after one round
         pose_rounds=PoseRoundSettings(two_stacks=4),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),

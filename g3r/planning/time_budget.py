@@ -187,6 +187,7 @@ class TimeBudget:
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
             max_gaussian_spacing_mm=preset.max_gaussian_spacing_mm,
             held_out=None,  # three fits whose seconds nobody has timed
+            n_lattices=PRESETS["accurate"].n_lattices,  # as many as time is left for
             share_probes=probes,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from g3r import reconstruct
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.planes import Slices
+from g3r.fitting import lattice_mean
 from g3r.fitting.slice_stage import SliceFit, fit_slices
 from g3r.fitting.volume_check import VolumeCheck, check_volume
 from g3r.geometry.grid import on_grid
@@ -101,7 +101,7 @@ def test_a_spoilt_fit_is_replaced_by_the_prior_volume(monkeypatch: pytest.Monkey
         fit = fit_slices(*arguments, **options)  # type: ignore[arg-type]
         return replace(fit, cloud=fit.cloud.with_amplitude(fit.cloud.amplitude.roll(7)))
 
-    monkeypatch.setattr(reconstruct, "fit_slices", spoilt)
+    monkeypatch.setattr(lattice_mean, "fit_slices", spoilt)
     result = reconstruction()
     record = result.record
     assert record.volume_check is not None

@@ -1,0 +1,112 @@
+"""The mean of several fits to the slices, each with Gaussians on a lattice of its own.
+
+What a fit gets wrong depends in part on where its Gaussians happened to lie. Fits on lattices that are shifted against
+each other, and a little closer or wider, err differently, and their mean errs less. It is a cloud as well: all
+Gaussians together, each as high as its share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.observer import FitObserver
+from g3r.fitting.prior_stage import NO_PROGRESS, PriorCloud, PriorStageSettings
+from g3r.fitting.prior_targets import distillation_target, fit_to_prior
+from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
+from g3r.fitting.slice_targets import SliceTarget
+from g3r.gaussians import GaussianCloud
+from g3r.run.deadline import Deadline, timed_steps
+
+SPACINGS = (1.0, 0.9, 1.1)
+"""Spacings of the lattices in turn, over that of the first."""
+
+SHIFT = (0.8192, 0.6710, 0.5497)
+"""From one lattice to the next, in edges of its cell: multiples of these, without their whole parts, fill a cube evenly
+(powers of the root of x^4 = x + 1; Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
+
+
+def fit_lattices(
+    first: PriorCloud,
+    prior: PriorVolume,
+    target: SliceTarget,
+    n_lattices: int,
+    *,
+    weight: NDArray[np.float64],
+    distillation: bool,
+    prior_stage: PriorStageSettings,
+    slice_stage: SliceStageSettings,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = NO_PROGRESS,
+    deadline: Deadline | None = None,
+    observer: FitObserver | None = None,
+) -> SliceFit:
+    """The first fit to the slices, and beside its cloud those of the fits on further lattices.
+
+    Args:
+        first: Gaussians fitted to the prior volume, where the first fit starts.
+        prior: what the others are seeded in.
+        target: the slices.
+        n_lattices: fits in all.
+        weight: [K] slice weights, from registration.
+        distillation: whether the prior holds the fits (Eq. 9).
+        prior_stage: how the Gaussians of further lattices are fitted to the prior.
+        slice_stage: how a fit to the slices runs.
+        rng: draws what the fits draw.
+        progress: called with (steps done, steps in all).
+        deadline: no further fit begins that would probably end after it. One in which the run is stopped counts for
+            nothing, except the first.
+        observer: sees the first fit.
+
+    Raises:
+        NumericalError: see `fit_slices`.
+    """
+    held = distillation_target(prior) if distillation else None
+    n_steps = n_lattices * slice_stage.n_steps
+
+    def fit(number: int) -> SliceFit:
+        start = first
+        if number:
+            start = fit_to_prior(
+                prior,
+                spacing_mm=first.spacing_mm * SPACINGS[number % len(SPACINGS)],
+                stage=prior_stage,
+                rng=rng,
+                progress=NO_PROGRESS,
+                deadline=deadline,
+                shift=np.modf(number * np.array(SHIFT))[0],
+            )
+        return fit_slices(
+            start.cloud,
+            target.slices,
+            gain=prior.gain,
+            weight=weight,
+            prior=held,
+            settings=slice_stage,
+            rng=rng,
+            pixel_weight=target.pixel_weight,
+            progress=lambda done, total: progress(number * total + done, n_steps),
+            deadline=deadline,
+            observer=None if number else observer,
+        )
+
+    fits: list[SliceFit] = []
+    for number, _ in timed_steps(n_lattices, deadline):
+        made = fit(number)
+        if fits and deadline is not None and deadline.is_stopped():
+            break
+        fits.append(made)
+    fits = fits or [fit(0)]  # stopped before: a fit of no step, which says so
+    return replace(fits[0], further=tuple(one.cloud for one in fits[1:]))
+
+
+def mean_cloud(fit: SliceFit) -> GaussianCloud:
+    """The mean of the clouds of a fit as one cloud: all Gaussians, each with its share of its height."""
+    clouds = (fit.cloud, *fit.further)
+    together = [torch.cat(parts) for parts in zip(*(cloud.parameters for cloud in clouds), strict=True)]
+    return GaussianCloud.of([*together[:3], together[3] / len(clouds)], fit.cloud.origin_mm)
