@@ -22,7 +22,7 @@ PEERS, PAPER, TRADEOFF = DOCS / "peers.md", DOCS / "paper.md", DOCS / "tradeoff.
 WHAT = {
     "`fast`": "a shorter registration, one fit",
     "`balanced`": "a round of poses and volume, two for two stacks; measured slice profiles",
-    "`accurate`": "four rounds for two stacks; with three it is no better",
+    "`accurate`": "the mean of six fits; four rounds for two stacks",
 }
 """What the presets do, in the order of the table."""
 

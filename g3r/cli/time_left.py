@@ -13,28 +13,28 @@ from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, 
 BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.7, PREPARING: 3.5}
 """Seconds of three stacks on two cores, before the first stage that a run keeps."""
 
-AFTER_S = {"volume": 0.1, "prior share": 0.8, "uncertainty": 0.4, WRITING: 1.2}
+AFTER_S = {"volume": 0.2, "prior share": 1.5, "uncertainty": 0.6, WRITING: 1.2}
 
 EXPECTED_S = {
-    "preview": {"registration": 4.5, "coarse volume": 1.0, "prior": 2.5, "fit to prior": 0.4, "fit to slices": 0.5},
-    "fast": {"registration": 5.0, "coarse volume": 1.0, "prior": 2.5, "fit to prior": 0.5, "fit to slices": 0.8},
+    "preview": {"registration": 2.5, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 0.9, "fit to slices": 1.7},
+    "fast": {"registration": 2.7, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 1.0, "fit to slices": 3.2},
     "balanced": {
-        "registration": 5.0,
-        "coarse volume": 1.0,
-        "prior": 2.0,
-        "poses in rounds": 9.0,
-        "fit to prior": 0.7,
-        "held-out slices": 1.2,
-        "fit to slices": 1.2,
+        "registration": 6.0,
+        "coarse volume": 1.4,
+        "prior": 1.6,
+        "poses in rounds": 8.0,
+        "fit to prior": 1.1,
+        "held-out slices": 3.0,
+        "fit to slices": 4.0,
     },
     "accurate": {
-        "registration": 30.0,
-        "coarse volume": 1.0,
-        "prior": 2.5,
-        "poses in rounds": 10.0,
-        "fit to prior": 0.7,
-        "held-out slices": 1.5,
-        "fit to slices": 1.2,
+        "registration": 6.0,
+        "coarse volume": 1.4,
+        "prior": 1.6,
+        "poses in rounds": 12.0,
+        "fit to prior": 1.1,
+        "held-out slices": 4.2,
+        "fit to slices": 38.0,
     },
 }
 """The same of each preset, with all programs compiled, by stage in their order."""

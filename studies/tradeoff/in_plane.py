@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from g3r.acquisition.images import Volume
-from g3r.acquisition.stacks import load_stacks
+from g3r.acquisition.stacks import Stack, load_stacks
 from g3r.evaluation.held_out_stack import predict_stack
+from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
 from studies.harness import FITS, Record, Row, Study, Task
@@ -43,11 +44,16 @@ def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """A measurement per case; then each real stack predicted from the others."""
     for folder in case_folders(options.cases):
         yield Task(folder.name, measure, (folder, options))
+    for name, pairs, left_out in real_stacks_left_out():
+        yield Task(name, predict, (pairs, left_out, options))
+
+
+def real_stacks_left_out() -> Iterator[tuple[str, list[tuple[Path, Path]], int]]:
+    """For each real stack a name, the stacks of its head with their masks, and its number among them."""
     pairs = stacks_with_masks()
     for pair in pairs:
         of_head = [one for one in pairs if one[0].parent == pair[0].parent]
-        name = pair[0].name.removesuffix(".nii.gz")
-        yield Task(f"real, without {name}", predict, (of_head, of_head.index(pair), options))
+        yield f"real, without {pair[0].name.removesuffix('.nii.gz')}", of_head, of_head.index(pair)
 
 
 def measure(folder: Path, options: argparse.Namespace) -> Row:
@@ -82,14 +88,33 @@ def predict(pairs: list[tuple[Path, Path]], left_out: int, options: argparse.Nam
     for width in WIDTHS:
         settings = changed(PRESETS[options.preset], {"slice_model.in_plane": width})
         result = GaussianReconstructor(options.ckpt, settings).reconstruct(used, registration)
-        volume = Volume(result.volume, result.grid.affine, f"{width:g}")
-        psnr_db[_key(width)] = {}
-        for judged in JUDGED:
-            fwhm = held_out.in_plane_fwhm_pixels
-            seen = replace(held_out, in_plane_fwhm_pixels=(judged * fwhm[0], judged * fwhm[1]))
-            found = predict_stack(volume, seen, support=result.mask, eroded_pixels=ERODED_PIXELS)
-            psnr_db[_key(width)][f"{judged:g}"] = found.figures()["psnr_db"]
+        psnr_db[_key(width)] = predictions(result, held_out)
     return {"predicted_db": psnr_db}
+
+
+def predictions(result: ReconstructionResult, held_out: Stack) -> dict[str, float]:
+    """PSNR of a stack as a volume predicts it, by the width in plane with which it is simulated.
+
+    Args:
+        result: with the volume.
+        held_out: a stack that it was not made from.
+    """
+    volume, fwhm, found = Volume(result.volume, result.grid.affine, "volume"), held_out.in_plane_fwhm_pixels, {}
+    for judged in JUDGED:
+        seen = replace(held_out, in_plane_fwhm_pixels=(judged * fwhm[0], judged * fwhm[1]))
+        predicted = predict_stack(volume, seen, support=result.mask, eroded_pixels=ERODED_PIXELS)
+        found[f"{judged:g}"] = predicted.figures()["psnr_db"]
+    return found
+
+
+def best_prediction(result: ReconstructionResult, held_out: Stack) -> float:
+    """The highest of these.
+
+    Args:
+        result: with the volume.
+        held_out: a stack that it was not made from.
+    """
+    return max(predictions(result, held_out).values())
 
 
 def line(key: str, row: Row) -> str:

@@ -11,6 +11,7 @@ from g3r.planning.presets import PRESETS, changed
 from studies.tradeoff import (
     convergence,
     in_plane,
+    lattices,
     memory,
     peer_phantom,
     pose_rounds,
@@ -167,3 +168,11 @@ def test_widths_in_plane_have_a_table_of_cases_and_one_of_real_stacks() -> None:
     assert "| without two | 0.3 | 30.70 | 30.55 | 30.45 |" in text
     assert text.count("| without two |") == len(in_plane.JUDGED)
     assert in_plane.line("real", rows["real, without two"]).startswith("real: width 1: 30.70, width 0.85: 30.55")
+
+
+def test_numbers_of_lattices_have_their_gain_and_their_seconds() -> None:
+    scores = {f"lattices {number}": 30.0 + 0.1 * number for number in lattices.NUMBERS}
+    row = {"psnr_db": scores, "cpu_s": {name: 8.0 * n for name, n in zip(scores, lattices.NUMBERS, strict=True)}}
+    text = lattices.tables({"preset": "accurate", "rows": {"one": row}})["lattices"]
+    assert "| one | 30.10 | 30.30 | 30.60 | 8 | 24 | 48 |" in text
+    assert lattices.line("one", row) == "one: lattices 1: 30.10, lattices 3: 30.30, lattices 6: 30.60"
