@@ -224,12 +224,12 @@ class GaussianReconstructor:
     def _fit_to_prior(self, prior: PriorVolume, plan: Plan, run: RunContext) -> PriorCloud | None:
         """Gaussians seeded in the prior volume and fitted to it (Eq. 8); None if stopped."""
         volumes, coarse_s = prior.volumes, run.clock.seconds[Stage.COARSE]
-        if run.stopped_at is not None:
+        n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
+        deadline, settings = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels), plan.settings
+        if run.stopped_at is not None or not settings.n_lattices:
             return None
 
         def fit() -> PriorCloud:
-            n_output_voxels = math.prod(volumes.grid.respaced(plan.settings.resolution_mm).shape)
-            deadline, settings = plan.for_fit_to_prior(prior, coarse_s, n_output_voxels), plan.settings
             return fit_to_prior(
                 prior,
                 spacing_mm=settings.lattice.mm(volumes.slices),

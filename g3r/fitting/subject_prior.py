@@ -60,11 +60,12 @@ class SubjectPrior:
         Args:
             volumes: that `volumes` gave.
             poses: of their slices.
-            n_views: see `estimate_prior`.
+            n_views: see `estimate_prior`; 0 leaves the network out.
             tiling: see `estimate_prior`.
         """
-        placed = placed_template(self.network, poses.orientation)
-        found = prior_volume(volumes, poses.gain, self.network, placed, n_views=n_views, tiling=tiling)
+        network = self.network if n_views else None
+        placed = placed_template(network, poses.orientation)
+        found = prior_volume(volumes, poses.gain, network, placed, n_views=n_views, tiling=tiling)
         release_memory()  # the most that is ever freed at a time
         return found
 

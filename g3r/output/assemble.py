@@ -46,6 +46,7 @@ from g3r.uncertainty.unseen import UnseenPart
 logger = logging.getLogger(__name__)
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
+UNFITTED_NOTE = "no fit was made: no uncertainty and no share of the prior were estimated"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +127,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         tell(FinishedVolume(volume=volume, mask=mask, grid=grid, unseen=unseen_part))
     run.warnings += [line for line in (check.line() if check else "", unseen_part.line()) if line]
     run.notes += [NOTE_ON_OTHERS] if settings.anatomy != FETAL_BRAIN else []
-    if run.stopped_at:
-        run.notes.append(PARTIAL_NOTE)
+    if run.stopped_at or not settings.n_lattices:
+        run.notes.append(PARTIAL_NOTE if run.stopped_at else UNFITTED_NOTE)
     else:
         if settings.use_prior:
             with run.timed(Stage.PRIOR_SHARE):
@@ -224,8 +225,7 @@ def _extent_known(found: StageResults, settings: ReconstructionSettings) -> bool
 
 def _no_fit(found: StageResults) -> SliceFit:
     """The slices as registration left them, and no Gaussians."""
-    empty = [torch.zeros(0, n) for n in (3, 3, 4)]
-    cloud = GaussianCloud.of([*empty, torch.zeros(0)], np.zeros(3))
+    cloud = GaussianCloud.of([*(torch.zeros(0, n) for n in (3, 3, 4)), torch.zeros(0)], np.zeros(3))
     slices, gain, weight = found.prior.volumes.slices, found.prior.gain, found.registration.weight
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 

@@ -16,8 +16,8 @@ class BudgetRecord:
 
     Attributes:
         seconds: that were given.
-        registration, fit: names of the presets that registration and the fit follow.
-        prior_views: views of the prior.
+        registration, fit: names of the presets that registration and the fit follow; "none" without a fit.
+        prior_views: views of the prior; 0 where there was no time for its network.
         pose_rounds: most rounds of poses and volume.
         step_s: measured seconds of one optimiser step.
         n_gaussians_timed: Gaussians in that step.
@@ -47,7 +47,7 @@ class Plan(Protocol):
         """Decide how registration searches; returns when it has to end."""
 
     def for_prior(self, coarse_s: float) -> None:
-        """Decide the numbers of views and of rounds of poses; `coarse_s` is what V_coarse and V_sharp took."""
+        """Decide on prior, its views and rounds of poses; `coarse_s` is what V_coarse and V_sharp took."""
 
     def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline | None:
         """Decide Gaussians and steps of both stages of the fit.

@@ -34,11 +34,11 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
-        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume.
+        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume; 0 shows the prior volume alone.
         held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
-        prior_views: mirror images over which the prior is averaged; see `estimate_prior`.
+        prior_views: mirror images over which the prior is averaged; see `estimate_prior`. 0 leaves its network out.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.

@@ -58,8 +58,11 @@ output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
-TOO_LITTLE = 4.0
-"""With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first."""
+VOLUME_AT_END = 0.15
+"""The same of a run without a fit, which has no maps of uncertainty."""
+
+TOO_LITTLE, NO_FIT = 4.0, 2.2
+"""With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first, or there is none."""
 
 SHARE_STEPS = 18
 """Optimiser steps that take as long as one probe for the map of the prior share."""
@@ -122,7 +125,7 @@ class TimeBudget:
         return self.deadline.part(REGISTRATION_SHARE)
 
     def for_prior(self, coarse_s: float) -> None:
-        """Take as many views of the prior and rounds of poses as fit, at most those of `accurate`.
+        """Take as many views of the prior and rounds of poses as fit, at most those of `accurate`, or no prior at all.
 
         Args:
             coarse_s: what V_coarse and V_sharp took.
@@ -134,10 +137,12 @@ class TimeBudget:
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
         pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
-        self.choices |= {"prior_views": views, "pose_rounds": pose_rounds.two_stacks}
+        if self.deadline.remaining_s < WRITING_S + VOLUME_AT_END * coarse_s + view_s:
+            self.settings = replace(self.settings, use_prior=False, prior_views=0)
+        self.choices |= {"prior_views": self.settings.prior_views, "pose_rounds": pose_rounds.two_stacks}
 
     def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline:
-        """Take the most careful preset whose Gaussians and steps fit, with the deadline of the first stage.
+        """Take the most careful preset whose Gaussians and steps fit, with the deadline of the first stage, or no fit.
 
         Args:
             prior: V_prior and the posed slices that it was made of.
@@ -146,6 +151,10 @@ class TimeBudget:
         """
         settings, volumes = self.settings, prior.volumes
         after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.values.size)
+        if self.deadline.remaining_s - after_s < NO_FIT * coarse_s:
+            self.settings = replace(settings, n_lattices=0)
+            self.choices |= {"fit": "none"}
+            return self.deadline
         if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
             # timing a step would take the time of the steps themselves
             reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)

@@ -99,6 +99,11 @@ MESSAGES = {
         "the run was {where}: this is the volume so far, without uncertainty",
         "Finish it with --resume before using it.",
     ),
+    "not fitted": Message(
+        CHECK,
+        "there was no time for a fit: this is {what}, without uncertainty",
+        "Run again with a longer --time-budget, or without one, before reading it.",
+    ),
     "warning": Message(CHECK, "{line}", ""),
     "all agree": Message(USE, "{n} of {n} stacks agree with each other ({agreement}; good is {good:g} and above)", ""),
     "all seen": Message(USE, "slices saw the whole {what}", ""),
@@ -188,6 +193,9 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "thickness assumed", {"stacks": _listed([stack.name for stack in assumed]), "mm": mm}
     if record.partial:
         yield "partial", {"where": str(record.stopped_at or "interrupted")}
+    elif not record.settings.n_lattices:
+        kind = "the prior volume" if record.settings.use_prior else "a blurred volume of the slices"
+        yield "not fitted", {"what": kind}
     said = {unseen, checked}
     for line in record.warnings:
         if line not in said and not _is_said_otherwise(line, record):

@@ -16,7 +16,7 @@ from studies.harness import Record, Row, Study, Task
 from studies.subjects import THICKNESS_MM, chosen_folders
 from studies.tables import marked, table
 
-BUDGETS_S = (12.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0, 120.0)
+BUDGETS_S = (6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0, 120.0)
 
 MORE_SHARE, MORE_S = 0.1, 2.0
 """By how much a budget may be exceeded."""
