@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, zoom
 
-FIRST_SIGMA_VOXELS = 1.5
+SIGMA_VOXELS = 1.5
 LEAST_WEIGHT = 0.05
 """Share of measured surroundings from which a mean is taken; with less, the next wider surroundings are asked."""
+
+SMALLEST = 4
+"""Voxels along the longest edge of the coarsest grid."""
 
 
 def smooth_fill(
@@ -16,8 +19,8 @@ def smooth_fill(
 ) -> NDArray[np.float32]:
     """Where the weight is low, the weighted mean of the nearest surroundings that were measured.
 
-    Normalised convolution with Gaussians of doubling width (Knutsson & Westin 1993): the narrowest that finds
-    measured voxels is taken.
+    Normalised convolution (Knutsson & Westin 1993) on grids of doubling voxels: the finest that finds measured voxels
+    is taken.
 
     Args:
         values: [I, J, K].
@@ -29,13 +32,33 @@ def smooth_fill(
         [I, J, K]: `weight * values + (1 - weight) * surroundings`, zero where nothing is near.
     """
     source = weight if share is None else weight * share
-    around, missing = np.zeros_like(values), np.ones(values.shape, np.float32)
-    sigma = FIRST_SIGMA_VOXELS
-    while sigma < max(values.shape) and missing.any():
-        mean_weight = gaussian_filter(source, sigma)
-        mean = gaussian_filter(source * values, sigma) / np.maximum(mean_weight, 1e-6)
-        found = np.clip(mean_weight / LEAST_WEIGHT, 0, 1) * missing
-        around += found * mean
-        missing -= found
-        sigma *= 2
-    return weight * values + (1 - weight) * around
+    around = _surroundings(source.astype(np.float32), (source * values).astype(np.float32))
+    return (weight * values + (1 - weight) * around).astype(np.float32)
+
+
+def _surroundings(source: NDArray[np.float32], weighted: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The mean of what is measured around each voxel.
+
+    Args:
+        source: [I, J, K] weights.
+        weighted: [I, J, K] values times weights.
+    """
+    mean_weight = gaussian_filter(source, SIGMA_VOXELS)
+    found = np.clip(mean_weight / LEAST_WEIGHT, 0, 1)
+    mean = found * gaussian_filter(weighted, SIGMA_VOXELS) / np.maximum(mean_weight, 1e-6)
+    if found.min() < 1 and max(source.shape) > SMALLEST:
+        mean += (1 - found) * _doubled(_surroundings(_halved(source), _halved(weighted)), source.shape)
+    return mean
+
+
+def _halved(array: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of two by two by two voxels; nothing lies beyond the last one."""
+    even = np.pad(array, [(0, n % 2) for n in array.shape])
+    blocks = even.reshape([length for n in even.shape for length in (n // 2, 2)])
+    return blocks.mean(axis=(1, 3, 5), dtype=np.float32)
+
+
+def _doubled(array: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The same on voxels of half the size, cut to a shape."""
+    fine = zoom(array, 2, order=1, mode="nearest", grid_mode=True)
+    return fine[tuple(slice(n) for n in shape)]

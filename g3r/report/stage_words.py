@@ -51,7 +51,7 @@ LINES = {
     "masks refined": ("masks", "compared between stacks, {n_changed} of {n_stacks:mask} differed"),
     "coarse": ("coarse volume", "a blurred volume of {n_slices:slice}"),
     "prior used": ("prior", "used where slices say little"),
-    "prior unused": ("prior", "no prior was asked for; the slices alone decide"),
+    "prior unused": ("prior", "not done; the slices alone decide"),
     "moved to prior": ("slices to prior", "the slices move to fit other brains"),
     "not moved to prior": ("slices to prior", "the slices stay where the scanner put them"),
     "rounds helped": ("poses in rounds", "done again, stacks agree better ({before} to {after})"),

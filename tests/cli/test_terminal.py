@@ -27,7 +27,7 @@ STAGES = [
     "finding the head: only 2 of 3 stacks agree",  # as quickly as they are registered here
     "following the motion: ",
     "first volume: ",
-    "comparing with other brains: no prior was asked for",
+    "comparing with other brains: not done",
     "building the volume: made of ",
     "fitting to the slices: ",
     "making the volume: 2 mm voxels, a brain of ",
