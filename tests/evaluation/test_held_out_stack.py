@@ -19,6 +19,9 @@ from g3r.errors import InputError
 from g3r.evaluation.held_out_stack import StackPrediction, predict_stack
 from g3r.evaluation.slice_scores import score_slice
 
+PIXEL_FWHM = 2.3548 / 12**0.5
+"""FWHM of a Gaussian with the variance of a box of one pixel."""
+
 
 @pytest.fixture(scope="module")
 def truth(subject: Path) -> Volume:
@@ -27,7 +30,9 @@ def truth(subject: Path) -> Volume:
 
 @pytest.fixture(scope="module")
 def stack(subject: Path) -> Stack:
-    return load_stack(subject / "stack-0.nii.gz", subject / "mask-0.nii.gz", 4.0)
+    """As it was simulated: each pixel averages over its own area."""
+    loaded = load_stack(subject / "stack-0.nii.gz", subject / "mask-0.nii.gz", 4.0)
+    return replace(loaded, in_plane_fwhm_pixels=(PIXEL_FWHM, PIXEL_FWHM))
 
 
 @pytest.fixture(scope="module")
