@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
-from g3r.checkpoints.device import on_device
-from g3r.checkpoints.shipped import set_of
 from g3r.checkpoints.weights_file import WeightsFile
 from g3r.fitting.held_out_slices import HeldOutChoice, ask_held_out_slices
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume, with_pixels_of
@@ -22,13 +20,12 @@ from g3r.fitting.prior_stage import PriorCloud
 from g3r.fitting.prior_targets import fit_to_prior
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
-from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
+from g3r.fitting.subject_prior import NOTE_ON_SINGLE
+from g3r.networks import Networks
 from g3r.output.assemble import StageResults, assemble
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
-from g3r.pose_network.model import PoseModel
-from g3r.prior.model import Prior
 from g3r.registration import GivenPoses, Registration, RegistrationSettings, register
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.given import measure
@@ -46,7 +43,7 @@ class GaussianReconstructor:
             ("cc0"); the usual set when None.
         settings: see `ReconstructionSettings`, or the name of a preset.
         pose_checkpoint: pose network and atlas template; when None those of the set that `checkpoint` names.
-        device: of the networks, see `on_device`.
+        device: of the networks, see `device_of`.
         observer: sees both stages of the fit.
 
     Raises:
@@ -63,16 +60,9 @@ class GaussianReconstructor:
         observer: FitObserver | None = None,
     ) -> None:
         self.settings, self.observer = settings_of(settings), observer
-        self.prior = Prior.load(checkpoint) if self.settings.use_prior else None
-        search, found = self.settings.registration, pose_checkpoint or set_of(checkpoint)
-        self.pose_model = PoseModel.load(found) if search.template or search.network else None
-        self.template = self.pose_model.template if self.pose_model else None
-        self.device = on_device(device, self.prior, self.pose_model)
-        self.subject_prior = SubjectPrior(
-            network=self.prior,
-            voxel_mm=self.prior.voxel_mm if self.prior else self.settings.resolution_mm,
-            common_bias_field=self.settings.common_bias_field,
-        )
+        search, use_prior = self.settings.registration, self.settings.use_prior
+        use_pose = search.template or search.network
+        self.networks = Networks(checkpoint, pose_checkpoint, use_prior=use_prior, use_pose=use_pose, device=device)
 
     def reconstruct(
         self,
@@ -97,15 +87,19 @@ class GaussianReconstructor:
             NumericalError: a fit that broke down.
         """
         plan, run = plan or FixedPlan(self.settings), run or RunContext()
+        if plan.settings.use_prior:
+            self.networks.start()  # their libraries are imported while poses are found
         slices, intensity = normalised_slices(stacks)
         run.notes += skipped_slice_notes(stacks, slices)
         poses = self._poses(slices, registration, plan, run)
-        stacks, poses = self._masks(stacks, poses, intensity, run)
-        volumes = run.stage(Stage.COARSE, lambda: self.subject_prior.volumes(poses))
+        stacks, poses = self._masks(stacks, poses, intensity, plan, run)
+        maker = self.networks.subject_prior(plan.settings)
+        volumes = run.stage(Stage.COARSE, lambda: maker.volumes(poses))
         prior = self._prior(volumes, poses, plan, run)
         prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
         held_out = self._held_out(cloud, prior, poses, plan, run)
+        prior_record, pose_record = self.networks.records()
         found = StageResults(
             stacks=stacks,
             registration=poses,
@@ -115,8 +109,8 @@ class GaussianReconstructor:
             cloud=cloud,
             held_out=held_out,
             fit=self._fit_to_slices(cloud, prior, poses, held_out, plan, run),
-            prior_record=self.prior.record() if self.prior else None,
-            pose_record=self.pose_model.record() if self.pose_model else None,
+            prior_record=prior_record,
+            pose_record=pose_record,
         )
         return ReportedResult.of(assemble(found, plan, run))
 
@@ -144,10 +138,10 @@ class GaussianReconstructor:
             deadline: when the search has to end.
         """
         settings = settings or self.settings.registration
-        proposals, template = {}, self.template
+        proposals, template = {}, self.networks.template
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
-        if self.pose_model is not None and settings.network and not spare:
-            proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
+        if settings.network and not spare and (proposed := self.networks.proposed_motion(slices)) is not None:
+            proposals["network"] = proposed
         return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
     def _poses(
@@ -157,7 +151,9 @@ class GaussianReconstructor:
         asked, report = plan.settings.registration, run.report(Stage.REGISTRATION)
         if isinstance(given, GivenPoses):
             run.notes += given.notes
-            poses = run.stage(Stage.REGISTRATION, lambda: measure(slices, given, asked, report, template=self.template))
+            poses = run.stage(
+                Stage.REGISTRATION, lambda: measure(slices, given, asked, report, template=self.networks.template)
+            )
         elif given is not None:
             run.notes.append("registration was given, not estimated here")
             with run.timed(Stage.REGISTRATION) as tell:
@@ -170,27 +166,28 @@ class GaussianReconstructor:
         return poses
 
     def _masks(
-        self, stacks: Sequence[Stack], poses: Registration, intensity: float, run: RunContext
+        self, stacks: Sequence[Stack], poses: Registration, intensity: float, plan: Plan, run: RunContext
     ) -> tuple[Sequence[Stack], Registration]:
         """Stacks and slices with masks that were found once more, with what registration knows."""
         if not any(stack.mask_source == REFINED for stack in stacks):
             return stacks, poses
         with run.timed(Stage.MASKS) as tell:
-            tell(refined := self.subject_prior.refined_masks(stacks, poses, intensity))
+            tell(refined := self.networks.subject_prior(plan.settings).refined_masks(stacks, poses, intensity))
         run.notes += refined.notes
         return refined.stacks, refined.poses
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
         """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
         plan.for_prior(run.clock.seconds[Stage.COARSE])
+        maker = self.networks.subject_prior(plan.settings)
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
         # V_prior of several stacks is made anew after each round, the last time with all views
         views = 1 if n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) else plan.settings.prior_views
-        prior = run.stage(Stage.PRIOR, lambda: self.subject_prior.of(volumes, poses, views, tiling))
+        prior = run.stage(Stage.PRIOR, lambda: maker.of(volumes, poses, views, tiling))
         if n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
-            moved = self.subject_prior.with_slices_moved
+            moved = maker.with_slices_moved
             prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: moved(prior, poses, views, tiling))
         run.notes.append(NOTE_ON_SINGLE[prior.accepted])
         return prior
@@ -205,7 +202,9 @@ class GaussianReconstructor:
             return prior, poses, None
 
         def prior_of(moved: Registration, last: bool) -> PriorVolume:
-            return self.subject_prior.again(moved, prior, settings.prior_views if last else 1, settings.tiling)
+            return self.networks.subject_prior(plan.settings).again(
+                moved, prior, settings.prior_views if last else 1, settings.tiling
+            )
 
         def refine() -> RefinedPoses:
             return refine_in_rounds(

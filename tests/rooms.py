@@ -17,8 +17,8 @@ OPEN_TO_ALL = {"errors", "_version"}
 MAY_IMPORT = {
     "errors": "",
     "_version": "",
-    "geometry": "",
     "run": "",
+    "geometry": "run",
     "acquisition": "geometry run",
     "checkpoints": "run",
     "dicom": "run acquisition",
@@ -31,13 +31,14 @@ MAY_IMPORT = {
     "evaluation": "geometry acquisition registration",
     "training": "geometry run checkpoints prior pose_network mask_network evaluation",
     "fitting": "geometry run acquisition gaussians registration prior",
-    "uncertainty": "geometry acquisition gaussians fitting",
+    "uncertainty": "geometry run acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
+    "networks": "geometry acquisition checkpoints prior pose_network fitting planning",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians registration output",
     "report": "geometry run acquisition registration planning output reuse",
     "bids": "run acquisition",
-    "reconstruct": "run acquisition checkpoints prior pose_network registration fitting planning output report",
+    "reconstruct": "run acquisition checkpoints registration fitting planning networks output report",
     "bench": "geometry run acquisition gaussians registration fitting planning evaluation output reconstruct",
     "cli": (
         "run acquisition dicom checkpoints prior pose_network mask_network masking training planning evaluation output "

@@ -120,8 +120,22 @@ def test_load_stack_needs_no_torch() -> None:
     assert modules_after("from g3r import load_stack", *HEAVY) == set()
 
 
-def test_the_pipeline_needs_no_training_packages() -> None:
-    assert modules_after("import g3r.reconstruct", "lightning", "torchio", "pytorch_lightning") == set()
+def test_the_pipeline_is_imported_without_the_libraries_of_its_networks() -> None:
+    heavy = ("torch", "monai", "matplotlib", "lightning", "torchio", "pytorch_lightning")
+    assert modules_after("import g3r.reconstruct", *heavy) == set()
+
+
+def test_the_networks_need_no_training_packages() -> None:
+    statement = "import g3r.prior.model, g3r.pose_network.model, g3r.mask_network.model"
+    assert modules_after(statement, "lightning", "torchio", "pytorch_lightning") == set()
+
+
+def test_a_preview_loads_no_network(subject: Path, tmp_path: Path) -> None:
+    files = [[str(subject / f"{kind}-{n}.nii.gz") for n in range(3)] for kind in ("stack", "mask")]
+    line = ["--stacks", *files[0], "--masks", *files[1], "--thickness", "4", "--output", str(tmp_path / "out")]
+    line += ["--preset", "preview", "--resolution", "1.5", "--threads", "1", "--quiet"]
+    statement = f"import g3r.cli.infer as c; assert c.main({line!r}) == 0"
+    assert modules_after(statement, "torch", "monai", "matplotlib") == set()
 
 
 REUSE = ("render", "apply", "export_poses")

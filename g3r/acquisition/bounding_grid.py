@@ -28,7 +28,7 @@ def grid_around(slices: Slices, spacing_mm: float, margin_mm: float = 6.0) -> Vo
     return VolumeGrid.isotropic(low, high, spacing_mm, margin_mm)
 
 
-@numba.njit(cache=True)
+@numba.njit(nogil=True, cache=True)
 def _bounds(mask, offset, shape, spacing, rotation, center, low, high):
     """Least and largest world coordinates of masked pixels; only the ends of a row can be extreme."""
     for k in range(len(shape)):

@@ -87,7 +87,7 @@ def _with_beyond(n_beyond: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
     return np.concatenate(rows), np.concatenate(steps)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def _accumulate(density, linear, offset, sigma, extent, amount):
     n_i, n_j, n_k = density.shape
     root2 = math.sqrt(2.0)

@@ -17,7 +17,7 @@ REORDERED = {"reassoc", "contract", "nsz"}
 """Sums in any order and fused multiply-adds; not-a-number stays what it is."""
 
 
-@numba.njit(cache=True)
+@numba.njit(nogil=True, cache=True)
 def fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
     """Write plane and in-plane position of pixels; they mostly come in order: the last plane is tried first.
 
@@ -41,7 +41,7 @@ def fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
         uv[p, 1] = (column - (shape[k, 1] - 1) / 2) * spacing[k, 1]
 
 
-@numba.njit(cache=True, fastmath=REORDERED)
+@numba.njit(nogil=True, cache=True, fastmath=REORDERED)
 def locate(u, v, matrix, origin, shape, outside, cell, fraction):
     """Find the cell of each pixel and where in it the pixel lies.
 
@@ -79,7 +79,7 @@ def locate(u, v, matrix, origin, shape, outside, cell, fraction):
         cell[p] = i * stride_x + j * stride_y + h if inside else beyond
 
 
-@numba.njit(cache=True)
+@numba.njit(nogil=True, cache=True)
 def end_of_run(plane, first, last):
     """Number of the first pixel after `first` that is of another plane, or `last`."""
     end = first + 1
@@ -88,7 +88,7 @@ def end_of_run(plane, first, last):
     return end
 
 
-@numba.njit(parallel=True, cache=True, fastmath=REORDERED)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=REORDERED)
 def gather(flat, shape, plane, uv, matrix, origin, node_weight, pixels):
     """Add to each pixel the weighted values of the volume at its nodes.
 
@@ -125,7 +125,7 @@ def gather(flat, shape, plane, uv, matrix, origin, node_weight, pixels):
             first = end
 
 
-@numba.njit(parallel=True, cache=True, fastmath=REORDERED)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=REORDERED)
 def scatter(pixels, shape, plane, uv, matrix, origin, node_weight, buffers):
     """Add each pixel to a volume at its nodes, with the weights of `gather`.
 

@@ -8,17 +8,19 @@ mapped by a polynomial without constant term, so that the background stays zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter
-from torch import Tensor
-from torch.nn import functional
 
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
+from g3r.run.on_demand import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 WORKING_VOXEL_MM = 3.0
 """Voxels in which template and head are compared."""
@@ -201,7 +203,7 @@ class _Deformation:
             at = a * world[0] + b * world[1] + c * world[2] + offset
             coordinates.append(2 * at / (self.template_grid.shape[axis] - 1) - 1)
         where = torch.stack(coordinates, dim=-1)[None]
-        found = functional.grid_sample(pair, where, mode="bilinear", padding_mode="zeros", align_corners=True)
+        found = torch.nn.functional.grid_sample(pair, where, mode="bilinear", padding_mode="zeros", align_corners=True)
         return found[0, 0], found[0, 1]
 
 

@@ -52,13 +52,13 @@ def best_seconds(call: Callable[[], object], repeats: int, clock: Callable[[], f
     return min(seconds)
 
 
-@numba.njit(cache=True)
+@numba.njit(nogil=True, cache=True)
 def _copy(source, target):
     for i in range(len(source)):
         target[i] = source[i]
 
 
-@numba.njit(cache=True, fastmath={"contract"})
+@numba.njit(nogil=True, cache=True, fastmath={"contract"})
 def _fused(values, turns, a, b, c, d):
     """Four chains of sixteen fused multiply-adds on each value, independent of each other."""
     total = f32(0.0)

@@ -177,7 +177,7 @@ def evaluations(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> tu
     return int(n_pixels), int(n_pairs)
 
 
-@numba.njit(cache=True)
+@numba.njit(nogil=True, cache=True)
 def _count(shapes, planes, overlaps, cut, projections):
     n_pixels, n_pairs = 0, 0
     for k in range(len(planes.rotation)):

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-import torch
+import sys
+from importlib.metadata import version
 
-from g3r.checkpoints.trained_model import TrainedModel
 from g3r.errors import InputError
+from g3r.run.on_demand import torch
 
 DEVICES = ("auto", "cpu", "cuda")
 
 
-def on_device(name: str, *models: TrainedModel | None) -> str:
-    """Move the networks of some models; returns where they are, "cuda" or "cpu".
+def device_of(name: str) -> str:
+    """Where networks are to compute, "cuda" or "cpu".
 
     Args:
         name: "cpu", "cuda", or "auto", which takes a GPU where torch finds one.
-        models: trained models; None is passed over.
 
     Raises:
         InputError: "cuda" where torch finds no GPU, or another name.
     """
     if name not in DEVICES:
         raise InputError(f"device {name!r}; expected {', '.join(DEVICES)}")
+    if name == "cpu" or (name == "auto" and knows_no_gpu()):
+        return "cpu"
     has_gpu = torch.cuda.is_available()
     if name == "cuda" and not has_gpu:
         found = "finds no GPU" if torch.backends.cuda.is_built() else "was installed without CUDA"
         raise InputError(f"--device cuda: torch {torch.__version__} {found}; pass --device cpu")
-    device = "cuda" if has_gpu and name != "cpu" else "cpu"
-    for model in models:
-        if model is not None:
-            model.network.to(device)
-    return device
+    return "cuda" if has_gpu else "cpu"
+
+
+def knows_no_gpu() -> bool:
+    """Whether the installed torch has no CUDA, as far as can be told without importing it."""
+    return sys.platform == "darwin" or version("torch").endswith("+cpu")
 
 
 def is_bfloat16_fast(device_type: str) -> bool:

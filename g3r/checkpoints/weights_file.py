@@ -63,13 +63,14 @@ class WeightsFile:
         description: what it says about its weights; only known to be a dict.
         claims: dtype and shape of each tensor by name; together they fill the file.
         sha256: of all bytes of the file.
+        content: all bytes of the file.
     """
 
     path: Path
     description: dict[str, Any]
     claims: dict[str, TensorClaim]
     sha256: str
-    _content: bytes = field(repr=False)
+    content: bytes = field(repr=False)
 
     def tensors(self) -> dict[str, Tensor]:
         """Decode all tensors.
@@ -81,7 +82,7 @@ class WeightsFile:
         from safetensors.torch import load
 
         try:
-            return load(self._content)
+            return load(self.content)
         except SafetensorError as error:
             raise DamagedError(str(error)) from error
 
@@ -137,7 +138,7 @@ def _read(stream: BinaryIO, path: Path, kind: str) -> WeightsFile:
     if len(content) != n_file:
         raise DamagedError("it changes while it is read")
     return WeightsFile(
-        path=path, description=description, claims=claims, sha256=hashlib.sha256(content).hexdigest(), _content=content
+        path=path, description=description, claims=claims, sha256=hashlib.sha256(content).hexdigest(), content=content
     )
 
 

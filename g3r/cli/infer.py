@@ -186,7 +186,7 @@ def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
         task.settings,
         task.inputs.named(),
         threads=task.n_threads,
-        device=task.reconstructor.device,
+        device=task.reconstructor.networks.device,
         thickness=[stack.thickness_mm for stack in task.stacks],
         in_plane_fwhm_pixels=[stack.in_plane_fwhm_pixels for stack in task.stacks],
         memory=options.max_memory,
@@ -205,7 +205,7 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
         preset=None if options.time_budget or options.config else options.preset,
         seed=task.settings.seed,
         threads=task.n_threads,
-        device=task.reconstructor.device,
+        device=task.reconstructor.networks.device,
         space="standard" if task.settings.registration.standard_orientation else "scanner",
     )
     record = replace(

@@ -150,9 +150,7 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
     )
     of_stacks = _stack_hashes(options, masked) if masked else slice_hashes(slices) if slices else ((), ())
     inputs = _inputs(of_stacks, masked, reconstructor, networks.get("mask"))
-    memory = plan_for_stacks(
-        stacks, settings, options.max_memory, reconstructor.prior.voxel_mm if reconstructor.prior else None
-    )
+    memory = plan_for_stacks(stacks, settings, options.max_memory, reconstructor.networks.prior_voxel_mm)
     return Task(
         stacks=stacks,
         settings=settings,
@@ -205,7 +203,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
         registration=registration,
         resolution_mm=options.resolution,
         seed=options.seed,
-        use_prior=not options.no_prior,
+        use_prior=preset.use_prior and not options.no_prior,
         fill_unseen=options.unseen == "fill",
     )
     settings = for_anatomy(settings, options.anatomy)
@@ -233,14 +231,14 @@ def _inputs(
     from g3r.output.record import Inputs
     from g3r.run.provenance import FileHash
 
-    prior, pose = reconstructor.prior, reconstructor.pose_model
+    prior, pose = reconstructor.networks.stored_prior, reconstructor.networks.stored_pose
     masks = masked.masks if masked else []
     asked = any(isinstance(one, FoundMask) and one.source == "automatic" for one in masks)
     return Inputs(
         stacks=of_stacks[0],
         masks=of_stacks[1],
-        prior=FileHash(prior.file_name, prior.file_sha256) if prior else None,
-        pose_network=FileHash(pose.file_name, pose.file_sha256) if pose else None,
+        prior=FileHash(prior.file.path.name, prior.file.sha256) if prior else None,
+        pose_network=FileHash(pose.file.path.name, pose.file.sha256) if pose else None,
         mask_network=FileHash(mask_weights.path.name, mask_weights.sha256) if mask_weights and asked else None,
     )
 

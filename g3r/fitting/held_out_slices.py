@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
@@ -23,6 +22,7 @@ from g3r.fitting.prior_targets import distillation_target
 from g3r.fitting.slice_stage import SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceModel, SliceTarget, slice_target
 from g3r.gaussians import GaussianCloud
+from g3r.run.on_demand import torch
 
 EVERY = 5
 """One slice in so many is held out, from another start in each stack."""

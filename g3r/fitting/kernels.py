@@ -107,7 +107,7 @@ def _exp(e):
     return p * p
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def image_l1(
     cloud,
     planes,
@@ -170,7 +170,7 @@ def image_l1(
                 gather(mine, n, cloud, planes, k, cut, True, image, buffers[worker], plane_gradient[k], with_pose)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=SUMS)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=SUMS)
 def scale_penalty(log_scale, seed, factor, gradient):
     """Scale regulariser: sum of (log_scale - seed)^2 over [N, 3].
 
@@ -189,7 +189,7 @@ def scale_penalty(log_scale, seed, factor, gradient):
     return total
 
 
-@numba.njit(parallel=True, cache=True, fastmath=SUMS)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=SUMS)
 def adam(values, gradient, first, second, rate):
     """One step of Adam; returns how many gradients are not finite.
 
@@ -218,7 +218,7 @@ def adam(values, gradient, first, second, rate):
     return n_bad
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, min_psf_mm2):
     """Bound of the change of any Gaussian's distance from a plane less its reach there, in units of its sigma.
 
@@ -252,7 +252,7 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, mi
     return largest
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def remember(mean, log_scale, quaternion, then):
     """Write what `farthest_move` measures movement from.
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.fitting.initial_volumes import PriorVolume
@@ -22,6 +21,7 @@ from g3r.fitting.slice_stage import SliceFit, SliceStageSettings, fit_slices
 from g3r.fitting.slice_targets import SliceTarget
 from g3r.gaussians import GaussianCloud
 from g3r.run.deadline import Deadline, timed_steps
+from g3r.run.on_demand import torch
 
 SPACINGS = (1.0, 0.9, 1.1)
 """Spacings of the lattices in turn, over that of the first."""
@@ -107,6 +107,8 @@ def fit_lattices(
 
 def mean_cloud(fit: SliceFit) -> GaussianCloud:
     """The mean of the clouds of a fit as one cloud: all Gaussians, each with its share of its height."""
+    if not fit.further:
+        return fit.cloud
     clouds = (fit.cloud, *fit.further)
     together = [torch.cat(parts) for parts in zip(*(cloud.parameters for cloud in clouds), strict=True)]
     return GaussianCloud.of([*together[:3], together[3] / len(clouds)], fit.cloud.origin_mm)

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.errors import NumericalError
 from g3r.fitting import kernels
 from g3r.gaussians import GaussianCloud
+from g3r.run.on_demand import torch
 
 BETA_1, BETA_2 = 0.9, 0.99
 """Decay of Adam's means of gradients and of their squares."""

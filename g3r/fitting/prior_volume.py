@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.coverage import UNSEEN_BELOW
 from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
-from g3r.prior.inference import PriorMaps, Tiling
-from g3r.prior.model import Prior
+from g3r.fitting.least_squares_volume import least_squares_volume
+from g3r.prior.maps import PriorMaps, Tiling
 from g3r.prior.subject_template import PlacedTemplate
 from g3r.registration.atlas_frame import Orientation
 
+if TYPE_CHECKING:
+    from g3r.prior.model import Prior
+
 KNOWN_DENSITY = 2 * UNSEEN_BELOW
-"""Density from which on V_sharp is taken as it is where no template fills what is missing."""
+"""Density from which on the slices' volume is taken as it is where no template fills what is missing."""
 
 
 def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedTemplate | None:
@@ -27,6 +32,7 @@ def placed_template(prior: Prior | None, orientation: Orientation | None) -> Pla
 def prior_volume(
     volumes: InitialVolumes,
     gain: NDArray[np.float64],
+    weight: NDArray[np.float64],
     prior: Prior | None,
     placed: PlacedTemplate | None,
     *,
@@ -38,7 +44,8 @@ def prior_volume(
     Args:
         volumes: what the slices give by themselves.
         gain: [K] of the slices.
-        prior: None takes V_sharp, smoothly continued into what was not seen.
+        weight: [K] of the slices.
+        prior: None takes the least-squares volume, smoothly continued into what was not seen.
         placed: its atlas template; None where there is none, and the smooth continuation takes its place.
         n_views: see `estimate_prior`.
         tiling: see `estimate_prior`.
@@ -48,7 +55,8 @@ def prior_volume(
         fitted = placed.fitted(volumes.sharp, share, volumes.density, volumes.grid)
         guess, outline = fitted.values, fitted.inside
     else:
-        guess = smooth_fill(volumes.sharp, np.clip(volumes.density / KNOWN_DENSITY, 0, 1), share)
+        seen = volumes.sharp if prior is not None else least_squares_volume(volumes, gain, weight)
+        guess = smooth_fill(seen, np.clip(volumes.density / KNOWN_DENSITY, 0, 1), share)
         outline = volumes.foreground.mask().astype(np.float32)
     values, brain = guess, None
     if prior is not None:

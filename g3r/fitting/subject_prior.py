@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,13 @@ from g3r.acquisition.stacks import Stack
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
 from g3r.fitting.mask_agreement import RefinedMasks, refine_masks
 from g3r.fitting.prior_volume import placed_template, prior_volume
-from g3r.prior.inference import Tiling
-from g3r.prior.model import Prior
+from g3r.prior.maps import Tiling
 from g3r.registration import Registration
 from g3r.registration.prior_registration import register_to_prior
 from g3r.run.allocator import release_memory
+
+if TYPE_CHECKING:
+    from g3r.prior.model import Prior
 
 NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was not tried
     None: "slices of the single stack stay where the atlas template or the header has them",
@@ -31,7 +34,7 @@ class SubjectPrior:
     """Makes the volumes of a subject from its slices, as often as these move.
 
     Args:
-        network: None takes V_sharp, smoothly continued, for V_prior.
+        network: None takes the least-squares volume of the slices, smoothly continued, for V_prior.
         voxel_mm: of the volumes.
         common_bias_field: whether the bias field that stacks share is divided out.
     """
@@ -65,7 +68,7 @@ class SubjectPrior:
         """
         network = self.network if n_views else None
         placed = placed_template(network, poses.orientation)
-        found = prior_volume(volumes, poses.gain, network, placed, n_views=n_views, tiling=tiling)
+        found = prior_volume(volumes, poses.gain, poses.weight, network, placed, n_views=n_views, tiling=tiling)
         release_memory()  # the most that is ever freed at a time
         return found
 

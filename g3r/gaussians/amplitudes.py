@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Planes
@@ -16,6 +15,7 @@ from g3r.gaussians.kernels import PROJECTION
 from g3r.gaussians.kernels_amplitudes import HeldProjections
 from g3r.gaussians.overlap import OverlapList, find_overlaps
 from g3r.gaussians.render import CUTOFF_SIGMA
+from g3r.run.on_demand import torch
 
 MAX_PROJECTION_BYTES = 400_000_000
 """Gaussians are projected once for all products if the projections take no more than this."""

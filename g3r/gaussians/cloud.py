@@ -9,14 +9,17 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
+from g3r.run.on_demand import is_tensor, torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SIGMA_RANGE_MM = (1e-6, 1e6)
 """No structure of a head is outside this range; beyond it the kernels' integers and float32 overflow."""
@@ -62,7 +65,7 @@ class GaussianCloud:
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"{name} has shape {found}; expected {shape}")
-            if not bool(torch.isfinite(getattr(self, name)).all()):
+            if n and not bool(torch.isfinite(getattr(self, name)).all()):
                 raise ValueError(f"{name} holds values that are not finite")
         object.__setattr__(self, "origin_mm", np.array(self.origin_mm, dtype=np.float64).reshape(3))
         if not np.isfinite(self.origin_mm).all():
@@ -85,6 +88,12 @@ class GaussianCloud:
     def __repr__(self) -> str:
         origin = ", ".join(f"{x:.1f}" for x in self.origin_mm)
         return f"GaussianCloud({len(self)} Gaussians about ({origin}) mm)"
+
+    @classmethod
+    def empty(cls) -> GaussianCloud:
+        """No Gaussians, and no torch: the arrays are NumPy's."""
+        arrays: list[Any] = [np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3), (0, 4), (0,))]
+        return cls.of(arrays, np.zeros(3))
 
     @property
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -114,7 +123,7 @@ class GaussianCloud:
             OSError: the file cannot be written.
         """
         arrays = {
-            name: getattr(self, name).detach().cpu().numpy().astype(np.float32)
+            name: (one.detach().cpu().numpy() if is_tensor(one := getattr(self, name)) else one).astype(np.float32)
             for name in ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
         }
         buffer = io.BytesIO()

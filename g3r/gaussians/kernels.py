@@ -214,7 +214,7 @@ def unload(image, pixels, offset, n_x, n_y):
             pixels[begin + y] = image[row + y]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def forward(cloud, planes, overlaps, cut, exact, work, out):
     """The sum of all Gaussians on each pixel, gain included (G3R Eq. 5), written to the flat pixels `out`."""
     n_workers = len(work.images)
@@ -228,7 +228,7 @@ def forward(cloud, planes, overlaps, cut, exact, work, out):
             unload(image, out, planes.offset[k], n_x, n_y)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def derive_shapes(mean, log_scale, quaternion, shapes):
     """Centre, Sigma = R diag(s^2) R^T (G3R Eq. 3) and s1 s2 s3 of every Gaussian [N, 10], float64.
 

@@ -32,7 +32,7 @@ class HeldProjections(NamedTuple):
     n_touching: NDArray[np.int64]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def set_up(part, shapes, planes, overlaps, cut, projections, n_touching):
     """Project the Gaussians onto the planes of a part; writes the last two, which are those of `held`."""
     first, last = part
@@ -42,7 +42,7 @@ def set_up(part, shapes, planes, overlaps, cut, projections, n_touching):
         n_touching[k] = project(shapes, planes, overlaps, k, cut, True, projections[begin:end])
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def apply(part, amplitude, planes, cut, held, images, out):
     """A c: the pixels of amplitudes on the planes of a part."""
     first, last = part
@@ -57,7 +57,7 @@ def apply(part, amplitude, planes, cut, held, images, out):
             unload(image, out, planes.offset[k], n_x, n_y)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def apply_adjoint(part, pixels, planes, cut, held, images, buffers):
     """A^T y of the pixels of a part, added to buffers [n_workers, N]."""
     first, last = part

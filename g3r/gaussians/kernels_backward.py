@@ -123,7 +123,7 @@ def gather(projections, n, cloud, planes, k, cut, exact, image, buffer, plane, w
     plane[6] += p6
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def backward(cloud, planes, overlaps, cut, exact, work, weight, buffers, plane_gradient):
     """The backward pass: gradients of sum(weight * pixels) by the moments of each projection.
 
@@ -187,7 +187,7 @@ def _along(t, r, a):
     return t[0] * r[0][a] + t[1] * r[1][a] + t[2] * r[2][a]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def shape_gradients(log_scale, quaternion, buffers, mean_grad, scale_grad, quaternion_grad, amplitude_grad):
     """Sum the workers' buffers (into the first) and take dL/dSigma to log-scales and quaternions.
 

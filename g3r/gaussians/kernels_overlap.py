@@ -28,7 +28,7 @@ class PlaneExtents(NamedTuple):
     half: NDArray[np.float32]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def columns_of(shapes, middle, columns):
     """Mean and covariance as rows [9, N] of float32, so that the search runs in vectors.
 
@@ -70,7 +70,7 @@ def _mark(columns, r, t, psf, half, cut, marks):
         marks[j] = touches
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def find(columns, planes, cut, marks, start, order):
     """Numbers of the Gaussians of each plane, ascending, into `order`; of none into an empty `order`.
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from g3r.acquisition.planes import Planes
 from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry.quaternion import rotation_from_quaternion
+from g3r.run.on_demand import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 PAIRS_AT_ONCE = 4_000_000
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from g3r.acquisition.planes import Planes
-from g3r.gaussians import kernels, kernels_backward
-from g3r.gaussians.arrays import CloudArrays, PlaneArrays, Workspace
+from g3r.gaussians import kernels
 from g3r.gaussians.cloud import GaussianCloud
 from g3r.gaussians.overlap import OverlapList, find_overlaps
 from g3r.gaussians.reference import render_reference
 from g3r.geometry import RigidPose
+from g3r.run.on_demand import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 CUTOFF_SIGMA = 3.2
 """Gaussians end here by default; at 3.2 sigma a Gaussian has fallen to 0.6 % of its amplitude."""
@@ -84,7 +85,9 @@ def render(
     if overlaps is None:
         overlaps = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
     exact = attenuation == "exact"
-    pixels: Tensor = _Render.apply(
+    from g3r.gaussians.render_function import RenderFunction  # its class derives from one of torch
+
+    pixels: Tensor = RenderFunction.apply(
         *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, overlaps, cutoff_sigma, exact
     )
     return pixels
@@ -97,57 +100,6 @@ def moved_planes(planes: Planes, twist: Tensor | None) -> Planes:
     change = twist.detach().double().numpy()
     rotation = planes.rotation @ Rotation.from_rotvec(change[:, :3]).as_matrix()
     return planes.with_pose(RigidPose(rotation, planes.center_mm + change[:, 3:]))
-
-
-class _Render(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        mean: Tensor,
-        log_scale: Tensor,
-        quaternion: Tensor,
-        amplitude: Tensor,
-        twist: Tensor | None,
-        log_gain: Tensor | None,
-        origin_mm: NDArray[np.float64],
-        planes: Planes,
-        overlaps: OverlapList,
-        cutoff_sigma: float,
-        exact: bool,
-    ) -> Tensor:
-        moved = moved_planes(planes, twist)
-        gain = np.ones(len(planes)) if log_gain is None else np.exp(log_gain.detach().double().numpy())
-        cloud = GaussianCloud.of((mean, log_scale, quaternion, amplitude), origin_mm)
-        work = Workspace.of(planes, overlaps.most)
-        given = (CloudArrays.of(cloud), PlaneArrays.of(moved, origin_mm, gain), overlaps.arrays, cutoff_sigma**2, exact)
-        out = np.zeros(planes.n_pixels, np.float32)
-        kernels.forward(*given, work, out)
-        ctx.saved = (given, work, cloud, twist)
-        ctx.like = [None if p is None else p.dtype for p in (mean, log_scale, quaternion, amplitude, twist, log_gain)]
-        return torch.from_numpy(out).to(mean.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        given, work, cloud, twist = ctx.saved
-        n, n_planes = len(cloud), len(given[1].rotation)
-        buffers = np.zeros((len(work.images), n, kernels.N_GRADIENTS))
-        plane_gradient = np.zeros((n_planes, kernels.N_PLANE_GRADIENTS))
-        weight = np.ascontiguousarray(grad.detach().numpy(), dtype=np.float32)
-        kernels_backward.backward(*given, work, weight, buffers, plane_gradient)  # type: ignore[call-arg]
-        found = [np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)]
-        log_scale, quaternion = (np.ascontiguousarray(p.detach().numpy()) for p in cloud.parameters[1:3])
-        kernels_backward.shape_gradients(log_scale, quaternion, buffers, *found)
-        pose = plane_gradient[:, :6]
-        if twist is not None:
-            # the kernels differentiate in a rotation after the present one: exp(w + dw) = exp(w) exp(J_r dw)
-            jacobian = right_jacobian(twist.detach().double().numpy()[:, :3])
-            pose = np.concatenate([np.einsum("kji,kj->ki", jacobian, pose[:, :3]), pose[:, 3:]], axis=1)
-        arrays = (*found, pose, plane_gradient[:, 6])
-        gradients = [
-            None if dtype is None else torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
-            for array, dtype in zip(arrays, ctx.like, strict=True)
-        ]
-        return (*gradients, None, None, None, None, None)
 
 
 def right_jacobian(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from g3r.gaussians.cloud import GaussianCloud
 from g3r.geometry import VolumeGrid
+from g3r.run.on_demand import torch
 
 SCALE_PER_SPACING = 0.6
 """Sigma of a seed over the lattice spacing: neighbours overlap so that a constant is flat to 2 %."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
+
+from g3r.run.on_demand import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground
@@ -225,7 +224,7 @@ def _extent_known(found: StageResults, settings: ReconstructionSettings) -> bool
 
 def _no_fit(found: StageResults) -> SliceFit:
     """The slices as registration left them, and no Gaussians."""
-    cloud = GaussianCloud.of([*(torch.zeros(0, n) for n in (3, 3, 4)), torch.zeros(0)], np.zeros(3))
+    cloud = GaussianCloud.empty()
     slices, gain, weight = found.prior.volumes.slices, found.prior.gain, found.registration.weight
     return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
 

@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.errors import cannot_be_written
 from g3r.geometry.grid import bounding_box
-from g3r.output.sections import BACKGROUND, DOTS_PER_INCH, FAINT_INK, INK, MARK, write_figure
+from g3r.output.sections import BACKGROUND, FAINT_INK, INK, MARK
+from g3r.run.atomic_file import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from g3r.acquisition.stacks import Stack
 
@@ -22,6 +25,7 @@ N_PANELS = 8
 """Slices shown of each stack, from the first with brain to the last."""
 
 PANEL_INCHES = 1.5
+DOTS_PER_INCH = 130
 MARGIN_MM = 25.0
 """Shown around the brain, so that what a mask misses is seen."""
 
@@ -56,7 +60,7 @@ def save_mask_picture(path: str | os.PathLike[str], stacks: Sequence[Stack]) -> 
     )
     for row, stack in zip(panels, stacks, strict=True):
         _draw_stack(list(row), stack)
-    write_figure(figure, Path(path))
+    _write(figure, Path(path))
 
 
 def _draw_stack(panels: list[Axes], stack: Stack) -> None:
@@ -83,3 +87,14 @@ def _draw_slice(
     panel.imshow(image, cmap="gray", vmin=0, vmax=bright, origin="lower", aspect=aspect, interpolation="nearest")
     if inside.any() and not inside.all():
         panel.contour(inside, levels=[0.5], colors=MARK, linewidths=0.8)
+
+
+def _write(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all; raises `InputError` where it cannot be written."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    try:
+        with atomic_path(path) as temporary:
+            FigureCanvasAgg(figure).print_png(temporary)
+    except OSError as error:
+        raise cannot_be_written(path, error) from None

@@ -126,7 +126,7 @@ class ReconstructionResult:
     def _max_bytes(self) -> int:
         """Size of the uncompressed files together, without the picture and tables."""
         arrays = [getattr(self, one.name) for one in fields(self)]
-        arrays += [tensor.numpy() for tensor in self.cloud.parameters]
+        arrays += [np.asarray(tensor) for tensor in self.cloud.parameters]
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def _write(self, folder: Path) -> None:

@@ -7,19 +7,17 @@ import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import nibabel as nib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from g3r.errors import cannot_be_written
 from g3r.geometry.grid import bounding_box
+from g3r.output.map_colours import INFERNO
 from g3r.run.atomic_file import atomic_path
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 BACKGROUND = "#000000"
 INK = "#c8c8c8"
@@ -31,11 +29,13 @@ MARGIN_MM = 6.0
 """Shown around the mask."""
 
 SCALE_BAR_MM = 20.0
-ROW_HEIGHT_INCHES = 2.5
-DOTS_PER_INCH = 130
-TITLE_LINE_INCHES = 0.19
-TITLE_LETTER_INCHES = 0.092
-"""Height of a line and mean width of a letter at the size of the title."""
+ROW_PIXELS = 325
+BETWEEN = 5
+"""Pixels between panels, and between rows."""
+
+LEFT, LEFT_CAPTIONED, RIGHT, HEAD, FOOT = 50, 75, 82, 44, 39
+TITLE_LINE, TITLE_LETTER = 25, 11
+"""Height of a line and mean width of a letter of the title, in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +133,12 @@ def save_sections(
     outlined = np.zeros(inside.shape, bool)
     if marked is not None:
         outlined = nib.orientations.apply_orientation(np.asarray(marked) > 0, orientation)
-    figure = _draw(rows, inside[box], outlined[box], center, spacing_mm, title)
-    write_figure(figure, Path(path))
+    picture = _draw(rows, inside[box], outlined[box], center, spacing_mm, title)
+    try:
+        with atomic_path(Path(path)) as temporary:
+            picture.save(temporary, format="png")
+    except OSError as error:
+        raise cannot_be_written(Path(path), error) from None
 
 
 def _crop(
@@ -155,79 +159,90 @@ def _draw(
     center: NDArray[np.intp],
     spacing_mm: NDArray[np.float64],
     title: str,
-) -> Figure:
+) -> Image.Image:
     """Lay the panels out at one scale in mm, so that lengths compare across views and rows."""
-    from matplotlib.figure import Figure
-
     size_mm = np.array(inside.shape) * spacing_mm
-    widths_mm = [size_mm[view.across] for view in VIEWS]
     height_mm = max(size_mm[view.up] for view in VIEWS)
-    inches_per_mm = ROW_HEIGHT_INCHES / height_mm
-    captioned = any(one.caption for one in volumes)
-    left, right, bottom = 0.58 if captioned else 0.38, 0.55, 0.30
-    width = sum(widths_mm) * inches_per_mm + left + right + 0.08
-    title_lines = textwrap.wrap(title, max(20, int(width / TITLE_LETTER_INCHES)))
-    top = 0.34 + (0.08 + TITLE_LINE_INCHES * len(title_lines) if title_lines else 0.0)
-    height = len(volumes) * ROW_HEIGHT_INCHES + 0.04 * (len(volumes) - 1) + top + bottom
-    figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor=BACKGROUND)
-    panels = figure.subplots(
-        len(volumes),
-        len(VIEWS),
-        squeeze=False,
-        gridspec_kw={
-            "width_ratios": widths_mm,
-            "left": left / width,
-            "right": 1 - right / width,
-            "top": 1 - top / height,
-            "bottom": bottom / height,
-            "wspace": 0.02,
-            "hspace": 0.04 / ROW_HEIGHT_INCHES,
-        },
-    )
+    per_mm = ROW_PIXELS / height_mm
+    widths = [max(1, round(size_mm[view.across] * per_mm)) for view in VIEWS]
+    left = LEFT_CAPTIONED if any(one.caption for one in volumes) else LEFT
+    width = sum(widths) + BETWEEN * (len(VIEWS) - 1) + left + RIGHT
+    lines = textwrap.wrap(title, max(20, width // TITLE_LETTER))
+    top = HEAD + (TITLE_LINE * len(lines) + 10 if lines else 0)
+    picture = Image.new("RGB", (width, top + len(volumes) * (ROW_PIXELS + BETWEEN) + FOOT), BACKGROUND)
+    pen = ImageDraw.Draw(picture)
+    for number, line in enumerate(lines):
+        pen.text((width / 2, 8 + TITLE_LINE * number), line, INK, font=_font(19), anchor="ma")
     for row, one in enumerate(volumes):
+        y = top + row * (ROW_PIXELS + BETWEEN)
         low, high = one.range or _window(one.data, inside, is_map=one.is_map)
         # what a mask has cut away is black, also where a volume goes below zero
         data = one.data if one.is_map else np.where(inside | (one.data != 0), one.data, low)
-        for panel, view in zip(panels[row], VIEWS, strict=True):
-            shown = _section(data, view, center)
-            extent = (0.0, size_mm[view.across], 0.0, size_mm[view.up])
-            colors = "inferno" if one.is_map else "gray"
-            image = panel.imshow(
-                shown, cmap=colors, vmin=low, vmax=high, origin="lower", extent=extent, interpolation="bilinear"
-            )
+        x = left
+        for view, wide in zip(VIEWS, widths, strict=True):
+            size = (wide, max(1, round(size_mm[view.up] * per_mm)))
+            panel = _panel(_section(data, view, center), size, low, high, is_map=one.is_map)
             part = _section(outlined, view, center)
             if part.any() and not part.all():
-                panel.contour(part, levels=[0.5], colors=[MARK], linewidths=0.8, origin="lower", extent=extent)
-            slack = (height_mm - size_mm[view.up]) / 2
-            panel.set_ylim(-slack, size_mm[view.up] + slack)
-            panel.set_axis_off()
+                panel.paste(MARK, mask=_outline(part, size))
+            picture.paste(panel, (x, y + (ROW_PIXELS - size[1]) // 2))
             if row == 0:
-                panel.set_title(view.name, color=INK, fontsize=10, pad=6)
-                _letter(panel, view.letters)
-        box = panels[row][0].get_position()
-        middle = (box.y0 + box.y1) / 2
-        _side_text(figure, 0.16 / width, middle, one.name, color=INK, fontsize=11)
-        _side_text(figure, 0.38 / width, middle, one.caption, color=FAINT_INK, fontsize=7.5)
+                pen.text((x + wide / 2, y - 8), view.name, INK, font=_font(18), anchor="mb")
+                _letter(pen, view.letters, (x, y, wide, ROW_PIXELS))
+            x += wide + BETWEEN
+        middle = y + ROW_PIXELS // 2
+        _side_text(picture, (20, middle), one.name, INK, 20)
+        _side_text(picture, (49, middle), one.caption, FAINT_INK, 14)
         if one.is_map:
-            last = panels[row][-1].get_position()
-            bar = figure.add_axes(
-                (last.x1 + 0.06 / width, last.y0 + 0.15 * last.height, 0.08 / width, 0.7 * last.height)
-            )
-            figure.colorbar(image, cax=bar)
-            bar.tick_params(colors=FAINT_INK, labelsize=7, length=2, pad=2)
-            bar.spines[:].set_visible(False)
-    _scale_bar(panels[-1][0])
-    if title_lines:
-        figure.text(0.5, 1 - 0.06 / height, "\n".join(title_lines), color=INK, fontsize=11, ha="center", va="top")
+            _bar(picture, (x - BETWEEN + 8, y + int(0.15 * ROW_PIXELS)), int(0.7 * ROW_PIXELS), low, high)
+    _scale_bar(pen, left, top + len(volumes) * (ROW_PIXELS + BETWEEN) - BETWEEN, per_mm)
     voxel = " x ".join(f"{value:.2f}" for value in spacing_mm)
     note = f"voxels {voxel} mm; radiological: the patient's right is on the left"
-    figure.text(1 - 0.1 / width, 0.13 / height, note, color=FAINT_INK, fontsize=7.5, ha="right", va="center")
-    return figure
+    pen.text((width - 12, picture.height - FOOT / 2), note, FAINT_INK, font=_font(14), anchor="rm")
+    return picture
 
 
-def _side_text(figure: Figure, x: float, y: float, text: str, *, color: str, fontsize: float) -> None:
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _panel(
+    section: NDArray[np.float32], size: tuple[int, int], low: float, high: float, *, is_map: bool
+) -> Image.Image:
+    """A section [up, across] in grey or in the colours of maps; its first row is at the bottom."""
+    share = (section.astype(np.float64) - low) / (high - low)
+    level = Image.fromarray((share[::-1].clip(0, 1) * 255).astype(np.uint8)).resize(size, Image.Resampling.BILINEAR)
+    return Image.fromarray(INFERNO[np.asarray(level)]) if is_map else level.convert("RGB")
+
+
+def _outline(part: NDArray[np.bool_], size: tuple[int, int]) -> Image.Image:
+    """A line of a pixel or so along the border of a part [up, across], where it lies in the panel."""
+    inside = Image.fromarray(part[::-1].astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
+    filled = Image.fromarray((np.pad(np.asarray(inside) > 127, 1)).astype(np.uint8) * 255)
+    line = np.asarray(filled) > np.asarray(filled.filter(ImageFilter.MinFilter(3)))
+    return Image.fromarray(line[1:-1, 1:-1].astype(np.uint8) * 255)
+
+
+def _side_text(picture: Image.Image, at: tuple[int, int], text: str, color: str, size: int) -> None:
     """Write a line upwards, left of a row."""
-    figure.text(x, y, text, rotation=90, color=color, fontsize=fontsize, ha="center", va="center")
+    if not text:
+        return
+    font = _font(size)
+    left, top, right, bottom = font.getbbox(text)
+    label = Image.new("RGB", (int(right - left) + 2, int(bottom - top) + 2), BACKGROUND)
+    ImageDraw.Draw(label).text((1 - left, 1 - top), text, color, font=font)
+    label = label.rotate(90, expand=True)
+    picture.paste(label, (at[0] - label.width // 2, max(0, at[1] - label.height // 2)))
+
+
+def _bar(picture: Image.Image, at: tuple[int, int], height: int, low: float, high: float) -> None:
+    """Draw the colours of a map with the values of both ends and the middle."""
+    levels = np.linspace(255, 0, height).round().astype(int)
+    picture.paste(Image.fromarray(np.repeat(INFERNO[levels][:, None], 10, axis=1)), at)
+    pen = ImageDraw.Draw(picture)
+    for share in (0.0, 0.5, 1.0):
+        y = at[1] + (1 - share) * height
+        pen.text((at[0] + 15, y), f"{low + share * (high - low):.3g}", FAINT_INK, font=_font(13), anchor="lm")
 
 
 def _section(data: NDArray[Any], view: View, center: NDArray[np.intp]) -> NDArray[Any]:
@@ -244,31 +259,19 @@ def _window(data: NDArray[np.float32], inside: NDArray[np.bool_], *, is_map: boo
     return low, high if high > low else low + 1.0
 
 
-def _letter(panel: Axes, letters: str) -> None:
+def _letter(pen: ImageDraw.ImageDraw, letters: str, box: tuple[int, int, int, int]) -> None:
     """Write the anatomical directions at the four sides, outlined: there may be image below them."""
-    from matplotlib.patheffects import withStroke
-
-    outline = [withStroke(linewidth=2, foreground=BACKGROUND)]
-    places = ((0.02, 0.5), (0.98, 0.5), (0.5, 0.99), (0.5, 0.01))
-    aligned = (("left", "center"), ("right", "center"), ("center", "top"), ("center", "bottom"))
-    for letter, (x, y), (horizontal, vertical) in zip(letters, places, aligned, strict=True):
-        text = panel.text(x, y, letter, transform=panel.transAxes, ha=horizontal, va=vertical)
-        text.set(color="#e8b04a", fontsize=8, path_effects=outline)
+    x, y, width, height = box
+    places = ((x + 4, y + height / 2), (x + width - 4, y + height / 2), (x + width / 2, y + 4))
+    for letter, place, anchor in zip(letters, (*places, (x + width / 2, y + height - 4)), _ANCHORS, strict=True):
+        pen.text(place, letter, "#e8b04a", font=_font(15), anchor=anchor, stroke_width=2, stroke_fill=BACKGROUND)
 
 
-def _scale_bar(panel: Axes) -> None:
+_ANCHORS = ("lm", "rm", "mt", "mb")
+
+
+def _scale_bar(pen: ImageDraw.ImageDraw, left: int, bottom: int, per_mm: float) -> None:
     """Draw a bar of known length in the lower left corner."""
-    x, y = panel.get_xlim()[0] + 3.0, panel.get_ylim()[0] + 3.0
-    panel.plot([x, x + SCALE_BAR_MM], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
-    panel.text(x, y + 1.5, f"{SCALE_BAR_MM / 10:.0f} cm", color=INK, fontsize=7.5, ha="left", va="bottom")
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all; raises `InputError` where it cannot be written."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    try:
-        with atomic_path(path) as temporary:
-            FigureCanvasAgg(figure).print_png(temporary)
-    except OSError as error:
-        raise cannot_be_written(path, error) from None
+    x, y = left + 8, bottom - 8
+    pen.line((x, y, x + SCALE_BAR_MM * per_mm, y), INK, 3)
+    pen.text((x, y - 4), f"{SCALE_BAR_MM / 10:.0f} cm", INK, font=_font(14), anchor="lb")

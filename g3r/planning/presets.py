@@ -14,7 +14,7 @@ from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
 from g3r.planning.anatomy import FETAL_BRAIN, Anatomy
-from g3r.prior.inference import DEFAULT_TILING, Tiling
+from g3r.prior.maps import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings
 
 RESOLUTION_RANGE_MM = (0.3, 3.0)
@@ -34,7 +34,8 @@ class ReconstructionSettings:
         prior_stage: stage 1.
         slice_model: how a slice follows from the volume, in stage 2.
         slice_stage: stage 2.
-        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume; 0 shows the prior volume alone.
+        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume; 0 shows V_prior alone, or the
+            least-squares volume of the slices.
         held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
@@ -42,7 +43,9 @@ class ReconstructionSettings:
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
-        use_prior: False seeds from V_sharp and leaves distillation out.
+        least_squares_voxel_mm: least voxel size of the volumes before the fit where no network prescribes one; their
+            noise grows as voxels shrink.
+        use_prior: False takes the least-squares volume of the slices for V_prior and leaves distillation out.
         distillation: False uses the prior for the start alone.
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
@@ -67,6 +70,7 @@ class ReconstructionSettings:
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
     prior_halo_voxels: int = DEFAULT_TILING.halo_voxels
     share_probes: int = 2
+    least_squares_voxel_mm: float = 0.0
     use_prior: bool = True
     distillation: bool = True
     common_bias_field: bool = True
@@ -104,18 +108,15 @@ _QUICK_SEARCH = replace(
 )
 
 PRESETS: dict[str, ReconstructionSettings] = {
-    "preview": replace(
+    "preview": replace(  # least squares alone: neither torch nor a network is loaded
         _BALANCED,
-        gaussian_spacing_pixels=2.85,
-        max_gaussian_spacing_mm=4.0,
         pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
         held_out=None,
-        prior_weight=0.45,
-        prior_views=1,
-        share_probes=1,
-        registration=replace(_QUICK_SEARCH, n_rounds=3, finest_voxel_mm=1.6, max_pixels=100_000),
-        prior_stage=replace(_BALANCED.prior_stage, n_steps=6),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=32),
+        n_lattices=0,
+        least_squares_voxel_mm=1.0,
+        use_prior=False,
+        prior_views=0,
+        registration=replace(_QUICK_SEARCH, network=False, n_rounds=9, finest_voxel_mm=0.9, max_pixels=400_000),
     ),
     "fast": replace(
         _BALANCED,
@@ -178,8 +179,8 @@ def settings_of(given: ReconstructionSettings | str) -> ReconstructionSettings:
 def for_anatomy(settings: ReconstructionSettings, anatomy: Anatomy) -> ReconstructionSettings:
     """The settings without what knows fetal brains alone, where the stacks show something else.
 
-    Without template, pose network and standard orientation the search starts from the stacks' headers, and V_sharp
-    stands for the prior volume.
+    Without template, pose network and standard orientation the search starts from the stacks' headers, and the
+    least-squares volume of the slices stands for V_prior.
 
     Args:
         settings: of a preset.
@@ -205,7 +206,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
         return replace(
             settings,
             held_out=None,  # a narrow profile and a smooth volume look alike
-            n_lattices=1,  # most of the volume is the prior
+            n_lattices=min(settings.n_lattices, 1),  # most of the volume is the prior
             pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
             slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
         )

@@ -27,9 +27,12 @@ from g3r.run.deadline import Deadline, LoopRecord
 
 logger = logging.getLogger(__name__)
 
-REGISTRATION_FROM_S = {"preview": 0.0, "fast": 22.0, "balanced": 40.0, "accurate": 120.0}
+REGISTRATION_FROM_S = {"preview": 0.0, "fast": 18.0, "balanced": 36.0, "accurate": 120.0}
 """Budget from which on registration searches as in a preset: about the whole command's own seconds on two
 cores, from one preset to the next."""
+
+PRIOR_FROM_S = 10.0
+"""Seconds left at the start from which on the prior network is used: the import of its libraries takes two of them."""
 
 REGISTRATION_SHARE = 0.5
 """Largest share of the remaining time that registration may take."""
@@ -63,6 +66,9 @@ VOLUME_AT_END = 0.15
 
 TOO_LITTLE, NO_FIT = 4.0, 2.2
 """With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first, or there is none."""
+
+QUICKEST_FIT = "fast"
+"""Preset whose fit is made where no other fits; the deadline ends it."""
 
 SHARE_STEPS = 18
 """Optimiser steps that take as long as one probe for the map of the prior share."""
@@ -104,6 +110,9 @@ class TimeBudget:
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
+        if seconds - spent_s < PRIOR_FROM_S:
+            least_mm = PRESETS["preview"].least_squares_voxel_mm
+            settings = replace(settings, use_prior=False, prior_views=0, least_squares_voxel_mm=least_mm)
         deadline = replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord())
         return cls(settings=settings, deadline=deadline, given_s=seconds)
 
@@ -137,7 +146,7 @@ class TimeBudget:
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
         pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
-        if self.deadline.remaining_s < WRITING_S + VOLUME_AT_END * coarse_s + view_s:
+        if not self.settings.use_prior or self.deadline.remaining_s < WRITING_S + VOLUME_AT_END * coarse_s + view_s:
             self.settings = replace(self.settings, use_prior=False, prior_views=0)
         self.choices |= {"prior_views": self.settings.prior_views, "pose_rounds": pose_rounds.two_stacks}
 
@@ -158,20 +167,19 @@ class TimeBudget:
         if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
             # timing a step would take the time of the steps themselves
             reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)
-            self.choices |= {"fit": "preview", "reserve_s": round(reserve_s, 2)}
+            self.choices |= {"fit": QUICKEST_FIT, "reserve_s": round(reserve_s, 2)}
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
-            return self._take("preview", PRESETS["preview"].share_probes, reserve_s)
-        spacing_mm = {name: preset.lattice.mm(volumes.slices) for name, preset in PRESETS.items()}
+            return self._take(QUICKEST_FIT, PRESETS[QUICKEST_FIT].share_probes, reserve_s)
+        spacing_mm = {name: preset.lattice.mm(volumes.slices) for name, preset in PRESETS.items() if preset.n_lattices}
         cloud = seed_cloud(prior.values, prior.support, volumes.grid, spacing_mm["fast"])
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
-        careful_first = [name for name in reversed(PRESETS) if name != "preview"]
-        for probes in (PRESETS["accurate"].share_probes, PRESETS["preview"].share_probes):
+        for probes in (PRESETS["accurate"].share_probes, PRESETS[QUICKEST_FIT].share_probes):
             reserve_s = after_s + (SHARE_STEPS * step_s * probes if settings.use_prior else 0.0)
             left = max(0.0, self.deadline.remaining_s - reserve_s)
             number = {name: (spacing_mm["fast"] / mm) ** 3 for name, mm in spacing_mm.items()}
-            fitting = (n for n in careful_first if STEPS_ENOUGH * fit_seconds(PRESETS[n], step_s, number[n]) <= left)
-            chosen = next(fitting, "preview")
-            if chosen != "preview":
+            needed_s = {name: STEPS_ENOUGH * fit_seconds(PRESETS[name], step_s, number[name]) for name in number}
+            chosen = next((name for name in reversed(needed_s) if needed_s[name] <= left), QUICKEST_FIT)
+            if needed_s[chosen] <= left:
                 break
         self.choices |= {
             "fit": chosen,

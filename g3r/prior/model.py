@@ -18,7 +18,8 @@ from g3r.checkpoints.plain_values import number, numbers
 from g3r.checkpoints.trained_model import TrainedModel
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling, estimate_prior
+from g3r.prior.inference import estimate_prior
+from g3r.prior.maps import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling
 
 VOXEL_MM_RANGE = (0.1, 10.0)
 VOXEL_MM_TOLERANCE = 1e-3

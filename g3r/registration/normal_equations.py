@@ -121,7 +121,7 @@ class SliceModel:
         return self.value - model.astype(np.float32)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=REORDERED)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=REORDERED)
 def _accumulate(
     flat, shape, start, uv, value, matrix, origin, node_mm, node_weight, gain, width, hessian, gradient, loss, moments
 ):

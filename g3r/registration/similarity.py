@@ -200,7 +200,7 @@ def mean_square_residual(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(yy - 2 * gain * ym + gain**2 * mm, 0.0) / np.maximum(n, 1.0)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=True)
 def _sums(flat, shape, point, value, start, linear, translation, out):
     """The sums m, mm and ym of `SearchPixels.moments`.
 

@@ -17,6 +17,7 @@ from g3r.acquisition.images import load_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError, cannot_be_written
 from g3r.output.files import FULL_WEIGHT, REPORT_NAME
+from g3r.output.map_colours import INFERNO
 from g3r.output.record import RunRecord
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MIN_HELD_OUT, RETRY_BELOW_CORRELATION
 from g3r.report.motion_chart import motion_chart
@@ -121,10 +122,7 @@ def _json(value: Any) -> str:
 
 def _colors() -> str:
     """The colours of maps, 256 of three bytes, as base64."""
-    from matplotlib import colormaps
-
-    table = colormaps["inferno"](np.arange(256), bytes=True)[:, :3]
-    return base64.b64encode(np.ascontiguousarray(table, dtype=np.uint8).tobytes()).decode("ascii")
+    return base64.b64encode(INFERNO.tobytes()).decode("ascii")
 
 
 def _sections(images: ViewerImages) -> list[tuple[str, str]]:

@@ -104,6 +104,9 @@ MESSAGES = {
         "there was no time for a fit: this is {what}, without uncertainty",
         "Run again with a longer --time-budget, or without one, before reading it.",
     ),
+    "preview": Message(
+        CHECK, "this is a preview: {what}, without uncertainty", "Run again with another --preset before reading it."
+    ),
     "warning": Message(CHECK, "{line}", ""),
     "all agree": Message(USE, "{n} of {n} stacks agree with each other ({agreement}; good is {good:g} and above)", ""),
     "all seen": Message(USE, "slices saw the whole {what}", ""),
@@ -194,8 +197,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if record.partial:
         yield "partial", {"where": str(record.stopped_at or "interrupted")}
     elif not record.settings.n_lattices:
-        kind = "the prior volume" if record.settings.use_prior else "a blurred volume of the slices"
-        yield "not fitted", {"what": kind}
+        kind = "the prior volume" if record.settings.use_prior else "a least-squares volume of the slices"
+        yield "not fitted" if record.time_budget else "preview", {"what": kind}
     said = {unseen, checked}
     for line in record.warnings:
         if line not in said and not _is_said_otherwise(line, record):

@@ -8,6 +8,7 @@ from pathlib import Path
 import psutil
 
 from g3r.errors import InputError
+from g3r.run.on_demand import threads_of_torch
 
 _STATUS = Path("/proc/self/status")
 
@@ -33,14 +34,13 @@ def use_threads(n_threads: int | None = None) -> int:
         InputError: more than numba was started with.
     """
     import numba
-    import torch
 
     offered = _offered_threads()
     wanted = n_threads or min(available_cores(), offered)
     if wanted > offered:
         raise InputError(f"--threads {wanted}: this machine offers {offered}; choose at most that")
     numba.set_num_threads(wanted)
-    torch.set_num_threads(wanted)
+    threads_of_torch(wanted)
     return wanted
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from g3r.run.atomic_file import atomic_path
+from g3r.run.on_demand import is_tensor, torch
 
 TREE = "tree"
 
@@ -86,7 +86,7 @@ def _packed(value: Any, arrays: Arrays, records: dict[str, type]) -> Any:
         return {"tuple": [_packed(one, arrays, records) for one in value]}
     if isinstance(value, dict):
         return {"dict": {str(key): _packed(one, arrays, records) for key, one in value.items()}}
-    if isinstance(value, np.ndarray | torch.Tensor):
+    if isinstance(value, np.ndarray) or is_tensor(value):
         name = f"array{len(arrays)}"
         kind = "array" if isinstance(value, np.ndarray) else "tensor"
         arrays[name] = _in_order(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy())

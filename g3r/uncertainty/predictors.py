@@ -7,7 +7,6 @@ same predictors.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_gradient_magnitude
 
@@ -19,6 +18,7 @@ from g3r.gaussians import render
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
+from g3r.run.on_demand import torch
 
 RESIDUAL_VOXEL_MM = 1.6
 RESIDUAL_SMOOTHING_MM = 1.6

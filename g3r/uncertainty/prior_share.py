@@ -10,7 +10,6 @@ prior's share.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -22,6 +21,7 @@ from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
+from g3r.run.on_demand import torch
 
 N_PROBES = 2
 PROBE_VOXEL_MM = 1.6

@@ -222,7 +222,7 @@ def template_and_printed(posed: Posed, reconstructor: GaussianReconstructor, mot
     """
     volumes = posed.volumes
     start = time.perf_counter()
-    placed = placed_template(reconstructor.prior, motion.orientation)
+    placed = placed_template(reconstructor.networks.prior, motion.orientation)
     if placed is not None:
         squares = least_squares_volume(volumes, posed.gain, posed.weight, posed.regularisers[1])
         template = placed.fitted(volumes.sharp, volumes.share, volumes.density, volumes.grid)

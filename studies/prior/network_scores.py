@@ -91,7 +91,7 @@ def inference_seconds(exported: Path) -> float:
     """Wall seconds of one view of a whole brain, the least of a few runs."""
     import numpy as np
 
-    from g3r.prior.inference import PriorMaps
+    from g3r.prior.maps import PriorMaps
     from g3r.prior.model import Prior
 
     prior = Prior.load(exported)

@@ -23,7 +23,7 @@ from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.evaluation.case import SimulatedCase
 from g3r.fitting.prior_volume import KNOWN_DENSITY
 from g3r.geometry import VolumeGrid
-from g3r.prior.inference import PriorMaps, Tiling
+from g3r.prior.maps import PriorMaps, Tiling
 from g3r.prior.model import Prior
 from g3r.prior.subject_template import PlacedTemplate
 

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import cg
 
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.prior_volume import placed_template, prior_volume
-from g3r.prior.inference import Tiling
+from g3r.prior.maps import Tiling
 from g3r.prior.model import Prior
 from g3r.registration import Registration
 
@@ -58,7 +58,7 @@ def filled_volumes(
     placed = placed_template(prior, poses.orientation)
     box_mm = placed.box_mm() if placed else None
     volumes = InitialVolumes.of(poses.slices, poses.gain, poses.weight, voxel_mm, box_mm)
-    whole = prior_volume(volumes, poses.gain, None, placed, n_views=1, tiling=Tiling())
+    whole = prior_volume(volumes, poses.gain, poses.weight, None, placed, n_views=1, tiling=Tiling())
     unknown = volumes.foreground.unseen.copy()
     for axis in range(3):
         edges = [slice(None)] * 3

@@ -43,8 +43,8 @@ def measured(case: SimulatedCase, options: argparse.Namespace, *, true_poses: bo
     result = reconstructor.reconstruct(case.stacks, poses)
     seconds = time.perf_counter() - start
     error = case.pose_error(result.slices)
-    assert reconstructor.prior is not None
-    fills, made_of = filled_volumes(poses, reconstructor.prior, reconstructor.prior.voxel_mm)
+    assert reconstructor.networks.prior is not None
+    fills, made_of = filled_volumes(poses, reconstructor.networks.prior, reconstructor.networks.prior.voxel_mm)
     volumes: dict[str, tuple[NDArray[np.float32], VolumeGrid]] = {
         **{name: (values, made_of.grid) for name, values in fills.items()},
         "V_prior": (result.prior, result.prior_grid),

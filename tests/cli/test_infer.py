@@ -291,9 +291,9 @@ def test_a_set_of_weights_is_named_once(
 
 def test_a_set_of_weights_by_its_name_in_python() -> None:
     reconstructor = GaussianReconstructor("cc0")
-    assert reconstructor.prior is not None
-    assert reconstructor.pose_model is not None
-    assert (reconstructor.prior.file_name, reconstructor.pose_model.file_name) == (
+    assert reconstructor.networks.prior is not None
+    assert reconstructor.networks.pose is not None
+    assert (reconstructor.networks.prior.file_name, reconstructor.networks.pose.file_name) == (
         "prior-cc0.safetensors",
         "pose-cc0.safetensors",
     )

@@ -17,7 +17,7 @@ from g3r.fitting.prior_volume import prior_volume
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import GaussianCloud, render
-from g3r.prior.inference import DEFAULT_TILING
+from g3r.prior.maps import DEFAULT_TILING
 from tests.fitting.scene import make_slices, true_cloud
 
 
@@ -28,7 +28,7 @@ def start(width: float) -> tuple[PriorVolume, GaussianCloud]:
     slices = replace(slices, value=render(true_cloud(), planes, cutoff_sigma=6.0).numpy())
     ones = np.ones(len(slices))
     volumes = InitialVolumes.of(slices, ones, ones, 1.0, common_bias_field=False)
-    prior = prior_volume(volumes, ones, None, None, n_views=1, tiling=DEFAULT_TILING)
+    prior = prior_volume(volumes, ones, ones, None, None, n_views=1, tiling=DEFAULT_TILING)
     return prior, cloud_of_prior(prior)
 
 

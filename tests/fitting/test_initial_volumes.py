@@ -14,7 +14,7 @@ from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.initial_volumes import CUT_OFF_MM, MARGIN_MM, InitialVolumes
 from g3r.fitting.prior_volume import placed_template, prior_volume
-from g3r.prior.inference import Tiling
+from g3r.prior.maps import Tiling
 from g3r.registration.atlas_frame import Orientation
 from tests.checkpoints.altered_files import small_prior
 
@@ -84,7 +84,7 @@ def test_the_grid_has_room_for_a_head_that_was_cut_off() -> None:
 
 def test_without_a_network_the_prior_volume_is_v_sharp_smoothly_continued(missing: InitialVolumes) -> None:
     gain = np.ones(len(missing.slices))
-    made = prior_volume(missing, gain, None, None, n_views=1, tiling=Tiling())
+    made = prior_volume(missing, gain, np.ones(len(gain)), None, None, n_views=1, tiling=Tiling())
     assert made.brain is None
     assert not made.has_template
     dense = missing.density > 0.5

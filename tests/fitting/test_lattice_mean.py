@@ -17,7 +17,7 @@ from g3r.fitting.slice_stage import SliceFit, SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import GaussianCloud, render
 from g3r.gaussians.seeding import seed_cloud
-from g3r.prior.inference import DEFAULT_TILING
+from g3r.prior.maps import DEFAULT_TILING
 from g3r.run.deadline import Deadline, LoopRecord
 from tests.fitting.scene import BALL, GRID, make_slices, true_volume
 
@@ -31,7 +31,7 @@ def prior() -> PriorVolume:
     slices = make_slices()
     ones = np.ones(len(slices))
     volumes = InitialVolumes.of(slices, ones, ones, 1.0, common_bias_field=False)
-    return prior_volume(volumes, ones, None, None, n_views=1, tiling=DEFAULT_TILING)
+    return prior_volume(volumes, ones, ones, None, None, n_views=1, tiling=DEFAULT_TILING)
 
 
 def fitted(prior: PriorVolume, n_lattices: int, **options: Any) -> SliceFit:

@@ -17,7 +17,7 @@ from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
 from g3r.geometry import RigidPose
 from g3r.planning.presets import PRESETS, adapted
-from g3r.prior.inference import DEFAULT_TILING
+from g3r.prior.maps import DEFAULT_TILING
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
 from tests.fitting.scene import make_slices
@@ -57,7 +57,7 @@ class PriorMaker:
     def __call__(self, poses: Registration, last: bool) -> PriorVolume:
         self.last.append(last)
         volumes = InitialVolumes.of(poses.slices, poses.gain, poses.weight, 1.0, common_bias_field=False)
-        return prior_volume(volumes, poses.gain, None, None, n_views=1, tiling=DEFAULT_TILING)
+        return prior_volume(volumes, poses.gain, poses.weight, None, None, n_views=1, tiling=DEFAULT_TILING)
 
 
 def run(start: Registration, n_rounds: int) -> tuple[RefinedPoses, PriorMaker]:

@@ -25,7 +25,7 @@ from g3r.planning.memory_size import gigabytes, parsed_size
 from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
-from g3r.prior.inference import Tiling
+from g3r.prior.maps import Tiling
 
 PREVIEW = replace(PRESETS["preview"], resolution_mm=1.5)
 PROCESS = 500_000_000
@@ -249,7 +249,7 @@ def test_a_time_budget_keeps_what_was_planned(slices: Slices) -> None:
     )
     ones = np.ones(len(slices))
     start = InitialVolumes.of(slices.scaled(1 / float(slices.masked_value.max())), ones, ones, 2.0)
-    prior = prior_volume(start, ones, None, None, n_views=1, tiling=Tiling())
+    prior = prior_volume(start, ones, ones, None, None, n_views=1, tiling=Tiling())
     budget = TimeBudget.of(planned, 30.0)
     budget.for_registration()
     budget.for_prior(0.1)

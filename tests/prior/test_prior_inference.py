@@ -9,8 +9,9 @@ from torch import nn
 from g3r.errors import NumericalError
 from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.dgpn import DensityGatedPriorNetwork
-from g3r.prior.inference import EstimatedPrior, PriorMaps, Tiling, estimate_prior
+from g3r.prior.inference import estimate_prior
 from g3r.prior.inputs import PriorInputs
+from g3r.prior.maps import EstimatedPrior, PriorMaps, Tiling
 from tests.prior.receptive_field import receptive_radius_voxels
 
 
