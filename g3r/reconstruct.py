@@ -23,7 +23,8 @@ from g3r.fitting.prior_targets import fit_to_prior
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE, SubjectPrior
-from g3r.output.assemble import StageResults, assemble
+from g3r.output.assemble import assemble
+from g3r.output.stage_results import StageResults
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
@@ -143,8 +144,7 @@ class GaussianReconstructor:
             progress: called with (rounds done, rounds in all).
             deadline: when the search has to end.
         """
-        settings = settings or self.settings.registration
-        proposals, template = {}, self.template
+        settings, template, proposals = settings or self.settings.registration, self.template, {}
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
         if self.pose_model is not None and settings.network and not spare:
             proposals["network"] = self.pose_model.predict(slices) @ slices.header_pose.inverse()
