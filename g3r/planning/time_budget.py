@@ -58,7 +58,7 @@ output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
-CORRECTION_OVER_COARSE = 0.6
+CORRECTION_OVER_COARSE = 0.8
 """Seconds of the correction on voxels over those of V_coarse and V_sharp."""
 
 VOLUME_AT_END = 0.15
