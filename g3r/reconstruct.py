@@ -22,7 +22,8 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.subject_prior import NOTE_ON_SINGLE
 from g3r.networks import Networks
-from g3r.output.assemble import StageResults, assemble
+from g3r.output.assemble import assemble
+from g3r.output.stage_results import StageResults
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
@@ -137,8 +138,7 @@ class GaussianReconstructor:
             progress: called with (rounds done, rounds in all).
             deadline: when the search has to end.
         """
-        settings = settings or self.settings.registration
-        proposals, template = {}, self.networks.template
+        settings, template, proposals = settings or self.settings.registration, self.networks.template, {}
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
         if settings.network and not spare and (proposed := self.networks.proposed_motion(slices)) is not None:
             proposals["network"] = proposed

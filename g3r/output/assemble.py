@@ -4,41 +4,33 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from g3r.acquisition.foreground import foreground
 from g3r.acquisition.slicing import by_headers
-from g3r.acquisition.stacks import Stack
 from g3r.errors import NumericalError
-from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.lattice_mean import mean_cloud
-from g3r.fitting.pose_rounds import PoseRounds
-from g3r.fitting.prior_stage import PriorCloud
-from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
-from g3r.fitting.volume_check import VolumeCheck, check_volume
-from g3r.gaussians import GaussianCloud
-from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
 from g3r.output.mixture import FinishedVolume, Mixture
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
+from g3r.output.stage_results import StageResults
+from g3r.output.written_volume import checked, corrected, least_weight, masks_on
 from g3r.planning.anatomy import FETAL_BRAIN, NAME_OF, NOTE_ON_OTHERS
 from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
-from g3r.registration import Registration
 from g3r.registration.quality import StackQuality, pose_warnings, registration_reliable, stack_qualities
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
 from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
+from g3r.uncertainty.estimate import prior_share_summary
 from g3r.uncertainty.prior_share import estimate_prior_share
 from g3r.uncertainty.unseen import UnseenPart
 
@@ -46,35 +38,6 @@ logger = logging.getLogger(__name__)
 
 PARTIAL_NOTE = "interrupted: the volume so far; no uncertainty and no share of the prior were estimated"
 UNFITTED_NOTE = "no fit was made: no uncertainty and no share of the prior were estimated"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageResults:
-    """Results of the stages of a run.
-
-    Attributes:
-        stacks: as they were given.
-        registration: poses of their slices.
-        prior: the prior volume and what it was made of.
-        intensity: intensity of 1 in the fit.
-        rounds: what rounds of poses and volume did; None where there was none.
-        held_out: what held-out slices chose; None where they were not asked.
-        cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
-            volume less well than that volume does.
-        fit: of the fit to the slices; None before it.
-        prior_record, pose_record: the networks' own; None where one is not used.
-    """
-
-    stacks: Sequence[Stack]
-    registration: Registration
-    prior: PriorVolume
-    rounds: PoseRounds | None
-    intensity: float
-    cloud: PriorCloud | None
-    held_out: HeldOutChoice | None
-    fit: SliceFit | None
-    prior_record: dict[str, Any] | None
-    pose_record: dict[str, Any] | None
 
 
 def assemble(found: StageResults, plan: Plan, run: RunContext) -> ReconstructionResult:
@@ -92,11 +55,11 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     qualities = stack_qualities(found.registration, len(found.stacks))
     run.warnings += pose_warnings(found.registration, qualities, found.stacks)
     grid = volumes.grid.respaced(settings.resolution_mm)
-    cloud = mean_cloud(fit := found.fit or _no_fit(found))
+    cloud = mean_cloud(fit := found.fit or found.no_fit())
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.timed(Stage.VOLUME) as tell:
-        mask, support = _masks_on(grid, found.prior, fit)
-        least = _prior_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
+        mask, support = masks_on(grid, found.prior, fit)
+        least = least_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
         mixture = Mixture(
             grid=grid,
             support=support,
@@ -110,10 +73,15 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         volume, left_to_prior, seen = mixture.volume(cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
         if not np.isfinite(volume).all():
             raise NumericalError("the volume holds values that are not finite; lower the step sizes")
-        check = _check(volume, mixture, found, fit) if settings.use_prior else None
+        check = checked(volume, mixture, found, fit) if settings.use_prior else None
         if check is not None and check.falls_back:
             mixture = replace(mixture, least_weight=1.0)
             volume, left_to_prior = mixture.volume(cloud, grid), mixture.left_to_prior(grid)
+        # errors are calibrated on what the fit gives; the correction takes a little of them away
+        mixed, correction = volume, corrected(volume, cloud, mixture, found, settings, run)
+        if correction is not None:
+            mixture = replace(mixture, correction=correction.values)
+            volume = mixture.corrected(mixed, grid)
         unseen = mask & ~seen
         unseen_part = UnseenPart.of(
             unseen,
@@ -147,7 +115,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         with run.timed(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(
                 UncertaintyInputs(
-                    volume=volume,
+                    volume=mixed,
                     mask=mask,
                     grid=grid,
                     fit=fit,
@@ -162,6 +130,9 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                 reliable=registration_reliable(qualities),
             )
         uncertainty, uncertainty_record = estimated.expected_error, estimated.record
+        if correction is not None and prior_share is not None:
+            prior_share = np.where(unseen, 1, prior_share * on_grid(correction.kept, volumes.grid, grid, outside=1.0))
+            uncertainty_record |= {"prior_share": prior_share_summary(prior_share[mask])}
     intensity = np.float32(found.intensity)
     if not settings.fill_unseen:
         volume, mask = volume * seen, mask & ~unseen
@@ -176,6 +147,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         coarse=volumes.coarse * intensity,
         density=volumes.density,
         prior_grid=volumes.grid,
+        correction=mixture.correction,
         cloud=cloud,
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
@@ -190,18 +162,9 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             unseen=unseen_part,
             prior_weight=mixture.least_weight,
             volume_check=check,
+            voxel_correction=correction.record if correction else None,
         ),
     )
-
-
-def _masks_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Brain mask and support on the output grid; on another than the prior's from the slices as the fit left them."""
-    if grid is prior.volumes.grid:
-        return prior.mask, prior.support
-    brain = prior.brain
-    likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
-    found = foreground(fit.slices, grid, fit.weight)
-    return found.mask(likely), found.support(likely)
 
 
 def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
@@ -220,38 +183,6 @@ def _extent_known(found: StageResults, settings: ReconstructionSettings) -> bool
         return True
     profiles = found.registration.profiles
     return found.prior.has_template or len(profiles) != 1 or not profiles[0].is_cut
-
-
-def _no_fit(found: StageResults) -> SliceFit:
-    """The slices as registration left them, and no Gaussians."""
-    cloud = GaussianCloud.empty()
-    slices, gain, weight = found.prior.volumes.slices, found.prior.gain, found.registration.weight
-    return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])
-
-
-def _prior_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:
-    """Least weight of V_prior in the volume; 0 without a prior, 1 where the fit had no time."""
-    if not settings.use_prior:
-        return 0.0
-    if settings.prior_weight > 0 and ended_early(n_steps := len(fit.history), settings.slice_stage.n_steps):
-        run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
-        return 1.0
-    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
-
-
-def _check(volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit) -> VolumeCheck:
-    """The volume beside those before the fit."""
-    before, grid, none = found.prior.volumes, mixture.grid, _no_fit(found).cloud
-    return check_volume(
-        volume,
-        mixture.volume(none, grid),
-        replace(mixture, prior=before.coarse).volume(none, grid),
-        support=mixture.support,
-        grid=grid,
-        slices=fit.slices,
-        slices_before=before.slices,
-        weight=fit.weight,
-    )
 
 
 def _record(

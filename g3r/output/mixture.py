@@ -1,4 +1,4 @@
-"""The written volume as a mixture of Gaussians and prior volume, on any grid."""
+"""The written volume as a mixture of Gaussians and prior volume, corrected on voxels, on any grid."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ INSIDE = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """What makes the written volume: V = [V_G + w (V_prior - V_G)] where it is shown, 0 elsewhere.
+    """What makes the written volume: V = [V_G + w (V_prior - V_G) + D] where it is shown, 0 elsewhere.
 
     V_G are the Gaussians, rendered. The weight w of V_prior is 1 where no slice looked and outside the support of the
-    Gaussians, and falls with the density to its least value. All intensities are those of the fit.
+    Gaussians, and falls with the density to its least value. D is what the slices say beyond both
+    (`fitting.voxel_correction`). All intensities are those of the fit.
 
     Attributes:
         grid: of `support`: that of the run's volume.
         support: [I, J, K] where Gaussians were fitted.
         prior: V_prior [I, J, K] on `prior_grid`.
         density: M_rho [I, J, K] on `prior_grid`.
-        prior_grid: of these two.
+        prior_grid: of these two and the correction.
         least_weight: of V_prior, where slices are dense.
         rim_mm: how far beyond the support V_prior is shown.
         cutoff_sigma: where a Gaussian ends.
+        correction: D [I, J, K] on `prior_grid`; None where there is none.
     """
 
     grid: VolumeGrid
@@ -48,6 +50,7 @@ class Mixture:
     least_weight: float
     rim_mm: float
     cutoff_sigma: float
+    correction: NDArray[np.float16] | None = None
 
     def density_on(self, grid: VolumeGrid) -> NDArray[np.float32]:
         """M_rho [I, J, K] on a grid; 0 where the prior's grid does not reach."""
@@ -69,7 +72,7 @@ class Mixture:
         """The volume [I, J, K] on a grid; the prior alone where the cloud is empty, before there is a fit.
 
         On the run's own grid this is the run's volume. On another one the Gaussians are evaluated at its points, and
-        V_prior, density, support and rim are interpolated from their grids.
+        V_prior, density, correction, support and rim are interpolated from their grids.
 
         Args:
             cloud: the Gaussians.
@@ -78,13 +81,28 @@ class Mixture:
         Raises:
             ValueError: a grid with sheared axes.
         """
-        shown = self._region(self.support | _margin(self.support, self.rim_mm, self.grid), grid)
+        shown = self._shown(grid)
         prior = on_grid(self.prior, self.prior_grid, grid, outside=0.0)
         if not len(cloud):
             return prior * shown
         weight = np.where(self._region(self.support, grid), self.left_to_prior(grid), 1)
         fitted = volume_from_pixels(render(cloud, volume_planes(grid), cutoff_sigma=self.cutoff_sigma).numpy(), grid)
-        return (fitted + weight * (prior - fitted)) * shown
+        return self.corrected((fitted + weight * (prior - fitted)) * shown, grid)
+
+    def corrected(self, mixed: NDArray[np.float32], grid: VolumeGrid) -> NDArray[np.float32]:
+        """The mixture of Gaussians and V_prior [I, J, K] on a grid, with the correction."""
+        if self.correction is None:
+            return mixed
+        return mixed + on_grid(self.correction, self.prior_grid, grid, outside=0.0) * self._shown(grid)
+
+    def reach(self) -> NDArray[np.float32]:
+        """Share [I, J, K] on `prior_grid` of a correction that counts: 0 where there are no Gaussians or no slices."""
+        left = np.exp(-UNSEEN_POWER * self.density)
+        return (self._region(self.support, self.prior_grid) * (1 - left)).astype(np.float32)
+
+    def _shown(self, grid: VolumeGrid) -> NDArray[np.bool_]:
+        """Where [I, J, K] of a grid there is a volume: the support and its rim."""
+        return self._region(self.support | _margin(self.support, self.rim_mm, self.grid), grid)
 
     def _region(self, inside: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.bool_]:
         """A region of the run's grid on another one."""

@@ -20,6 +20,7 @@ from g3r.errors import InputError
 from g3r.fitting.held_out_slices import HeldOutChoice
 from g3r.fitting.pose_rounds import PoseRounds
 from g3r.fitting.volume_check import VolumeCheck
+from g3r.fitting.voxel_correction import VoxelCorrectionRecord
 from g3r.output.stack_record import StackRecord, mean_motion
 from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
@@ -155,6 +156,7 @@ class RunRecord:
         held_out: what held-out slices chose; None where they were not asked.
         prior_weight: least weight of V_prior in the volume.
         volume_check: how well volume, V_prior and V_coarse explain the slices; None without V_prior.
+        voxel_correction: of the volume after that; None where there was none.
         gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
@@ -182,6 +184,7 @@ class RunRecord:
     held_out: HeldOutChoice | None = None
     prior_weight: float = 0.0
     volume_check: VolumeCheck | None = None
+    voxel_correction: VoxelCorrectionRecord | None = None
     gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)

@@ -48,6 +48,7 @@ class ReconstructionResult:
         unseen: [I, J, K] on `grid`, the part of the brain that no slice saw; inside the mask if it is shown at all.
         support: [I, J, K] on `grid`, where Gaussians were fitted.
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
+        correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None where there is none.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: in their last poses.
         gain, weight, ncc: [K] intensity factor, weight and correlation with the volume of each slice.
@@ -69,6 +70,7 @@ class ReconstructionResult:
     coarse: NDArray[np.float32]
     density: NDArray[np.float32]
     prior_grid: VolumeGrid
+    correction: NDArray[np.float16] | None = None
     cloud: GaussianCloud
     intensity_scale: float
     slices: Slices
@@ -190,6 +192,7 @@ class ReconstructionResult:
             grid=self.grid,
             support=self.support,
             prior_grid=self.prior_grid,
+            correction=self.correction,
             intensity_scale=self.intensity_scale,
             stacks=tuple(StackGrid.of(stack) for stack in self.stacks),
             slices=replace(self.slices, value=np.zeros_like(self.slices.value), view=None),

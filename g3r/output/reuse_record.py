@@ -48,12 +48,13 @@ class StackGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class ReuseRecord:
-    """Geometry of a result to the last digit, without pixels.
+    """Geometry of a result to the last digit, and the correction of its volume; without pixels.
 
     Attributes:
         grid: of the volume.
         support: [I, J, K] on it, where Gaussians were fitted.
-        prior_grid: of V_prior and density.
+        prior_grid: of V_prior, density and correction.
+        correction: [I, J, K] on `prior_grid`, see `Mixture`; None where there is none.
         intensity_scale: what an intensity of 1 in the fit is in the stacks.
         stacks: one per stack.
         slices: [K] in their last poses, with their masks and the PSF of the fit; all values are zero.
@@ -63,6 +64,7 @@ class ReuseRecord:
     grid: VolumeGrid
     support: NDArray[np.bool_]
     prior_grid: VolumeGrid
+    correction: NDArray[np.float16] | None = None
     intensity_scale: float
     stacks: tuple[StackGrid, ...]
     slices: Slices
@@ -103,6 +105,8 @@ class ReuseRecord:
             "weight": self.weight,
         }
         arrays |= {name: getattr(slices.planes, name) for name in PLANE_FIELDS}
+        if self.correction is not None:
+            arrays["correction"] = self.correction
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
         with atomic_path(path) as temporary:
@@ -141,10 +145,15 @@ def _record(data: dict[str, NDArray[Any]]) -> ReuseRecord:
     turned = zip(data["stack_slice_axis"], data["stack_flipped"], strict=True)
     axes = [FileAxes(int(axis), (bool(first), bool(second))) for axis, (first, second) in turned]
     stacks = zip(data["stack_shape"], data["stack_affine"], axes, strict=True)
+    prior_grid = _grid(data["prior_grid_shape"], data["prior_grid_affine"])
+    correction = data.get("correction")
+    if correction is not None and correction.shape != prior_grid.shape:
+        raise ValueError(f"a correction of {correction.shape} voxels; expected {prior_grid.shape}")
     return ReuseRecord(
         grid=grid,
         support=_bits(data["support"], math.prod(grid.shape)).reshape(grid.shape),
-        prior_grid=_grid(data["prior_grid_shape"], data["prior_grid_affine"]),
+        prior_grid=prior_grid,
+        correction=correction,
         intensity_scale=float(data["intensity_scale"]),
         stacks=tuple(StackGrid(_grid(shape, affine), one) for shape, affine, one in stacks),
         slices=slices,

@@ -106,6 +106,9 @@ def estimate_memory(
         Stage.FIT_TO_SLICES: volumes + cloud + max(fit, rim),
         Stage.VOLUME: outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
+    if settings.voxel_correction is not None:
+        correction = COARSE_PER_PIXEL * n_pixels + 4 * (CORRECTION_VOLUMES + buffers) * voxels
+        stages[Stage.VOLUME] = max(stages[Stage.VOLUME], outputs + correction)
     if settings.held_out is not None:
         stages[Stage.HELD_OUT] = stages[Stage.FIT_TO_SLICES]
     if settings.pose_rounds.n_rounds(slices.n_stacks):
@@ -133,6 +136,7 @@ MAPS_PER_VOXEL, TEMPLATE_FIT_PER_VOXEL = 44, 115
 CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL, RIM_VOLUMES = 12, 60, 8
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
+CORRECTION_VOLUMES = 16
 SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
 
 

@@ -13,6 +13,7 @@ from g3r.fitting.pose_rounds import PoseRoundSettings, RoundFit
 from g3r.fitting.prior_stage import PriorStageSettings
 from g3r.fitting.slice_stage import SliceStageSettings
 from g3r.fitting.slice_targets import SliceModel
+from g3r.fitting.voxel_correction import VoxelCorrectionSettings
 from g3r.planning.anatomy import FETAL_BRAIN, Anatomy
 from g3r.prior.maps import DEFAULT_TILING, Tiling
 from g3r.registration import RegistrationSettings
@@ -38,6 +39,8 @@ class ReconstructionSettings:
             least-squares volume of the slices.
         held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
+        voxel_correction: how the volume is corrected by what slices say and Gaussians cannot show; None leaves that
+            out, as a single stack does.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`. 0 leaves its network out.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
@@ -64,6 +67,7 @@ class ReconstructionSettings:
     n_lattices: int = 1
     held_out: HeldOutSettings | None = field(default_factory=HeldOutSettings)
     prior_weight: float = 0.3
+    voxel_correction: VoxelCorrectionSettings | None = field(default_factory=VoxelCorrectionSettings)
     prior_rim_mm: float = 0.8
     prior_views: int = 2
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
@@ -113,6 +117,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
         held_out=None,
         n_lattices=0,
+        voxel_correction=None,
         least_squares_voxel_mm=1.0,
         use_prior=False,
         prior_views=0,
@@ -137,6 +142,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         pose_rounds=PoseRoundSettings(two_stacks=4),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
+        voxel_correction=VoxelCorrectionSettings(hold=1.0),  # the mean of lattices leaves less to correct
     ),
 }
 """Settings by name, from quick to careful."""
@@ -207,6 +213,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
             settings,
             held_out=None,  # a narrow profile and a smooth volume look alike
             n_lattices=min(settings.n_lattices, 1),  # most of the volume is the prior
+            voxel_correction=None,
             pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
             slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
         )

@@ -32,6 +32,7 @@ _SPAWN_KEY = {
     Stage.PRIOR_SHARE: 4,
     Stage.HELD_OUT: 5,
     Stage.POSE_ROUNDS: 6,
+    Stage.VOLUME: 7,
 }
 
 

@@ -61,6 +61,9 @@ output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
+CORRECTION_OVER_COARSE = 0.8
+"""Seconds of the correction on voxels over those of V_coarse and V_sharp."""
+
 VOLUME_AT_END = 0.15
 """The same of a run without a fit, which has no maps of uncertainty."""
 
@@ -170,6 +173,8 @@ class TimeBudget:
             self.choices |= {"fit": QUICKEST_FIT, "reserve_s": round(reserve_s, 2)}
             logger.info("time budget: %.0f s left for the fit and the files", self.deadline.remaining_s)
             return self._take(QUICKEST_FIT, PRESETS[QUICKEST_FIT].share_probes, reserve_s)
+        if settings.voxel_correction is not None:
+            after_s += CORRECTION_OVER_COARSE * coarse_s
         spacing_mm = {name: preset.lattice.mm(volumes.slices) for name, preset in PRESETS.items() if preset.n_lattices}
         cloud = seed_cloud(prior.values, prior.support, volumes.grid, spacing_mm["fast"])
         step_s = timed_step(cloud, volumes.slices, np.random.default_rng(settings.seed))
@@ -206,6 +211,7 @@ class TimeBudget:
             held_out=None,  # three fits whose seconds nobody has timed
             n_lattices=PRESETS["accurate"].n_lattices,  # as many as time is left for
             share_probes=probes,
+            voxel_correction=settings.voxel_correction if preset.voxel_correction else None,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
         )

@@ -107,6 +107,7 @@ class FinishedRun:
             least_weight=self.record.prior_weight,
             rim_mm=settings.prior_rim_mm if settings.use_prior else 0.0,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
+            correction=found.correction,
         )
 
     def _map(self, name: str, grid: VolumeGrid) -> Volume:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
+from g3r.acquisition.total_variation import diffusivity, divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.slice_targets import SliceModel
@@ -59,11 +60,11 @@ def least_squares_volume(
     strength = np.float32(regulariser.strength * float(seen[seen > 0.1 * seen.max()].mean()))
     target = operator.adjoint(pixel_weight * value)
 
-    def solved(start: Array, diffusivity: Array | None) -> Array:
+    def solved(start: Array, edges: Array | None) -> Array:
         def normal(flat: NDArray[np.floating]) -> Array:
             volume = flat.reshape(grid.shape).astype(np.float32)
             data = operator.adjoint(pixel_weight * operator.forward(volume).astype(np.float32))
-            return (data + strength * divergence_of_gradient(volume, diffusivity)).ravel().astype(np.float32)
+            return (data + strength * divergence_of_gradient(volume, edges)).ravel().astype(np.float32)
 
         system = LinearOperator((target.size, target.size), matvec=normal, dtype=np.float32)
         found, _ = cg(system, target.ravel(), x0=start.ravel(), maxiter=regulariser.n_iterations, rtol=1e-4)
@@ -71,30 +72,8 @@ def least_squares_volume(
 
     volume = volumes.coarse
     for _ in range(regulariser.n_rounds):
-        volume = solved(volume, None if regulariser.tip is None else _diffusivity(volume, regulariser.tip))
+        volume = solved(volume, None if regulariser.tip is None else diffusivity(volume, regulariser.tip))
     return volume
-
-
-def _diffusivity(volume: Array, tip: float) -> Array:
-    """1 / (2 |grad V|) of total variation with a rounded tip [I, J, K]."""
-    squares = np.zeros_like(volume)
-    for axis in range(3):
-        squares += np.diff(volume, axis=axis, append=np.take(volume, [-1], axis)) ** 2
-    return (0.5 / np.sqrt(squares + np.float32(tip) ** 2)).astype(np.float32)
-
-
-def divergence_of_gradient(volume: Array, diffusivity: Array | None) -> Array:
-    """D^T W D V with forward differences D, free edges, and the weights W [I, J, K] of voxels (None: 1)."""
-    out = np.zeros_like(volume)
-    for axis in range(3):
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        flow = np.diff(volume, axis=axis)
-        if diffusivity is not None:
-            flow = flow * diffusivity[tuple(low)]
-        out[tuple(low)] -= flow
-        out[tuple(high)] += flow
-    return out
 
 
 TIKHONOV = Regulariser(strength=0.03, n_iterations=25)

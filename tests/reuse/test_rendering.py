@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -36,6 +37,17 @@ def test_so_it_is_without_a_prior_and_with_blank_unseen_parts(subject: Path, tmp
     assert largest_difference(tmp_path / "run") < 1e-6
     with pytest.raises(InputError, match="standard orientation is not known"):
         target_grid(FinishedRun.load(tmp_path / "run"), space="standard")
+
+
+def test_so_it_is_with_a_correction(subject: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    reconstruct(subject, out, "--preset", "fast", "--resolution", "1.2")
+    run = FinishedRun.load(out)
+    assert run.record.voxel_correction is not None
+    assert run.record.voxel_correction.size > 0
+    assert largest_difference(out) < 1e-6
+    without = replace(run.mixture, correction=None).volume(run.cloud, run.geometry.grid)
+    assert not np.allclose(without * run.geometry.intensity_scale, read(out / "volume.nii.gz"), rtol=1e-3)
 
 
 def test_a_finer_grid_holds_the_same_head(finished: Path, run: FinishedRun, tmp_path: Path) -> None:

@@ -1,0 +1,82 @@
+"""How the written volume comes about: masks, the weight of V_prior, the check by the slices, the correction by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.foreground import foreground
+from g3r.fitting.initial_volumes import PriorVolume
+from g3r.fitting.prior_weight import ended_early, prior_weight
+from g3r.fitting.slice_stage import SliceFit
+from g3r.fitting.slice_targets import slice_target
+from g3r.fitting.volume_check import VolumeCheck, check_volume
+from g3r.fitting.voxel_correction import VoxelCorrection, correct_on_voxels, too_fine
+from g3r.gaussians import GaussianCloud
+from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import on_grid
+from g3r.output.mixture import Mixture
+from g3r.output.stage_results import StageResults
+from g3r.planning.presets import ReconstructionSettings, adapted
+from g3r.planning.stages import Stage, stage_rng
+from g3r.run.context import RunContext
+
+
+def masks_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Brain mask and support on the output grid; on another than the prior's from the slices as the fit left them."""
+    if grid is prior.volumes.grid:
+        return prior.mask, prior.support
+    brain = prior.brain
+    likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
+    found = foreground(fit.slices, grid, fit.weight)
+    return found.mask(likely), found.support(likely)
+
+
+def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:
+    """Least weight of V_prior in the volume; 0 without a prior, 1 where the fit had no time."""
+    if not settings.use_prior:
+        return 0.0
+    if settings.prior_weight > 0 and ended_early(n_steps := len(fit.history), settings.slice_stage.n_steps):
+        run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
+        return 1.0
+    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
+
+
+def checked(volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit) -> VolumeCheck:
+    """The volume beside those before the fit."""
+    before, grid, none = found.prior.volumes, mixture.grid, found.no_fit().cloud
+    return check_volume(
+        volume,
+        mixture.volume(none, grid),
+        replace(mixture, prior=before.coarse).volume(none, grid),
+        support=mixture.support,
+        grid=grid,
+        slices=fit.slices,
+        slices_before=before.slices,
+        weight=fit.weight,
+    )
+
+
+def corrected(
+    volume: NDArray[np.float32],
+    cloud: GaussianCloud,
+    mixture: Mixture,
+    found: StageResults,
+    settings: ReconstructionSettings,
+    run: RunContext,
+) -> VoxelCorrection | None:
+    """The correction of a volume with Gaussians; None where none is asked or can be made, or the run was stopped."""
+    fit, prior = found.fit, found.prior
+    asked = adapted(settings, prior.volumes.slices.n_stacks).voxel_correction
+    if asked is None or fit is None or run.stopped_at is not None or mixture.least_weight == 1:
+        return None
+    if too_fine(mixture.prior_grid, fit.slices):
+        return None
+    widths = found.held_out.widths if found.held_out else None
+    target = slice_target(prior, found.registration.weight, settings.slice_model, widths)
+    here = volume if mixture.grid is mixture.prior_grid else mixture.volume(cloud, mixture.prior_grid)
+    rng = stage_rng(settings.seed, Stage.VOLUME)
+    reach = mixture.reach()
+    return correct_on_voxels(here, fit, target.pixel_weight, mixture.prior_grid, reach, asked, rng)
