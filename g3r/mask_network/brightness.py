@@ -11,12 +11,14 @@ from g3r.geometry.grid import bounding_box
 Image = NDArray[np.float32]
 Array = NDArray[np.floating]
 
-NOISE_MM, SHADING_MM = 2.0, 15.0
-"""Standard deviations in the plane: detail is what lies between noise and the shading of coils."""
+NOISE_MM, COARSE_MM = 2.0, 6.0
+"""Standard deviations in the plane: detail is what lies between noise, and shading and large parts."""
 SKIN_MM = 5.0
 """Outermost part of a section that does not count: its edge is no detail."""
-MIN_INNER_MM2 = 1000.0
-"""Less than this, summed over the slices, does not tell."""
+MIN_INNER_MM2 = 200.0
+"""Sections of which less is left are not judged."""
+MIN_SECTIONS = 3
+"""Fewer do not tell."""
 EVEN_MM = 25.0
 """Standard deviation of the smoothing in the plane that evens brightness: less than a head, more than its parts."""
 DARKEST_SHARE = 0.1
@@ -24,7 +26,7 @@ DARKEST_SHARE = 0.1
 
 
 def detail_inside(image: Image, mask: NDArray[np.bool_], spacing_mm: Array) -> float:
-    """Standard deviation of what is finer than shading and coarser than noise, as a share of the mean brightness.
+    """How much detail most sections of a mask show: standard deviation of what is neither noise nor coarse.
 
     Args:
         image: [I, J, K] stack in any units, slices along the last axis.
@@ -32,7 +34,7 @@ def detail_inside(image: Image, mask: NDArray[np.bool_], spacing_mm: Array) -> f
         spacing_mm: [3].
 
     Returns:
-        NaN where the mask is too small to tell.
+        Median over the sections, as a share of the brightness about each pixel; NaN where too few are large enough.
     """
     if not mask.any():
         return float("nan")
@@ -41,13 +43,14 @@ def detail_inside(image: Image, mask: NDArray[np.bool_], spacing_mm: Array) -> f
     # a margin of one pixel that is no mask, also where the field of view ends
     within = np.pad(mask[box], [(1, 1), (1, 1), (0, 0)])
     values = np.pad(image[box], [(1, 1), (1, 1), (0, 0)]) * within
-    inner = np.stack(
-        [distance_transform_edt(within[:, :, k], sampling=spacing[:2]) > SKIN_MM for k in range(within.shape[2])], 2
-    )
-    if inner.sum() * spacing[0] * spacing[1] < MIN_INNER_MM2:
-        return float("nan")
-    fine, coarse = (_mean_within(values, within, mm, spacing)[inner] for mm in (NOISE_MM, SHADING_MM))
-    return float(np.sqrt(np.mean((fine - coarse) ** 2)) / max(float(coarse.mean()), 1e-12))
+    fine, coarse = (_mean_within(values, within, mm, spacing) for mm in (NOISE_MM, COARSE_MM))
+    detail = []
+    for k in range(within.shape[2]):
+        inner = distance_transform_edt(within[:, :, k], sampling=spacing[:2]) > SKIN_MM
+        if inner.sum() * spacing[0] * spacing[1] >= MIN_INNER_MM2:
+            around = np.maximum(coarse[:, :, k][inner], 1e-12)
+            detail.append(float(np.std((fine[:, :, k][inner] - around) / around)))
+    return float(np.median(detail)) if len(detail) >= MIN_SECTIONS else float("nan")
 
 
 def evened(image: Image, spacing_mm: Array) -> Image:
