@@ -91,7 +91,7 @@ def test_beyond_a_stack_that_ends_within_the_brain_there_is_no_hollow_skull(subj
     n = stack.image.shape[2] // 2
     mask = stack.mask.copy()
     mask[:, :, n:] = False
-    cut = replace(case, stacks=[replace(stack, mask=mask, image=stack.image * mask), *case.stacks[1:]])
+    cut = replace(case, stacks=(replace(stack, mask=mask, image=stack.image * mask), *case.stacks[1:]))
     whole, ends = (surrounded(one, seed=1)[0].image[:, :, SLICES_BEYOND:] for one in (case, cut))
     assert whole[:, :, n].any()
     assert ends[:, :, n - 1].any()
