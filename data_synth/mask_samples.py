@@ -60,6 +60,7 @@ def draw_sample(
     wide_shape: tuple[int, int, int],
     pixel_mm: float,
     crop_shape: tuple[int, int, int],
+    wrap_share: float = WRAP_SHARE,
 ) -> MaskSample:
     """A sample of a scan.
 
@@ -70,11 +71,12 @@ def draw_sample(
         wide_shape: its pixels and slices; a random part of a larger scan.
         pixel_mm: of the crop.
         crop_shape: pixels and slices of the crop.
+        wrap_share: of wide images in which what is beyond the field of view folds into it.
     """
     wide_image, wide_mask = _wide(scan, rng, wide_mm, wide_shape)
     image, mask = _crop(scan, rng, pixel_mm, crop_shape)
     return MaskSample(
-        wide_image=with_artefacts(wide_image, rng, wrap=True, max_noise=WIDE_NOISE),
+        wide_image=with_artefacts(wide_image, rng, wrap_share, WIDE_NOISE),
         wide_mask=wide_mask,
         image=with_artefacts(image, rng),
         mask=mask,
@@ -143,16 +145,18 @@ def _transform() -> tio.Compose:
     )
 
 
-def with_artefacts(image: Image, rng: np.random.Generator, wrap: bool = False, max_noise: float = MAX_NOISE) -> Image:
+def with_artefacts(
+    image: Image, rng: np.random.Generator, wrap_share: float = 0.0, max_noise: float = MAX_NOISE
+) -> Image:
     """A stack with a bias field, ghosts, motion blur, Rician noise and another gamma, by torchio and MONAI.
 
     Args:
         image: [I, J, K], the brain's brightest about 1.
         rng: source of randomness.
-        wrap: whether what is beyond the field of view may fold into it.
+        wrap_share: how often what is beyond the field of view folds into it.
         max_noise: largest standard deviation of the noise.
     """
-    if wrap and rng.random() < WRAP_SHARE:
+    if wrap_share and rng.random() < wrap_share:
         axis = int(rng.integers(2))
         image = image + np.float32(rng.uniform(0.2, 0.8)) * np.roll(image, image.shape[axis] // 2, axis)
     tensor = torch.from_numpy(np.ascontiguousarray(image))[None]
@@ -177,4 +181,4 @@ def full_stack(scan: Scan, pixel_mm: float, rng: np.random.Generator) -> tuple[I
     shape = tuple(int(mm / pixel_mm) for mm in scan.fov_mm)
     first = -(np.array(shape) - 1) / 2 * pixel_mm
     image, inside = scan.images((float(first[0]), float(first[1])), pixel_mm, (shape[0], shape[1]))
-    return with_artefacts(image, rng, wrap=True), inside > 0.5
+    return with_artefacts(image, rng, WRAP_SHARE), inside > 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ NEGATIVE_SHARE = 0.2
 PLANNED_SHARE = 0.65
 CUT_SHARE = 0.2
 """Scans whose slices do not cover the head."""
+VIEW_CUT_SHARE = 0.08
+"""Scans whose field of view cuts the head."""
 DROPOUT_SHARE = 0.03
 BREATH_MM = 0.7
 """Standard deviation of the mother's own movement from slice to slice."""
@@ -129,13 +132,22 @@ class Scan:
         return image, inside
 
 
-def draw_scan(scene: Scene, rng: np.random.Generator, negative: bool | None = None) -> Scan:
+def draw_scan(
+    scene: Scene,
+    rng: np.random.Generator,
+    negative: bool | None = None,
+    *,
+    view_cut_share: float = VIEW_CUT_SHARE,
+    level_share: Mapping[str, float] = LEVEL_SHARE,
+) -> Scan:
     """A scan of a scene.
 
     Args:
         scene: to be scanned.
         rng: source of randomness.
         negative: True for one that shows no head; None draws it.
+        view_cut_share: see `VIEW_CUT_SHARE`.
+        level_share: of the levels of motion, one in all.
     """
     if negative is None:
         negative = bool(rng.random() < NEGATIVE_SHARE)
@@ -160,14 +172,14 @@ def draw_scan(scene: Scene, rng: np.random.Generator, negative: bool | None = No
     fov = rng.uniform(220, 400, 2)
     room = np.maximum(fov / 2 - radius, 10)
     offset: Array = rng.uniform(-0.85, 0.85, 2) * np.minimum(room, 90)
-    if rng.random() < 0.08:  # the field of view cuts the head
+    if rng.random() < view_cut_share:
         axis = int(rng.integers(2))
         offset[axis] = np.sign(offset[axis]) * (fov[axis] / 2 - radius * rng.uniform(-0.2, 0.8))
     centre = np.append(offset, 0.0)
     # the slices' origins: the middle of the field of view at each depth; the head's centre is the scan's origin
     at = np.stack([np.full(len(depth), -offset[0]), np.full(len(depth), -offset[1]), depth], axis=1)
     header = RigidPose(np.broadcast_to(rotation, (len(depth), 3, 3)), at @ rotation.T)
-    level = LEVELS[str(rng.choice(list(LEVEL_SHARE), p=list(LEVEL_SHARE.values())))]
+    level = LEVELS[str(rng.choice(list(level_share), p=list(level_share.values())))]
     motion = slice_trajectory(len(depth), level, np.zeros(3), int(rng.integers(1, 4)), rng)
     breath = RigidPose.from_rotvec(np.zeros((len(depth), 3)), rng.normal(0, BREATH_MM, (len(depth), 3)))
     log_gain = rng.normal(0, rng.uniform(0, 0.08), len(depth))

@@ -17,6 +17,9 @@ LARGEST_RADIUS = 1.2
 """In radii of the ellipsoid that has the moments of what was found: a brain is no further from its middle."""
 MIN_VOXELS = 50
 """Fewer do not tell an ellipsoid."""
+CLEFT_MM = 10.0
+"""Half the width of clefts in a section that are filled: people bridge the gap between the lobes, and so do the heads
+that the network learns from."""
 RIM_MM = 3.5
 """How far outside the brain the outline is drawn, as people draw it, beyond the skull."""
 
@@ -95,6 +98,25 @@ def without_doubtful_ends(mask: NDArray[np.bool_], probability: NDArray[np.float
     result = np.zeros_like(mask)
     if likely:
         result[:, :, likely[0] : likely[-1] + 1] = mask[:, :, likely[0] : likely[-1] + 1]
+    return result
+
+
+def without_clefts(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """A mask whose sections are closed by a disc of `CLEFT_MM`.
+
+    Args:
+        mask: [I, J, K].
+        spacing_mm: [3].
+    """
+    result = mask.copy()
+    room = np.ceil(CLEFT_MM / spacing_mm[:2]).astype(int) + 1
+    for k in np.flatnonzero(mask.any((0, 1))):
+        box = bounding_box(mask[:, :, k])
+        # the disc needs its room beyond the field of view, too: what is not seen there is no border
+        section = np.pad(mask[:, :, k][box], [(n, n) for n in room])
+        wide = distance_transform_edt(~section, sampling=spacing_mm[:2]) <= CLEFT_MM
+        closed = distance_transform_edt(wide, sampling=spacing_mm[:2]) > CLEFT_MM
+        result[:, :, k][box] |= closed[room[0] : -room[0], room[1] : -room[1]]
     return result
 
 

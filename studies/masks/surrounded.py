@@ -26,6 +26,9 @@ SLICES_BEYOND = 4
 
 N_THROUGH = 3
 
+MAX_UNSEEN_MM2 = 100.0
+"""Of a slice without a pixel of the case's own, that lies in the brain: beyond it the scene would be a hollow skull."""
+
 
 def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
     """The stacks of a case in a larger field of view, with everything around the brain, and their true masks.
@@ -80,6 +83,8 @@ def _in_scene(
 ) -> Stack:
     """One stack: the case's own pixels where they show brain, the scene around them.
 
+    Slices beyond those of the case that would show brain are black: nothing is known of what they would show.
+
     Args:
         case: that it belongs to.
         number: of the stack.
@@ -101,7 +106,7 @@ def _in_scene(
     scan_pose = origin @ moved.take(np.full(n_slices, n_slices // 2)) @ header
     pixel_mm = float(stack.spacing_mm[0])
     first = -(np.array(stack.image.shape[:2]) - 1) / 2 * pixel_mm
-    outside, _ = image_slices(
+    outside, brain = image_slices(
         shells,
         np.linalg.inv(head.affine),
         head_pose,
@@ -114,6 +119,8 @@ def _in_scene(
         thickness_mm=stack.thickness_mm,
         n_through=N_THROUGH,
     )
+    unseen = (brain.sum((0, 1)) * pixel_mm**2 > MAX_UNSEEN_MM2) & ~stack.mask.any((0, 1))
+    outside[:, :, unseen] = 0
     bright = float(np.percentile(stack.image[stack.mask], 99.5))
     return replace(stack, image=stack.image + np.float32(bright) * outside)
 

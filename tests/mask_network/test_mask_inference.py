@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import N_PLACES, find_brain, likely_places
+from g3r.mask_network.inference import N_PLACES, WIDE_FLIPS, find_brain, likely_places
 from g3r.mask_network.mask_shape import as_people_draw
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork
@@ -30,15 +30,33 @@ def stub() -> Any:
     return SimpleNamespace(network=BrightIsBrain())
 
 
+class BlindAtFirst(BrightIsBrain):
+    """Sees nothing in the first look at the whole stack."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[torch.Tensor] = []
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        self.seen.append(image)
+        return super().forward(image) if len(self.seen) > len(WIDE_FLIPS) else torch.full_like(image, -20.0)
+
+
 def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
     at = np.stack(np.meshgrid(*(np.arange(n) * mm for n, mm in zip(shape, SPACING_MM, strict=True)), indexing="ij"), -1)
     return np.linalg.norm(at - np.array(centre_mm), axis=-1) < radius_mm
 
 
+def folded(inside: np.ndarray) -> np.ndarray:
+    """Something with as much detail as a brain, all of it bright."""
+    wave = np.sin(np.arange(len(inside)) * SPACING_MM[0] * 2 * np.pi / 20)[:, None, None]
+    return (inside * (1 + 0.3 * wave)).astype(np.float32)
+
+
 @pytest.mark.parametrize("centre", [(90.0, 70.0, 40.0), (35.0, 120.0, 50.0), (20.0, 90.0, 8.0)])
 def test_a_ball_is_outlined_where_it_is(stub: Any, centre: tuple[float, float, float]) -> None:
     true = ball((160, 140, 25), centre, 32.0)
-    found = find_brain(true.astype(np.float32), SPACING_MM, stub)
+    found = find_brain(folded(true), SPACING_MM, stub)
     assert found.found
     middle = np.argwhere(true).mean(0) * SPACING_MM
     true = as_people_draw(true, np.array(SPACING_MM))
@@ -51,9 +69,34 @@ def test_a_ball_is_outlined_where_it_is(stub: Any, centre: tuple[float, float, f
 
 def test_the_largest_of_two_is_taken(stub: Any) -> None:
     large, small = ball((160, 140, 25), (60.0, 60.0, 40.0), 28.0), ball((160, 140, 25), (140.0, 140.0, 40.0), 16.0)
-    found = find_brain((large | small).astype(np.float32), SPACING_MM, stub)
+    found = find_brain(folded(large | small), SPACING_MM, stub)
     assert (found.mask & large).sum() > 0.9 * large.sum()
     assert not (found.mask & small).any()
+
+
+def test_a_ball_without_folds_is_no_head(stub: Any) -> None:
+    even, head = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0), ball((160, 140, 25), (140.0, 140.0, 40.0), 20.0)
+    found = find_brain(even.astype(np.float32), SPACING_MM, stub)
+    assert not found.found
+    assert "even" in found.reason
+    # where there is something with folds, it is that, though it is smaller
+    found = find_brain(even + folded(head), SPACING_MM, stub)
+    assert (found.mask & head).sum() > 0.9 * head.sum()
+    assert not (found.mask & even).any()
+
+
+def test_where_nothing_is_seen_a_second_look_has_even_brightness() -> None:
+    head, bright = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0), ball((160, 140, 25), (170.0, 170.0, 40.0), 25.0)
+    image = (0.8 * folded(head) + 8 * bright).astype(np.float32)
+    network = BlindAtFirst()
+    found = find_brain(image, SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
+    assert (found.mask & head).sum() > 0.9 * head.sum()
+    first, second = network.seen[0], network.seen[len(WIDE_FLIPS)]
+    assert first.shape == second.shape
+    middle = [round(mm / 2.4) for mm in (60.0, 60.0)], [round(mm / 2.4) for mm in (170.0, 170.0)]
+    (own, other), (own_even, other_even) = ([one[0, 0, i, j, 11] for i, j in middle] for one in (first, second))
+    assert other / own > 5
+    assert other_even / own_even < 2
 
 
 def test_too_little_is_no_head(stub: Any) -> None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.mask_network.mask_shape import RIM_MM, as_people_draw, cleaned, without_doubtful_ends, without_outgrowths
+from g3r.mask_network.mask_shape import (
+    RIM_MM,
+    as_people_draw,
+    cleaned,
+    without_clefts,
+    without_doubtful_ends,
+    without_outgrowths,
+)
 
 SPACING_MM = np.array([0.8, 1.1, 3.0])
 
@@ -71,3 +78,16 @@ def test_doubtful_sections_at_the_ends_go_and_those_between_stay() -> None:
     assert np.flatnonzero(kept.any((0, 1))).tolist() == [3, 4, 5, 6]
     np.testing.assert_array_equal(kept[:, :, 3:7], mask[:, :, 3:7])
     assert not without_doubtful_ends(mask, probability * 0.5).any()
+
+
+@pytest.mark.parametrize("at_edge", [False, True])
+def test_clefts_of_a_section_are_filled_and_wide_bays_stay(at_edge: bool) -> None:
+    whole = np.zeros((100, 90, 4), bool)
+    whole[0 if at_edge else 10 : 90, 10:80, 1:3] = True
+    cleft, bay = whole.copy(), whole.copy()
+    cleft[45:50, 10:50, 1] = False  # 4 mm wide
+    bay[20:80, 10:60, 1] = False  # 48 mm
+    assert (without_clefts(cleft, SPACING_MM) ^ whole).sum() < 10  # the disc leaves a dent at the mouth
+    filled = without_clefts(bay, SPACING_MM) & ~bay
+    assert filled.sum() < 0.1 * (whole & ~bay).sum()  # the disc does not reach into its corners
+    np.testing.assert_array_equal(without_clefts(whole, SPACING_MM), whole)

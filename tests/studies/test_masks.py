@@ -83,3 +83,16 @@ def test_stacks_in_surroundings_keep_their_brain_in_its_place(subject: Path) -> 
     still, before = case.pose_error(moved), case.header_error()
     assert still.median_mm == pytest.approx(before.median_mm, abs=0.05)
     assert max(still.per_slice_mm.values()) == pytest.approx(max(before.per_slice_mm.values()), abs=0.1)
+
+
+def test_beyond_a_stack_that_ends_within_the_brain_there_is_no_hollow_skull(subject: Path) -> None:
+    case = load_case(subject)
+    stack = case.stacks[0]
+    n = stack.image.shape[2] // 2
+    mask = stack.mask.copy()
+    mask[:, :, n:] = False
+    cut = replace(case, stacks=(replace(stack, mask=mask, image=stack.image * mask), *case.stacks[1:]))
+    whole, ends = (surrounded(one, seed=1)[0].image[:, :, SLICES_BEYOND:] for one in (case, cut))
+    assert whole[:, :, n].any()
+    assert ends[:, :, n - 1].any()
+    assert not ends[:, :, n].any()
