@@ -10,16 +10,16 @@ from pathlib import Path
 
 from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, WRITING
 
-BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.7, PREPARING: 3.5}
+BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.3, PREPARING: 0.4}
 """Seconds of three stacks on two cores, before the first stage that a run keeps."""
 
 AFTER_S = {"volume": 0.2, "prior share": 1.5, "uncertainty": 0.6, WRITING: 1.2}
 
 EXPECTED_S = {
-    "preview": {"registration": 2.5, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 0.9, "fit to slices": 1.7},
-    "fast": {"registration": 2.7, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 1.0, "fit to slices": 3.2},
+    "preview": {"registration": 3.5, "coarse volume": 1.0, "prior": 0.7},
+    "fast": {"registration": 4.0, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 1.0, "fit to slices": 3.2},
     "balanced": {
-        "registration": 6.0,
+        "registration": 7.0,
         "coarse volume": 1.4,
         "prior": 1.6,
         "poses in rounds": 8.0,
@@ -28,7 +28,7 @@ EXPECTED_S = {
         "fit to slices": 4.0,
     },
     "accurate": {
-        "registration": 6.0,
+        "registration": 7.0,
         "coarse volume": 1.4,
         "prior": 1.6,
         "poses in rounds": 12.0,
@@ -55,6 +55,7 @@ MASK_S = 8.0
 """For the network to find the brain in one stack."""
 
 ONLY_WITH_PRIOR = ("prior share",)
+ONLY_WITH_FIT = ("prior share", "uncertainty")
 
 STEADY_S = 5.0
 """Seconds that the expectation counts for against what was measured."""
@@ -92,6 +93,8 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     if options.dry_run:
         return before
     stages = before | EXPECTED_S["balanced" if options.time_budget else options.preset] | AFTER_S
+    if options.preset == "preview" and not options.time_budget:
+        stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_FIT}
     if options.no_prior:
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_PRIOR}
     if compiling:

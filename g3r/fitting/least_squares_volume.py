@@ -12,8 +12,9 @@ from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.surroundings import without_surroundings
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.slice_targets import SliceModel
 
-SMOOTHNESS_MM2 = 0.02
+SMOOTHNESS_MM2 = 0.03
 """Weight of squared gradients over that of the pixels, chosen on two simulated heads."""
 
 N_ITERATIONS = 8
@@ -25,7 +26,8 @@ def least_squares_volume(
 ) -> NDArray[np.float32]:
     """Minimise sum_p w_p (A V - y)_p^2 + s ||grad V||^2, with what lies beside the brain taken out of the pixels.
 
-    Voxels beyond the brain are free: what the profile of a pixel at the rim reaches there is taken for brain.
+    Slices have the profile of the fit. Voxels beyond the brain are free: what the profile of a pixel at the rim reaches
+    there is taken for brain.
 
     Args:
         volumes: of the slices in their poses; V_sharp is the start.
@@ -36,7 +38,8 @@ def least_squares_volume(
         [I, J, K] on the grid of the volumes.
     """
     grid, support = volumes.grid, volumes.foreground.support()
-    slices, share = without_surroundings(volumes.slices, support, grid, gain, weight)
+    modelled = SliceModel().applied(volumes.slices)
+    slices, share = without_surroundings(modelled, support, grid, gain, weight)
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     return solve_volume(
         operator,

@@ -101,10 +101,14 @@ def estimate_memory(
         stages[Stage.PRIOR] = volumes + max(network, TEMPLATE_FIT_PER_VOXEL * voxels)
     fit = projections + FIT_PER_PIXEL * n_pixels + TARGET_PER_VOXEL * voxels
     rim = COARSE_PER_PIXEL * n_pixels + 4 * (RIM_VOLUMES + buffers) * voxels
+    stages[Stage.VOLUME] = outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output
+    stages[Stage.WRITING] = outputs + WRITING_PER_VOXEL * output
+    if not settings.n_lattices:
+        stages[Stage.PRIOR] = max(stages.get(Stage.PRIOR, 0), volumes + rim)  # by least squares
+        return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
     stages |= {
         Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
         Stage.FIT_TO_SLICES: volumes + cloud + max(fit, rim),
-        Stage.VOLUME: outputs + MASK_PER_PIXEL * n_pixels + 4 * (MASK_VOLUMES + buffers) * output,
     }
     if settings.voxel_correction is not None:
         correction = COARSE_PER_PIXEL * n_pixels + 4 * (CORRECTION_VOLUMES + buffers) * voxels
@@ -118,7 +122,6 @@ def estimate_memory(
     if settings.use_prior:
         stages[Stage.PRIOR_SHARE] = outputs + projections + SHARE_PER_PIXEL * n_pixels + SHARE_PER_VOXEL * output
     stages[Stage.UNCERTAINTY] = outputs + SHARE_PER_PIXEL * n_pixels + PREDICTORS_PER_VOXEL * output
-    stages[Stage.WRITING] = outputs + WRITING_PER_VOXEL * output
     return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
 
 
@@ -148,7 +151,8 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
         settings: of the reconstruction.
         prior_voxel_mm: voxel size of the prior; that of the output when None.
     """
-    voxel_mm = prior_voxel_mm if settings.use_prior and prior_voxel_mm else settings.resolution_mm
+    own_voxel_mm = max(settings.resolution_mm, settings.least_squares_voxel_mm)
+    voxel_mm = prior_voxel_mm if settings.use_prior and prior_voxel_mm else own_voxel_mm
     grid = grid_around(slices, voxel_mm, MARGIN_MM)
     n_voxels = GRID_SLACK * math.prod(grid.shape)
     spacing_mm = settings.lattice.mm(slices)

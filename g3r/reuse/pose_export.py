@@ -61,7 +61,10 @@ def write_slice_folders(folder: Path, run: FinishedRun, measured: Slices | None)
     """
     slices = run.geometry.slices
     if not len(run.cloud):
-        raise InputError(f"{run.folder}: holds no Gaussians, the run was interrupted; finish it with --resume")
+        raise InputError(
+            f"{run.folder}: holds no Gaussians: no fit was made, or it was interrupted; run with --preset fast or "
+            "better, or finish it with --resume"
+        )
     parts = {"simulated": replace(slices, value=simulated_slices(run))}
     if measured is not None:
         parts["slices"] = measured

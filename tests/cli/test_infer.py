@@ -23,10 +23,11 @@ from g3r.evaluation.pose_error import read_poses, slice_points, target_registrat
 from g3r.gaussians import GaussianCloud
 from g3r.output.files import FULL_WEIGHT, MASK_NAMES, OUTPUT_NAMES, SLICE_COLUMNS
 from g3r.output.result import ReconstructionResult
-from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.planning.presets import ReconstructionSettings
 from tests.faults.small_case import BY_COMMAND, WHOLE
+from tests.quick import QUICK_FIT
 
-QUICK = ("--preset", "preview", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
+QUICK = ("--preset", "fast", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 
 
 def run(command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -121,7 +122,7 @@ def test_the_record_is_json_without_paths(subject: Path, reconstructed: Path) ->
     assert [stack["name"] for stack in record["stacks"]] == [path.name for path in files(subject, "stack")]
     assert all(seconds >= 0 for seconds in record["seconds"].values())
     assert record["peak_memory_bytes"] > 1e7
-    assert record["command"]["preset"] == "preview"
+    assert record["command"]["preset"] == "fast"
     for key in ("versions", "warnings", "notes", "loss", "inactive_terms", "registration"):
         assert key in record
     assert record["registration"]["reliable"] is True
@@ -158,13 +159,12 @@ def test_an_earlier_result_is_kept_unless_forced(subject: Path, reconstructed: P
 
 def quick_settings() -> ReconstructionSettings:
     """Without the prior and with a short registration and fit."""
-    preview = PRESETS["preview"]
     return replace(
-        preview,
+        QUICK_FIT,
         resolution_mm=1.5,
         use_prior=False,
-        registration=replace(preview.registration, n_rounds=2),
-        slice_stage=replace(preview.slice_stage, n_steps=5),
+        registration=replace(QUICK_FIT.registration, n_rounds=2),
+        slice_stage=replace(QUICK_FIT.slice_stage, n_steps=5),
     )
 
 

@@ -14,8 +14,8 @@ import pytest
 
 from g3r import GaussianReconstructor, load_stack
 from g3r.acquisition.images import load_volume, save_volume
-from g3r.planning.presets import PRESETS
 from g3r.uncertainty.unseen import MENTIONED_ABOVE
+from tests.quick import QUICK_FIT
 
 N_MISSING = 4
 
@@ -39,7 +39,7 @@ def stack(subject: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 def test_blank_leaves_zeros_and_says_so(stack: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "g3r.cli.infer", "--stacks", stack[0], "--masks", stack[1], "--output", out]
-    command += ["--preset", "preview", "--resolution", "2", "--no-prior", "--thickness", "4", "--threads", "1"]
+    command += ["--preset", "fast", "--resolution", "2", "--no-prior", "--thickness", "4", "--threads", "1"]
     done = subprocess.run([*map(str, command), "--unseen", "blank"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     volume, mask, unseen, error = (
@@ -62,13 +62,12 @@ def test_blank_leaves_zeros_and_says_so(stack: tuple[Path, Path], tmp_path: Path
 
 
 def test_filled_the_unseen_part_is_brain_and_not_blank(stack: tuple[Path, Path], subject: Path) -> None:
-    preview = PRESETS["preview"]
     settings = replace(
-        preview,
+        QUICK_FIT,
         resolution_mm=2.0,
         use_prior=False,
-        registration=replace(preview.registration, n_rounds=0, template=False, network=False),
-        slice_stage=replace(preview.slice_stage, n_steps=3),
+        registration=replace(QUICK_FIT.registration, n_rounds=0, template=False, network=False),
+        slice_stage=replace(QUICK_FIT.slice_stage, n_steps=3),
     )
     reconstructor = GaussianReconstructor(settings=settings)
     result = reconstructor.reconstruct([load_stack(*stack, 4.0)])

@@ -15,9 +15,10 @@ from typing import Any
 from g3r.cli.infer import main as infer
 from g3r.output.record import CommandRecord, Inputs, RunRecord
 from g3r.output.stack_record import StackRecord
-from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.planning.presets import ReconstructionSettings
 from g3r.run.provenance import FileHash
 from tests.phantoms import simulate_small_subject
+from tests.quick import QUICK_FIT
 
 FOLDER = Path(__file__).parent
 
@@ -77,9 +78,8 @@ class SmallCase:
 
 def quick_settings() -> ReconstructionSettings:
     """Settings of a run of about a second."""
-    preview = PRESETS["preview"]
     registration = replace(
-        preview.registration,
+        QUICK_FIT.registration,
         template=False,
         network=False,
         stacks=False,
@@ -87,7 +87,7 @@ def quick_settings() -> ReconstructionSettings:
         n_rounds=1,
         standard_orientation=False,
     )  # a fraction of a second; the poses do not matter here
-    return replace(preview, registration=registration, resolution_mm=2.0, use_prior=False)
+    return replace(QUICK_FIT, registration=registration, resolution_mm=2.0, use_prior=False)
 
 
 def make_small_case(folder: Path) -> SmallCase:

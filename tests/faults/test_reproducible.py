@@ -20,7 +20,7 @@ from tests.faults.small_case import SmallCase
 from tests.tally import Tally
 
 SAME = ("volume.nii.gz", "mask.nii.gz", "uncertainty.nii.gz", "gaussians.npz", "slices.tsv", "sections.png")
-QUICK = ("--preset", "preview", "--resolution", "2", "--thickness", "4")
+QUICK = ("--preset", "fast", "--resolution", "2", "--thickness", "4")
 
 
 def same_files(one: Path, other: Path) -> bool:
@@ -113,7 +113,7 @@ def test_other_inputs_are_told_and_noted(
 @pytest.mark.parametrize(
     "options",
     [
-        ["--preset", "preview"],
+        ["--preset", "fast"],
         ["--seed", "0"],
         ["--no-prior"],
         ["--resolution", "1"],

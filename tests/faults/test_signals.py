@@ -17,7 +17,7 @@ from g3r.planning.presets import PRESETS
 from tests.faults.small_case import WHOLE, SmallCase, names
 from tests.tally import Tally
 
-N_STEPS = PRESETS["preview"].slice_stage.n_steps
+N_STEPS = PRESETS["fast"].slice_stage.n_steps
 
 
 @pytest.fixture

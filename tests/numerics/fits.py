@@ -19,17 +19,17 @@ from g3r.gaussians import render
 from g3r.gaussians.seeding import seed_cloud
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.output.result import ReconstructionResult
-from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration.settings import RegistrationSettings
 from tests.numerics.scenes import ORIGIN_MM, head_scene, single, stacks_of_planes
+from tests.quick import QUICK_FIT
 
 HEAD_RADIUS_MM = 10.0
 NOISE = 0.02
 SCANNER_UNITS = 700.0
 
 SETTINGS = replace(
-    PRESETS["preview"],
+    QUICK_FIT,
     gaussian_spacing_pixels=2.0,
     registration=RegistrationSettings(
         template=False, network=False, stacks=False, segments=False, n_rounds=2, standard_orientation=False

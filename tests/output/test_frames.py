@@ -16,7 +16,7 @@ from g3r.registration.atlas_frame import motion_to_headers
 from tests.cli.test_infer import files, inputs
 from tests.output.test_inactive_terms import slices_of
 
-QUICK = ("--preset", "preview", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
+QUICK = ("--preset", "fast", "--resolution", "1.5", "--no-prior", "--thickness", "4", "--threads", "1", "--quiet")
 CODES = {"standard": 2, "scanner": 1}
 
 

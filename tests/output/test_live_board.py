@@ -20,8 +20,8 @@ from tests.faults.small_case import SmallCase, make_small_case
 
 pytest.importorskip("tensorboard")
 
-N_STEPS = PRESETS["preview"].slice_stage.n_steps
-N_PRIOR_STEPS = PRESETS["preview"].prior_stage.n_steps
+N_STEPS = PRESETS["fast"].slice_stage.n_steps
+N_PRIOR_STEPS = PRESETS["fast"].prior_stage.n_steps
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,9 @@ from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
 from g3r.prior.maps import Tiling
+from tests.quick import QUICK_FIT
 
-PREVIEW = replace(PRESETS["preview"], resolution_mm=1.5)
+PREVIEW = replace(QUICK_FIT, resolution_mm=1.5)
 PROCESS = 500_000_000
 MB = 1_000_000
 
@@ -58,7 +59,7 @@ def arguments(subject: Path, output: Path, *more: str) -> list[str]:
     ]
 
 
-QUIETLY = ("--preset", "preview", "--threads", "1", "--quiet")
+QUIETLY = ("--preset", "fast", "--threads", "1", "--quiet")
 
 
 @pytest.fixture(scope="module")
@@ -169,8 +170,8 @@ def test_a_dry_run_states_it(subject: Path, tmp_path: Path, capsys: pytest.Captu
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "of memory" in line]
         return line
 
-    assert stated("--preset", "preview").startswith("needs about 1.")
-    assert "most of it in uncertainty" in stated("--preset", "preview", "--resolution", "0.3")
+    assert stated("--preset", "fast").startswith("needs about 1.")
+    assert "most of it in uncertainty" in stated("--preset", "fast", "--resolution", "0.3")
     # memory for a time budget is planned for the most that it may take
     fine = ("--resolution", "0.3", "--no-prior")
     assert stated("--time-budget", "5", *fine) == stated("--preset", "accurate", *fine)

@@ -29,6 +29,6 @@ def finished(planted_stacks: list[Path], tmp_path_factory: pytest.TempPathFactor
     """What g3r-infer wrote of them, in a folder with a space in its name."""
     folder = tmp_path_factory.mktemp("results") / "one run"
     masks = [path.with_name(path.name.replace("stack", "mask")) for path in planted_stacks]
-    line = ["--stacks", *planted_stacks, "--masks", *masks, "--preset", "preview", "--no-prior", "--resolution", "3"]
+    line = ["--stacks", *planted_stacks, "--masks", *masks, "--preset", "fast", "--no-prior", "--resolution", "3"]
     assert main([*map(str, line), "--threads", "1", "--quiet", "--output", str(folder)]) == 0
     return folder

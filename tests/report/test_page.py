@@ -139,7 +139,7 @@ def test_a_report_that_fails_costs_no_volume(
 
     monkeypatch.setattr(page, "write_report", fails)
     masks = [path.with_name(path.name.replace("stack", "mask")) for path in planted_stacks]
-    line = ["--stacks", *planted_stacks, "--masks", *masks, "--preset", "preview", "--no-prior", "--resolution", "3"]
+    line = ["--stacks", *planted_stacks, "--masks", *masks, "--preset", "fast", "--no-prior", "--resolution", "3"]
     assert infer.main([*map(str, line), "--threads", "1", "--quiet", "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "volume.nii.gz").is_file()
     assert not (tmp_path / "out" / "report.html").exists()

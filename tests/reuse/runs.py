@@ -15,7 +15,7 @@ from g3r.evaluation.pose_error import read_poses, slice_points, target_registrat
 from g3r.geometry import RigidPose, VolumeGrid
 from tests.cli.test_infer import files, inputs
 
-QUICK = ("--preset", "preview", "--thickness", "4", "--threads", "1", "--quiet")
+QUICK = ("--preset", "fast", "--thickness", "4", "--threads", "1", "--quiet")
 
 
 def reconstruct(subject: Path, folder: Path, *further: str) -> None:

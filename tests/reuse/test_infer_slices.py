@@ -54,7 +54,7 @@ def moved(exported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def again(moved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of a run of the moved slices, like `finished` in all else."""
     folder = tmp_path_factory.mktemp("again") / "out"
-    options = ("--preset", "preview", "--resolution", "1.2", "--threads", "1", "--quiet")
+    options = ("--preset", "fast", "--resolution", "1.2", "--threads", "1", "--quiet")
     assert main(["--slices", str(moved), *options, "--output", str(folder)]) == 0
     return folder
 
