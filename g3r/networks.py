@@ -17,6 +17,7 @@ from g3r.fitting.subject_prior import SubjectPrior
 from g3r.geometry import RigidPose
 from g3r.planning.presets import ReconstructionSettings
 from g3r.pose_network.stored_template import stored_template
+from g3r.run.lean_import import lean
 
 if TYPE_CHECKING:
     from g3r.pose_network.model import PoseModel
@@ -72,6 +73,7 @@ class Networks:
             network=prior,
             voxel_mm=prior.voxel_mm if prior else own_voxel_mm,
             common_bias_field=settings.common_bias_field,
+            least_squares=settings.least_squares_voxel_mm > 0,
         )
 
     @property
@@ -93,14 +95,16 @@ class Networks:
         return prior, pose
 
     def _load_prior(self, file: WeightsFile) -> Prior:
-        from g3r.prior.model import Prior
+        with lean():
+            from g3r.prior.model import Prior
 
         model = Prior.load(file)
         model.network.to(self.device)
         return model
 
     def _load_pose(self, file: WeightsFile) -> PoseModel:
-        from g3r.pose_network.model import PoseModel
+        with lean():
+            from g3r.pose_network.model import PoseModel
 
         model = PoseModel.load(file)
         model.network.to(self.device)

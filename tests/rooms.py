@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "fitting": "geometry run acquisition gaussians registration prior",
     "uncertainty": "geometry run acquisition gaussians fitting",
     "planning": "run acquisition gaussians prior registration fitting",
-    "networks": "geometry acquisition checkpoints prior pose_network fitting planning",
+    "networks": "geometry run acquisition checkpoints prior pose_network fitting planning",
     "output": "geometry run acquisition gaussians registration fitting uncertainty planning",
     "reuse": "geometry acquisition gaussians registration output",
     "report": "geometry run acquisition registration planning output reuse",

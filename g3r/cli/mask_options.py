@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from g3r.errors import InputError
 from g3r.planning.anatomy import FETAL_BRAIN
+from g3r.run.lean_import import lean
 
 if TYPE_CHECKING:
     from g3r.checkpoints.weights_file import WeightsFile
@@ -145,7 +146,8 @@ def masker_of(options: argparse.Namespace, weights: WeightsFile | None) -> Maske
 
     @functools.cache
     def network() -> AutomaticMask:  # torch takes seconds, and most runs have masks
-        from g3r.mask_network.model import MaskModel
+        with lean():
+            from g3r.mask_network.model import MaskModel
         from g3r.masking.automatic import AutomaticMask
         from g3r.run.machine import use_threads
 

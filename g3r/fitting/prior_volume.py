@@ -38,6 +38,7 @@ def prior_volume(
     *,
     n_views: int,
     tiling: Tiling,
+    least_squares: bool = False,
 ) -> PriorVolume:
     """V_prior (G3R Eq. 7) and the brain mask, in which the unseen part of the head is what its shape suggests.
 
@@ -45,19 +46,21 @@ def prior_volume(
         volumes: what the slices give by themselves.
         gain: [K] of the slices.
         weight: [K] of the slices.
-        prior: None takes the least-squares volume, smoothly continued into what was not seen.
+        prior: None takes V_sharp, smoothly continued into what was not seen.
         placed: its atlas template; None where there is none, and the smooth continuation takes its place.
         n_views: see `estimate_prior`.
         tiling: see `estimate_prior`.
+        least_squares: takes the least-squares volume for V_sharp where there is no prior: no fit will follow.
     """
-    share = volumes.share
+    share, seen = volumes.share, volumes.foreground
     if placed is not None:
         fitted = placed.fitted(volumes.sharp, share, volumes.density, volumes.grid)
         guess, outline = fitted.values, fitted.inside
     else:
-        seen = volumes.sharp if prior is not None else least_squares_volume(volumes, gain, weight)
-        guess = smooth_fill(seen, np.clip(volumes.density / KNOWN_DENSITY, 0, 1), share)
-        outline = volumes.foreground.mask().astype(np.float32)
+        mask, support = seen.mask(), seen.support()
+        known = least_squares_volume(volumes, support, gain, weight) if least_squares else volumes.sharp
+        guess = smooth_fill(known, np.clip(volumes.density / KNOWN_DENSITY, 0, 1), share)
+        outline = mask.astype(np.float32)
     values, brain = guess, None
     if prior is not None:
         maps = PriorMaps(
@@ -70,12 +73,14 @@ def prior_volume(
         )
         found = prior.estimate(maps, n_views=n_views, tiling=tiling)
         values, brain = found.volume, found.brain
+    if prior is not None or placed is not None:
+        mask, support = seen.mask(brain), seen.support(brain)
     return PriorVolume(
         volumes=volumes,
         values=values,
         brain=brain,
-        mask=volumes.foreground.mask(brain),
-        support=volumes.foreground.support(brain),
+        mask=mask,
+        support=support,
         has_template=placed is not None,
         gain=gain,
         scale=volumes.scale,

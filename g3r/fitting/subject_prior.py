@@ -34,14 +34,16 @@ class SubjectPrior:
     """Makes the volumes of a subject from its slices, as often as these move.
 
     Args:
-        network: None takes the least-squares volume of the slices, smoothly continued, for V_prior.
+        network: None takes V_sharp, smoothly continued, for V_prior.
         voxel_mm: of the volumes.
         common_bias_field: whether the bias field that stacks share is divided out.
+        least_squares: takes the least-squares volume for V_sharp where there is no network.
     """
 
     network: Prior | None
     voxel_mm: float
     common_bias_field: bool = True
+    least_squares: bool = False
 
     def refined_masks(self, stacks: Sequence[Stack], poses: Registration, intensity: float) -> RefinedMasks:
         """Masks that were found, refined with the network's atlas template; see `refine_masks`.
@@ -68,7 +70,16 @@ class SubjectPrior:
         """
         network = self.network if n_views else None
         placed = placed_template(network, poses.orientation)
-        found = prior_volume(volumes, poses.gain, poses.weight, network, placed, n_views=n_views, tiling=tiling)
+        found = prior_volume(
+            volumes,
+            poses.gain,
+            poses.weight,
+            network,
+            placed,
+            n_views=n_views,
+            tiling=tiling,
+            least_squares=self.least_squares and placed is None and network is None,
+        )
         release_memory()  # the most that is ever freed at a time
         return found
 

@@ -17,7 +17,7 @@ from g3r.fitting.voxel_correction import VoxelCorrection, correct_on_voxels, too
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
-from g3r.output.mixture import Mixture
+from g3r.output.mixture import INSIDE, Mixture
 from g3r.output.stage_results import StageResults
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
@@ -28,6 +28,13 @@ def masks_on(grid: VolumeGrid, prior: PriorVolume, fit: SliceFit) -> tuple[NDArr
     """Brain mask and support on the output grid; on another than the prior's from the slices as the fit left them."""
     if grid is prior.volumes.grid:
         return prior.mask, prior.support
+    if not len(fit.cloud):
+        # as registration left the slices: what they say on the prior's grid holds on this one
+        mask, support = (
+            on_grid(one.astype(np.float32), prior.volumes.grid, grid, outside=0.0) >= INSIDE
+            for one in (prior.mask, prior.support)
+        )
+        return mask, support
     brain = prior.brain
     likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
     found = foreground(fit.slices, grid, fit.weight)

@@ -8,6 +8,7 @@ studies.tradeoff.memory`, docs/tradeoff.md): they are on the safe side, and cove
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 from g3r.acquisition.area_profile import head_volume_mm3
@@ -80,7 +81,7 @@ def estimate_memory(
         at_once: with `release_memory_eagerly`.
     """
     sizes = sizes_of(slices, settings, prior_voxel_mm)
-    start = held_bytes() if process_bytes is None else process_bytes
+    start = held_bytes() + _libraries_to_come(settings) if process_bytes is None else process_bytes
     buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
     base = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
@@ -140,7 +141,15 @@ CLOUD_PER_GAUSSIAN, PAIR_INDEX_BYTES = 500, 8
 TARGET_PER_VOXEL, FIT_PER_PIXEL, RIM_VOLUMES = 12, 60, 8
 OUTPUTS_PER_VOXEL, MASK_PER_PIXEL, MASK_VOLUMES = 12, 60, 5
 CORRECTION_VOLUMES = 16
+TORCH_BYTES, MONAI_BYTES = 195_000_000, 126_000_000  # the second without `lean_import`
 SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 18, 70, 26
+
+
+def _libraries_to_come(settings: ReconstructionSettings) -> int:
+    """What the libraries will hold that are imported on demand."""
+    torch = TORCH_BYTES if settings.n_lattices and "torch" not in sys.modules else 0
+    monai = MONAI_BYTES if settings.use_prior and "monai" not in sys.modules else 0
+    return torch + monai
 
 
 def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: float | None = None) -> ProblemSizes:

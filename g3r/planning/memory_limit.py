@@ -89,12 +89,13 @@ def plan_memory(
     Raises:
         InputError: nothing that may be given up brings it below the limit.
     """
-    start = held_bytes() if process_bytes is None else process_bytes
 
     def estimate(of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
-        return estimate_memory(slices, of, n_threads, start, prior_voxel_mm=prior_voxel_mm, at_once=at_once)
+        return estimate_memory(slices, of, n_threads, process_bytes, prior_voxel_mm=prior_voxel_mm, at_once=at_once)
 
-    sizes = sizes_of(slices, settings, prior_voxel_mm)
+    def sizes() -> ProblemSizes:
+        return sizes_of(slices, settings, prior_voxel_mm)
+
     plan = _lowered(sizes, settings, limit_bytes, estimate)
     needed = plan.estimate
     if limit_bytes is not None and needed.peak > limit_bytes:
@@ -155,7 +156,7 @@ class Estimator(Protocol):
 
 
 def _lowered(
-    sizes: ProblemSizes, settings: ReconstructionSettings, limit: int | None, estimate: Estimator
+    sizes: Callable[[], ProblemSizes], settings: ReconstructionSettings, limit: int | None, estimate: Estimator
 ) -> MemoryPlan:
     """Settings changed until they need no more than the limit, or nothing is left to change."""
     found = estimate(settings)
@@ -167,7 +168,7 @@ def _lowered(
         changes.append("memory limit: freed memory is given back at once (slower)")
     stages = estimate(settings, at_once).stages
     with_projections = max(stages.get(name, 0) for name in STAGES_WITH_PROJECTIONS)
-    less = _fewer_projections(settings, sizes, with_projections - limit)
+    less = _fewer_projections(settings, sizes(), with_projections - limit)
     if less is not settings:
         kept = less.slice_stage.projection_bytes
         changes.append(f"memory limit: projections kept in {kept / 1e6:.0f} MB, others computed again (slower)")

@@ -46,9 +46,9 @@ class ReconstructionSettings:
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
         share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
-        least_squares_voxel_mm: least voxel size of the volumes before the fit where no network prescribes one; their
-            noise grows as voxels shrink.
-        use_prior: False takes the least-squares volume of the slices for V_prior and leaves distillation out.
+        least_squares_voxel_mm: without a network and a fit, the least-squares volume is written, with voxels of at
+            least this size, since its noise grows as they shrink; 0 takes V_sharp.
+        use_prior: False seeds from V_sharp and leaves distillation out.
         distillation: False uses the prior for the start alone.
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
@@ -127,6 +127,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         _BALANCED,
         pose_rounds=PoseRoundSettings(two_stacks=1, more_stacks=0),
         held_out=None,
+        voxel_correction=None,
         prior_views=1,
         share_probes=1,
         registration=replace(_QUICK_SEARCH, n_rounds=5, finest_voxel_mm=1.4, max_pixels=200_000),
@@ -185,8 +186,8 @@ def settings_of(given: ReconstructionSettings | str) -> ReconstructionSettings:
 def for_anatomy(settings: ReconstructionSettings, anatomy: Anatomy) -> ReconstructionSettings:
     """The settings without what knows fetal brains alone, where the stacks show something else.
 
-    Without template, pose network and standard orientation the search starts from the stacks' headers, and the
-    least-squares volume of the slices stands for V_prior.
+    Without template, pose network and standard orientation the search starts from the stacks' headers, and V_sharp
+    stands for the prior volume.
 
     Args:
         settings: of a preset.

@@ -18,7 +18,7 @@ import pytest
 from tests.bids.data_sets import add_session
 from tests.cli.test_infer import files
 
-QUICK = ("--", "--preset", "preview", "--resolution", "1.5", "--no-prior", "--thickness", "4")
+QUICK = ("--", "--preset", "fast", "--resolution", "1.5", "--no-prior", "--thickness", "4")
 
 XFM = "from-scanner_to-standard_mode-image_xfm.txt"
 

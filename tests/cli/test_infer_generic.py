@@ -37,7 +37,7 @@ def pose_error_mm(case: Path, output: Path) -> float:
 def test_an_object_is_reconstructed_without_networks(tmp_path: Path) -> None:
     case = simulated(tmp_path / "case", 3, "--resolution", "1.6", "--thickness", "4", "--motion", "mild")
     output = tmp_path / "out"
-    assert run(case, output, "--thickness", "4", "--preset", "preview", "--resolution", "2", "--threads", "1") == 0
+    assert run(case, output, "--thickness", "4", "--preset", "fast", "--resolution", "2", "--threads", "1") == 0
     record = RunRecord.read(output / "run.json")
     assert record.settings.anatomy == "generic"
     assert record.inputs is not None

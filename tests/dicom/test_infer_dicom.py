@@ -58,7 +58,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def written(examination: Examination, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the result (`out`), the volume as DICOM (`series`) and what was said (`said.txt`)."""
     folder = tmp_path_factory.mktemp("written")
-    options = ["--preset", "preview", "--no-prior", "--resolution", "3", "--threads", "1", "--space", "scanner"]
+    options = ["--preset", "fast", "--no-prior", "--resolution", "3", "--threads", "1", "--space", "scanner"]
     masks = ["--mask-command", mask_command(examination, folder)]
     outputs = ["--output", folder / "out", "--dicom-out", folder / "series"]
     done = run("infer", "--dicom", examination.dicom, *masks, *options, *outputs)

@@ -13,11 +13,11 @@ import pytest
 from g3r.acquisition.images import load_volume
 from g3r.cli.terminal import Terminal
 from g3r.gaussians import GaussianCloud
-from g3r.planning.presets import PRESETS
 from tests.faults.small_case import WHOLE, SmallCase, names
+from tests.quick import QUICK_FIT
 from tests.tally import Tally
 
-N_STEPS = PRESETS["fast"].slice_stage.n_steps
+N_STEPS = QUICK_FIT.slice_stage.n_steps
 
 
 @pytest.fixture

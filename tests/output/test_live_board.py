@@ -15,13 +15,13 @@ import pytest
 from g3r.cli.infer import main
 from g3r.fitting.observer import FitMoment
 from g3r.geometry import VolumeGrid
-from g3r.planning.presets import PRESETS
 from tests.faults.small_case import SmallCase, make_small_case
+from tests.quick import QUICK_FIT
 
 pytest.importorskip("tensorboard")
 
-N_STEPS = PRESETS["fast"].slice_stage.n_steps
-N_PRIOR_STEPS = PRESETS["fast"].prior_stage.n_steps
+N_STEPS = QUICK_FIT.slice_stage.n_steps
+N_PRIOR_STEPS = QUICK_FIT.prior_stage.n_steps
 
 
 @pytest.fixture(scope="module")
