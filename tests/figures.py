@@ -20,7 +20,6 @@ README, DOCS = REPOSITORY / "README.md", REPOSITORY / "docs"
 PEERS, PAPER, TRADEOFF = DOCS / "peers.md", DOCS / "paper.md", DOCS / "tradeoff.md"
 
 WHAT = {
-    "`preview`": "least squares, no network, no maps: for the minutes between two stacks",
     "`fast`": "a shorter registration, one fit",
     "`balanced`": "a round of poses and volume, two for two stacks; measured slice profiles",
     "`accurate`": "the mean of six fits; four rounds for two stacks",
@@ -50,7 +49,7 @@ def marked(path: Path, marker: str) -> Rows:
 
 def subjects() -> Rows:
     """The subjects that no setting was chosen on, with three stacks."""
-    return [row for row in marked(TRADEOFF, "presets") if row["pixel x slice, mm"]]
+    return [row for row in marked(TRADEOFF, "presets") if row["`fast`, dB"]]
 
 
 def presets_table() -> str:

@@ -99,7 +99,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_PRIOR}
     if compiling:
         stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
-        if "poses in rounds" not in stages:
+        if "poses in rounds" not in stages and "fit to slices" in stages:
             stages["fit to slices"] += COMPILING_FIT_S
     if options.time_budget:
         shorter = max(options.time_budget, 1.0) / sum(stages.values())

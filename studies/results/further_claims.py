@@ -218,7 +218,6 @@ def verdicts() -> Iterator[Claim]:
 
 def presets() -> Iterator[Claim]:
     """Speed against accuracy."""
-    yield preset_gain("fast", "preview", 3)
     yield preset_gain("balanced", "fast", 3)
     yield preset_gain("accurate", "balanced", 3)
     yield preset_gain("accurate", "balanced", 2)

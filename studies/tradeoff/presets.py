@@ -43,7 +43,7 @@ def _subject(head: int, motion: int) -> SizedSubject:
 
 SUBJECTS = tuple(_subject(head, motion) for motion in range(len(MOTIONS)) for head in range(len(HEADS)))
 
-TRADE = ("preview", "fast", "balanced", "accurate")
+TRADE = ("fast", "balanced", "accurate")
 
 FEWER_STACKS = "balanced"
 """The preset in which two stacks and one are measured; two stacks in the most careful one, too."""
@@ -51,9 +51,9 @@ FEWER_STACKS = "balanced"
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """A reconstruction each: quick presets of all subjects first."""
-    quick = [(preset, 3) for preset in TRADE[:-1]]
-    for preset, n_stacks in (*quick, (FEWER_STACKS, 2), (TRADE[-1], 2), (TRADE[-1], 3), (FEWER_STACKS, 1)):
-        for spec in SUBJECTS if n_stacks in options.n_stacks else ():
+    several = ((TRADE[0], 3), (TRADE[1], 3), (FEWER_STACKS, 2), (TRADE[2], 2), (TRADE[2], 3))
+    for preset, n_stacks in (*several, (FEWER_STACKS, 1)):
+        for spec in SUBJECTS:
             yield Task(f"{spec.name}, {n_stacks}, {preset}", measure, (spec, n_stacks, preset, options))
 
 
@@ -172,10 +172,10 @@ def fewer_table(rows: Mapping[str, Row]) -> str:
 def tables(record: Record) -> dict[str, str]:
     """Both tables, and what they were measured on."""
     made = f"Weights {record['weights']}; CPU seconds of the reconstruction without start and files."
-    found = {"presets": f"{made}\n\n{trade_table(record['rows'])}"}
-    if any(row["n_stacks"] < 3 for row in record["rows"].values()):
-        found["fewer-stacks"] = f"dB.\n\n{fewer_table(record['rows'])}"
-    return found
+    return {
+        "presets": f"{made}\n\n{trade_table(record['rows'])}",
+        "fewer-stacks": f"dB.\n\n{fewer_table(record['rows'])}",
+    }
 
 
 STUDY = Study(
@@ -183,7 +183,6 @@ STUDY = Study(
     about="Eight simulated heads of several sizes, pixels and slices, that no setting was chosen on: every preset with "
     "three stacks; two stacks and one.",
     shared=("--ckpt", "--threads", "--jobs", "--cache"),
-    options={"--n-stacks": {"type": int, "nargs": "+", "default": [3, 2, 1], "help": "stacks of a subject"}},
     tasks=tasks,
     tables=tables,
     document="tradeoff.md",

@@ -41,7 +41,7 @@ def test_so_it_is_without_a_prior_and_with_blank_unseen_parts(subject: Path, tmp
 
 def test_so_it_is_with_a_correction(subject: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    reconstruct(subject, out, "--preset", "fast", "--resolution", "1.2")
+    reconstruct(subject, out, "--preset", "balanced", "--resolution", "1.2")
     run = FinishedRun.load(out)
     assert run.record.voxel_correction is not None
     assert run.record.voxel_correction.size > 0

@@ -130,8 +130,7 @@ def test_presets_are_compared_on_the_same_subjects_alone(tmp_path: Path) -> None
     rows["two, longer"] = preset_row(first, 2, "accurate", 28.5)
     found = presets.tables({"weights": "w", "rows": rows})
     assert (
-        "| mean gain over the quicker one |  |  |  |  |  | +0.25 (least -0.50) |  | +0.50 (least +0.50) |"
-        in found["presets"]
+        "| mean gain over the quicker one |  |  |  | +0.25 (least -0.50) |  | +0.50 (least +0.50) |" in found["presets"]
     )
     for preset, values in (("balanced", "28.00 | 27.00 | 26.00"), ("accurate", "28.50 | 27.50 | 26.50")):
         assert f"| {first} | 2 | `{preset}` | 10 | {values} | +1.00 | 0.10 | 1 |" in found["fewer-stacks"]
