@@ -187,7 +187,7 @@ def _draw(
                 panel.paste(MARK, mask=_outline(part, size))
             picture.paste(panel, (x, y + (ROW_PIXELS - size[1]) // 2))
             if row == 0:
-                pen.text((x + wide / 2, y - 8), view.name, INK, font=_font(18), anchor="mb")
+                pen.text((x + wide / 2, y - 12), view.name, INK, font=_font(18), anchor="ms")
                 _letter(pen, view.letters, (x, y, wide, ROW_PIXELS))
             x += wide + BETWEEN
         middle = y + ROW_PIXELS // 2
