@@ -121,7 +121,9 @@ PRESETS: dict[str, ReconstructionSettings] = {
         least_squares_voxel_mm=1.0,
         use_prior=False,
         prior_views=0,
-        registration=replace(_QUICK_SEARCH, network=False, n_rounds=9, finest_voxel_mm=0.9, max_pixels=400_000),
+        registration=replace(
+            _QUICK_SEARCH, network=False, n_rounds=9, finest_voxel_mm=0.9, finest_voxel_pixels=0.8, max_pixels=400_000
+        ),
     ),
     "fast": replace(
         _BALANCED,

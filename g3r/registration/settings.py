@@ -20,6 +20,8 @@ class RegistrationSettings:
         n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
+        finest_voxel_pixels: the same at least, in units of what a pixel covers (the cube root of its area times the
+            thickness): in a volume of smaller voxels each slice finds itself, wherever it is.
         max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
         seed: of the random search.
@@ -35,6 +37,7 @@ class RegistrationSettings:
     n_rounds: int = 12
     steps_per_round: int = 5
     finest_voxel_mm: float = 1.2
+    finest_voxel_pixels: float = 0.0
     max_pixels: int = 400_000
     standard_orientation: bool = True
     seed: int = 0
