@@ -169,3 +169,20 @@ def scatter(pixels, shape, plane, uv, matrix, origin, node_weight, buffers):
                     flat[c + to_x + to_y] += w11 - z11
                     flat[c + to_x + to_y + to_z] += z11
             first = end
+
+
+@numba.njit(parallel=True, nogil=True, cache=True)
+def fill_world(plane, uv, rotation, center, position):
+    """Write where pixels lie in the world.
+
+    Args:
+        plane: [P] of each pixel.
+        uv: [P, 2] (mm from the plane's centre).
+        rotation: [K, 3, 3] world from plane.
+        center: [K, 3] (mm).
+        position: [P, 3] (mm), written.
+    """
+    for p in numba.prange(len(plane)):
+        k = plane[p]
+        for axis in range(3):
+            position[p, axis] = center[k, axis] + uv[p, 0] * rotation[k, axis, 0] + uv[p, 1] * rotation[k, axis, 1]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.total_variation import divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 
@@ -79,7 +80,7 @@ def solve_volume(
     strength = np.float32(smoothness * typical)
 
     def normal(volume: NDArray[np.float32]) -> NDArray[np.float32]:
-        return operator.adjoint(weight * operator.forward(volume)) + strength * _laplacian(volume)
+        return operator.adjoint(weight * operator.forward(volume)) + strength * divergence_of_gradient(volume, None)
 
     volume = np.zeros(operator.grid.shape, np.float32) if start is None else start.astype(np.float32)
     residual = operator.adjoint((weight * value).astype(np.float32)) - normal(volume)
@@ -96,15 +97,3 @@ def solve_volume(
         direction = residual + np.float32(new_norm / norm) * direction
         norm = new_norm
     return volume
-
-
-def _laplacian(volume: NDArray[np.float32]) -> NDArray[np.float32]:
-    """D^T D V with forward differences D and free edges."""
-    out = np.zeros_like(volume)
-    for axis in range(3):
-        difference = np.diff(volume, axis=axis)
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        out[tuple(low)] -= difference
-        out[tuple(high)] += difference
-    return out

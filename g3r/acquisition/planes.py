@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.kernels import fill_plane_and_uv
+from g3r.acquisition.kernels import fill_plane_and_uv, fill_world
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import Selection
 
@@ -84,9 +84,8 @@ class Planes:
     def pixel_world_mm(self, pixel: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
         """World position [P, 3] of every pixel, or of those with the given numbers."""
         plane, uv = self._plane_and_uv(pixel)
-        position = self.center_mm[plane]
-        for axis in range(2):
-            position += uv[:, axis, None] * self.rotation[plane, :, axis]
+        position = np.empty((len(plane), 3))
+        fill_world(plane, uv, self.rotation, self.center_mm, position)
         return position
 
     def _plane_and_uv(self, pixel: NDArray[np.integer] | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels_voxels import fill_divergence
+
 Array = NDArray[np.float32]
 
 
@@ -27,13 +29,6 @@ def diffusivity(volume: Array, tip: float) -> Array:
 
 def divergence_of_gradient(volume: Array, weight: Array | None) -> Array:
     """D^T W D V with forward differences D, free edges, and the weights W [I, J, K] of voxels (None: 1)."""
-    out = np.zeros_like(volume)
-    for axis in range(3):
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        flow = np.diff(volume, axis=axis)
-        if weight is not None:
-            flow = flow * weight[tuple(low)]
-        out[tuple(low)] -= flow
-        out[tuple(high)] += flow
+    out = np.empty_like(volume)
+    fill_divergence(volume, np.ones((1, 1, 1), volume.dtype) if weight is None else weight, weight is not None, out)
     return out

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.kernels import gather, scatter
+from g3r.acquisition.kernels_voxels import join
 from g3r.acquisition.planes import Planes
 from g3r.geometry import VolumeGrid
 
@@ -68,6 +69,7 @@ class VoxelOperator:
         self.index_from_plane = np.ascontiguousarray(inverse[:3, :3] @ planes.rotation)  # [K, 3, 3]
         self.index_center = planes.center_mm @ inverse[:3, :3].T + inverse[:3, 3]
         self.node_index = np.einsum("kij,kqj->kqi", self.index_from_plane, self.node_mm)
+        self._geometries: dict[np.dtype[Any], tuple[NDArray[Any], ...]] = {}
 
     @property
     def n_pixels(self) -> int:
@@ -100,13 +102,16 @@ class VoxelOperator:
         padded = [n + 2 for n in self.grid.shape]
         buffers = np.zeros((n_buffers, math.prod(padded)), pixels.dtype)
         scatter(pixels, *self._geometry(pixels.dtype), buffers)  # type: ignore[call-arg]
-        volume = (buffers[0] if n_buffers == 1 else buffers.sum(0)).reshape(padded)
-        return np.ascontiguousarray(volume[1:-1, 1:-1, 1:-1])
+        volume = np.empty(self.grid.shape, pixels.dtype)
+        join(buffers.reshape(n_buffers, *padded), volume)
+        return volume
 
     def _geometry(self, dtype: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
         """Shape of a volume with a margin of one voxel, planes of the pixels, and where they and their nodes lie."""
-        shape = np.array(self.grid.shape) + 2
-        origin = self.index_center[:, None] + self.node_index + 1
-        reals = [self.uv_mm.T, self.index_from_plane, origin, self.node_weight]
-        uv, matrix, origin, weight = (np.ascontiguousarray(one, dtype) for one in reals)
-        return shape.astype(dtype), self.plane, uv, matrix, origin, weight
+        if dtype not in self._geometries:
+            shape = np.array(self.grid.shape) + 2
+            origin = self.index_center[:, None] + self.node_index + 1
+            reals = [self.uv_mm.T, self.index_from_plane, origin, self.node_weight]
+            uv, matrix, origin, weight = (np.ascontiguousarray(one, dtype) for one in reals)
+            self._geometries[dtype] = shape.astype(dtype), self.plane, uv, matrix, origin, weight
+        return self._geometries[dtype]

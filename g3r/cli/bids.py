@@ -79,8 +79,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.jobs is not None and options.jobs < 1:
         parser.error(f"--jobs {options.jobs}; expected at least 1")
     infer = _infer_options(parser, words[cut + 1 :])
+    from g3r.run.idle_threads import let_threads_sleep
     from g3r.run.stop_request import StopRequest
 
+    let_threads_sleep()
     stop_request = StopRequest()
     try:
         with stop_request:

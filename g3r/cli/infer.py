@@ -27,6 +27,7 @@ from g3r.cli.terminal import PROGRAM, Terminal
 from g3r.cli.time_left import TimeLeft, expected_seconds, needs_compiling
 from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
+from g3r.run.idle_threads import let_threads_sleep
 from g3r.run.lean_import import import_lean
 from g3r.run.log_file import LOG_NAME, LogFile
 from g3r.run.stop_request import StopRequest
@@ -43,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parsed_options(argv)
     import_lean()
+    let_threads_sleep()
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show

@@ -16,6 +16,7 @@ from g3r.cli.completion import parsed
 from g3r.cli.failures import EXPECTED, line_and_code
 from g3r.cli.mask_options import add_masker_options, check_masker_options, mask_weights_path, masker_of
 from g3r.errors import InputError
+from g3r.run.idle_threads import let_threads_sleep
 
 if TYPE_CHECKING:
     from g3r.acquisition.brain_mask import FoundMask
@@ -46,6 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = build_parser()
     options = parsed(parser, argv)
     check_masker_options(parser, options)
+    let_threads_sleep()
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
     logging.getLogger("g3r.acquisition.slice_profile").setLevel(logging.ERROR)  # the thickness decides nothing here
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,8 +81,11 @@ class InitialVolumes:
         sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
         seen = foreground(slices, grid, weight)
         field_rms = 0.0
-        if common_bias_field:
-            log_field = common_log_field(sharp, seen.core, grid)
+        with ThreadPoolExecutor(1) as pool:  # N4 has one thread, and releases Python's lock
+            field = pool.submit(common_log_field, sharp, seen.core, grid) if common_bias_field else None
+            density = coverage(slices, grid, weight)
+        if field is not None:
+            log_field = field.result()
             slices = without_field(slices, log_field, grid)
             coarse, sharp = coarse * np.exp(-log_field), sharp * np.exp(-log_field)
             field_rms = float(np.sqrt((log_field[seen.core] ** 2).mean())) if seen.core.any() else 0.0
@@ -91,7 +95,7 @@ class InitialVolumes:
         return cls(
             slices=slices,
             coarse=coarse,
-            density=coverage(slices, grid, weight),
+            density=density,
             masked_density=masked,
             sharp=sharp,
             foreground=seen,

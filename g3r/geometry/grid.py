@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import affine_transform
 
 from g3r.geometry.rigid import RigidPose
+
+SLAB = 32
+"""Planes of a map that are read at once; their number does not depend on that of threads, and so no rounding does."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,13 @@ def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, 
     """
     if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
         return data.astype(np.float32)
-    index = source.index_from_world @ target.affine
-    return affine_transform(
-        data.astype(np.float32), index[:3, :3], index[:3, 3], target.shape, order=1, mode="constant", cval=outside
-    )
+    index, data = source.index_from_world @ target.affine, data.astype(np.float32)
+    found = np.empty(target.shape, np.float32)
+
+    def fill(first: int) -> None:
+        shift, part = index[:3, 3] + index[:3, 0] * first, found[first : first + SLAB]
+        affine_transform(data, index[:3, :3], shift, part.shape, part, order=1, mode="constant", cval=outside)
+
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:  # scipy takes one thread, and releases Python's lock
+        list(pool.map(fill, range(0, len(found), SLAB)))
+    return found

@@ -51,7 +51,7 @@ def standard_orientation(
 
     Args:
         slices: at their final poses, in any frame.
-        templates: atlas templates of the subject's size; the one that fits best decides.
+        templates: atlas templates of the subject's size; the one that fits best after the first round decides.
         start: motions [K] (world from header) into the atlas frame, roughly.
         rng: source of randomness.
 
@@ -61,8 +61,9 @@ def standard_orientation(
     present = slices.world_from_header()
     common = aligned_to(slices, start, present) @ present.inverse()
     pixels = SearchPixels.of(slices)
-    found = [(*_moved_to(template, pixels, common.take([0]), rng), template) for template in templates]
-    best, motion, template = max(found, key=lambda one: one[0])
+    found = [(*_moved_to(template, pixels, common.take([0]), ROUNDS[:1], rng), template) for template in templates]
+    _, motion, template = max(found, key=lambda one: one[0])
+    best, motion = _moved_to(template, pixels, motion, ROUNDS[1:], rng)
     logger.info("standard orientation: correlation %.2f with the atlas template of %.0f weeks", best, template.weeks)
     if best < MIN_ATLAS_CORRELATION:
         return None
@@ -83,11 +84,15 @@ def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> 
 
 
 def _moved_to(
-    template: FittedTemplate, pixels: SearchPixels, motion: RigidPose, rng: np.random.Generator
+    template: FittedTemplate,
+    pixels: SearchPixels,
+    motion: RigidPose,
+    rounds: Sequence[tuple[float, float]],
+    rng: np.random.Generator,
 ) -> tuple[float, RigidPose]:
-    """Best correlation of all slices with a template, and the motion that gives it."""
+    """Best correlation of all slices with a template, and the motion that gives it, after some of `ROUNDS`."""
     agreement = np.zeros(1)
-    for rotation_deg, translation_mm in ROUNDS:
+    for rotation_deg, translation_mm in rounds:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
         agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
         motion = candidate.take([int(agreement.argmax())])

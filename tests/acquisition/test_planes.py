@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, volume_from_pixels, volume_planes
 from g3r.acquisition.slicing import slices_from_stacks
@@ -86,3 +87,21 @@ def test_records_print_their_sizes_in_one_line() -> None:
     assert repr(stack) == "Stack(second: 9 x 16 x 5 voxels of 0.8 x 0.9 x 3 mm, 2 mm thick)"
     assert repr(slices).startswith(f"Slices({len(slices)} slices of 2 stacks, {len(slices.pixel_index)} ")
     assert repr(slices.planes) == f"Planes({len(slices)} planes, {slices.planes.n_pixels} pixels)"
+
+
+def test_pixels_lie_where_their_planes_say(rng: np.random.Generator) -> None:
+    rotation = Rotation.random(3, random_state=5).as_matrix()
+    planes = Planes(
+        rotation=rotation,
+        center_mm=rng.normal(size=(3, 3)),
+        spacing_mm=np.array([[1.0, 2.0], [0.7, 0.9], [3.0, 0.5]]),
+        shape=np.array([[3, 2], [1, 4], [2, 2]]),
+        psf_var_mm2=np.ones((3, 3)),
+    )
+    expected = []
+    for k in range(3):
+        u, v = np.meshgrid(*[(np.arange(n) - (n - 1) / 2) for n in planes.shape[k]], indexing="ij")
+        own = np.stack([u * planes.spacing_mm[k, 0], v * planes.spacing_mm[k, 1], 0 * u], -1).reshape(-1, 3)
+        expected.append(own @ rotation[k].T + planes.center_mm[k])
+    np.testing.assert_allclose(planes.pixel_world_mm(), np.concatenate(expected), atol=1e-12)
+    np.testing.assert_allclose(planes.pixel_world_mm(np.array([7, 0])), np.concatenate(expected)[[7, 0]], atol=1e-12)

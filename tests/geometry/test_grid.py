@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.geometry.grid import bounding_box, on_grid
+from g3r.geometry.grid import SLAB, bounding_box, on_grid
 
 
 def affine_of(axes: np.ndarray, spacing: tuple[float, float, float], origin: tuple[float, ...]) -> np.ndarray:
@@ -110,3 +110,15 @@ def test_a_map_read_on_another_grid_is_trilinear_and_known_outside(rng: np.rando
     assert found[4, 3, 1] == pytest.approx(place @ [1, 2, 3])
     assert found[-1, 0, 0] == -1
     np.testing.assert_array_equal(on_grid(data, source, source, outside=0.0), data.astype(np.float32))
+
+
+def test_a_map_of_several_slabs_reads_the_same_ramp_on_another_grid() -> None:
+    source = VolumeGrid((30, 40, 35), affine_of(AXES["oblique"], (2.0, 1.5, 1.8), (3.0, -5.0, 7.0)))
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in source.shape], indexing="ij"), -1)
+    target = VolumeGrid((SLAB + 5, 4, 3), affine_of(AXES["oblique"], (0.7, 1.0, 1.0), (13.0, 11.0, 27.0)))
+    expected = target.world(np.stack(np.meshgrid(*[np.arange(n) for n in target.shape], indexing="ij"), -1)).sum(-1)
+    found = on_grid(source.world(index).sum(-1), source, target, outside=np.nan)
+    inside = np.isfinite(found)
+    assert inside[: SLAB - 1].any()
+    assert inside[SLAB + 1 :].any()
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=1e-4)
