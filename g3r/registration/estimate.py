@@ -44,8 +44,8 @@ class Registration:
         gain: [K] intensity factors.
         weight: [K] slice weights in (0, 1].
         ncc: [K] correlation of each slice with the volume.
-        held_out: for each stack the correlation with a volume made of the other stacks, outline included;
-            None for a single stack.
+        held_out: for each stack the correlation with a volume made of the other stacks, outline included, without
+            the few slices that do not count (`Prediction.agreement`); None for a single stack.
         initialisation: name of the one that the search started from.
         initialisations: held-out correlation of every initialisation, stack by stack.
         interleave: of each stack, as its motion suggests; None for a rigid stack.
@@ -158,7 +158,9 @@ def measured_again(registration: Registration, fill: TemplateFill | None = None)
     motion = slices.world_from_header()
     score = held_out_score(slices, samples, motion, fill if missing else None)
     overlap = overlap_of(slices, samples, motion) if missing else None
-    return replace(registration, held_out=score.correlations, profiles=profiles, overlap=overlap)
+    return replace(
+        registration, held_out=score.agreements(samples, registration.weight), profiles=profiles, overlap=overlap
+    )
 
 
 def _with_rigid_stacks(
@@ -169,7 +171,7 @@ def _with_rigid_stacks(
     fitted: FittedSlices,
     voxel_mm: float,
 ) -> tuple[FittedSlices, list[float]]:
-    """Make stacks rigid again that gained nothing from slice poses of their own; held-out correlations of all.
+    """Make stacks rigid again that gained nothing from slice poses of their own; agreement of all with the others.
 
     Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
     are not asked: a few slices that went astray lower their correlation, while all others gain.
@@ -179,7 +181,7 @@ def _with_rigid_stacks(
     refined = fitted.slices.world_from_header()
     after = held_out_score(slices, samples, refined, fill)
     if not rigid:
-        return fitted, after.correlations
+        return fitted, after.agreements(samples, fitted.weight)
     equal = np.ones(len(slices))
     rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
     reverted = [
@@ -192,7 +194,7 @@ def _with_rigid_stacks(
         )
     ]
     if not reverted:
-        return fitted, after.correlations
+        return fitted, after.agreements(samples, fitted.weight)
     # the refined slices as a whole may have drifted from the segments; stacks that revert must follow
     motion = aligned_to(slices, refined, motion)
     gain, weight = fitted.gain.copy(), fitted.weight.copy()
@@ -201,7 +203,7 @@ def _with_rigid_stacks(
         refined = refined.with_rows(sample.rows, motion.take(sample.rows))
         gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
     kept = replace(fitted, slices=slices.with_motion(refined), gain=gain, weight=weight)
-    return kept, held_out_score(slices, samples, refined, fill).correlations
+    return kept, held_out_score(slices, samples, refined, fill).agreements(samples, weight)
 
 
 def segments_of(

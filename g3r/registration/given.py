@@ -109,7 +109,7 @@ def measure(
     if len(samples) > 1:
         missing = any(sample.profile.has_missing for sample in samples)
         fill = _fill(placed, orientation) if missing else None
-        held_out = held_out_score(even, samples, motion, fill).correlations
+        held_out = held_out_score(even, samples, motion, fill).agreements(samples, fitted.weight)
         overlap = overlap_of(even, samples, motion) if missing else None
     n_segments, interleave = segments_of(samples, motion, JUMP_MM)
     return Registration(

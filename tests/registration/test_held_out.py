@@ -41,6 +41,25 @@ def test_a_score_has_a_prediction_for_every_stack_and_slice(
     assert scores.cost == pytest.approx(sum(p.cost for p in scores.prediction))
 
 
+def test_a_few_slices_that_went_astray_do_not_count_in_the_agreement(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+) -> None:
+    slices, truth = still_slices
+    rows = samples[1].rows
+    middle = len(rows) // 2
+    astray = rows[middle : middle + max(1, len(rows) // 8)]
+    far = turned_about(np.zeros(3), np.deg2rad([60, 0, 0]), np.array([0, 30, 0]))
+    score = held_out_score(slices, samples, truth.with_rows(astray, far @ truth.take(astray)))
+    weight = np.ones(len(slices))
+    without = score.agreements(samples, weight)
+    assert without == score.correlations
+    weight[astray] = 0.1
+    assert score.agreements(samples, weight)[1] > without[1] + 0.01
+    # where many do not count, all of them tell
+    weight[rows[::2]] = 0.1
+    assert score.agreements(samples, weight)[1] == without[1]
+
+
 def test_poses_pay_a_penalty_for_their_movements(
     still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
 ) -> None:
