@@ -164,7 +164,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
         def __call__(self, moment: object) -> None:
             moments.append(time.process_time())
 
-    settings = SliceStageSettings(n_steps=TIMED_STEPS, amplitude_iterations=0)
+    settings = SliceStageSettings(n_steps=TIMED_STEPS, n_parts=1, amplitude_iterations=0)
     ones = np.ones(len(slices))
     fit_slices(
         cloud,

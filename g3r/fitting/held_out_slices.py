@@ -111,7 +111,8 @@ def ask_held_out_slices(
     mean_mm = cloud.mean_mm.numpy() + cloud.origin_mm
     part = cloud.take(torch.from_numpy(slab.holds(mean_mm, SLAB_MARGIN_MM)))
     in_slab = slab.holds(slices.planes.pixel_world_mm())
-    short = replace(stage, n_steps=settings.n_steps, optimise_poses=False)
+    # so few steps have to see every slice each
+    short = replace(stage, n_steps=settings.n_steps, n_parts=1, optimise_poses=False)
 
     def fitted(width: float) -> HeldOutFit | None:
         whole = slice_target(prior, weight, model, [width] * slices.n_stacks)

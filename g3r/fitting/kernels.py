@@ -111,6 +111,7 @@ def _exp(e):
 def image_l1(
     cloud,
     planes,
+    chosen,
     overlaps,
     cut,
     work,
@@ -126,11 +127,13 @@ def image_l1(
 ):
     """L1 of rendered planes and its gradients: each plane is rendered, compared and differentiated in turn.
 
-    The loss is factor sum_k slice_weight_k residual_k, with residual_k the sum of weight |pixel - target| over plane k.
+    The loss is factor sum_k slice_weight_k residual_k over the chosen planes, with residual_k the sum of weight
+    |pixel - target| over plane k.
 
     Args:
         cloud: `CloudArrays`.
         planes: `PlaneArrays`.
+        chosen: [M] numbers of the planes that are looked at.
         overlaps: `OverlapArrays`.
         cut: square of the cut-off in sigma.
         work: `Workspace`.
@@ -140,14 +143,15 @@ def image_l1(
         factor: of the loss.
         with_pose: whether gradients of poses are wanted.
         buffers: [n_workers, N, 11], gradients of the Gaussians are added.
-        plane_gradient: [K, 7] is written, columns as in `gaussians.kernels`.
-        field_gradient: [K, 5] is written.
-        residual: [K] is written.
+        plane_gradient: [K, 7] is written for the chosen planes, columns as in `gaussians.kernels`.
+        field_gradient: [K, 5] is written for them.
+        residual: [K] is written for them.
     """
     n_workers = len(work.images)
     for worker in numba.prange(n_workers):
         image, mine = work.images[worker], work.projections[worker]
-        for k in range(worker, len(planes.rotation), n_workers):
+        for place in range(worker, len(chosen), n_workers):
+            k = chosen[place]
             n_x, n_y = planes.shape[k, 0], planes.shape[k, 1]
             pitch = n_y + N_LANES
             clear(image, n_x, n_y)

@@ -32,6 +32,9 @@ OVERLAP_MARGIN_SIGMA = 1.0
 
 TINY = float(np.finfo(np.float32).tiny)
 
+EVERY = slice(None)
+"""All planes of a term."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageTerm:
@@ -96,13 +99,18 @@ class ImageTerm:
             cutoff_sigma=self.cutoff_sigma,
         )
 
-    def mean(self, residual: NDArray[np.float64], slice_weight: NDArray[np.float64]) -> float:
-        """The term from sums of weight |difference| [K] and slice weights [K]."""
-        return float(slice_weight @ residual) / self.scale(slice_weight)
+    def mean(
+        self,
+        residual: NDArray[np.float64],
+        slice_weight: NDArray[np.float64],
+        chosen: NDArray[np.integer] | slice = EVERY,
+    ) -> float:
+        """The term of the chosen planes from sums of weight |difference| [K] and slice weights [K]."""
+        return float(slice_weight[chosen] @ residual[chosen]) / self.scale(slice_weight, chosen)
 
-    def scale(self, slice_weight: NDArray[np.float64]) -> float:
-        """Sum of all weights, which the term is divided by."""
-        return max(float(slice_weight @ self.total_weight), TINY)
+    def scale(self, slice_weight: NDArray[np.float64], chosen: NDArray[np.integer] | slice = EVERY) -> float:
+        """Sum of all weights of the chosen planes, which the term is divided by."""
+        return max(float(slice_weight[chosen] @ self.total_weight[chosen]), TINY)
 
 
 Terms = Mapping[str, tuple[ImageTerm, PlaneState]]
@@ -125,12 +133,14 @@ class TermLoss:
 
     Attributes:
         mean: the term.
+        chosen: [M] numbers of the planes whose mean it is; for the others the arrays below are zero.
         residual: [K] sums of weight |difference|.
         plane_gradient: [K, 7] of body-frame rotation (3), world translation (3) and log-gain.
         field_gradient: [K, 5] of the fields' coefficients.
     """
 
     mean: float
+    chosen: NDArray[np.integer]
     residual: NDArray[np.float64]
     plane_gradient: NDArray[np.float64]
     field_gradient: NDArray[np.float32]
@@ -202,15 +212,17 @@ class LossStep:
     objective: CloudObjective
     terms: Terms
 
-    def add(self, name: str, factor: float) -> TermLoss:
+    def add(self, name: str, factor: float, chosen: NDArray[np.integer] | None = None) -> TermLoss:
         """An image term (without the factor); its gradient times the factor goes into the sum.
 
         Args:
             name: of the term.
             factor: weight of the term in the loss.
+            chosen: [M] ascending numbers of the planes whose mean the term is; None for all.
         """
         (term, state), held = self.terms[name], self.objective.overlaps[name]
         n = len(term.planes)
+        chosen = np.arange(n) if chosen is None else chosen
         planes = PlaneArrays(
             state.rotation,
             state.center_mm,
@@ -225,20 +237,23 @@ class LossStep:
         kernels.image_l1(
             CloudArrays(self.objective.shapes, self.objective.parameters.value["amplitude"]),
             planes,
+            chosen,
             held.overlaps.arrays,
             term.cutoff_sigma**2,
             held.work,
             term.pixels,
             state.slice_weight,
             state.coefficients,
-            factor / term.scale(state.slice_weight),
+            factor / term.scale(state.slice_weight, chosen),
             term.with_pose,
             self.objective.buffers,
             plane_gradient,
             field_gradient,
             residual,
         )
-        return TermLoss(term.mean(residual, state.slice_weight), residual, plane_gradient, field_gradient)
+        return TermLoss(
+            term.mean(residual, state.slice_weight, chosen), chosen, residual, plane_gradient, field_gradient
+        )
 
     def finish(self) -> float:
         """The scale regulariser times its weight; writes the gradient of the sum of all terms."""

@@ -45,10 +45,10 @@ class LearningRates:
     log_scale: float = 0.02
     quaternion: float = 0.02
     amplitude_share: float = 0.04
-    log_gain: float = 0.002
-    bias_field: float = 0.008
-    rotation_rad: float = 1e-3
-    translation_mm: float = 0.03
+    log_gain: float = 0.016
+    bias_field: float = 0.016
+    rotation_rad: float = 2e-3
+    translation_mm: float = 0.06
 
 
 class FitParameters:

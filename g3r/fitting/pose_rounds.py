@@ -52,7 +52,7 @@ class PoseRoundSettings:
     two_stacks: int = 2
     more_stacks: int = 1
     prior_steps: int = 12
-    slice_steps: int = 60
+    slice_steps: int = 110
     newton_steps: int = 4
 
     def n_rounds(self, n_stacks: int) -> int:

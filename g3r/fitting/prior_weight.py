@@ -15,7 +15,7 @@ SINGLE_STACK_WEIGHT = 0.75
 MAX_WEIGHT = 0.75
 """However large the pixels are."""
 
-FEWEST_STEPS = 8
+FEWEST_STEPS = 16
 """After fewer steps of the fit, where time or the user ended it, V_prior alone is better than any mixture."""
 
 

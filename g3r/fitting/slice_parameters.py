@@ -109,8 +109,9 @@ class SliceParameters:
             gradient["rotation"][...] = after + pull * radius2 * rotation
             gradient["translation"][...] = image.plane_gradient[:, 3:6] + pull * translation
         if "log_gain" in value:
-            slope = image.plane_gradient[:, 6]
-            gradient["log_gain"][...] = slope - slope.mean()
+            slope = image.plane_gradient[image.chosen, 6]  # the mean of slices that were not seen is not known
+            gradient["log_gain"][...] = 0.0
+            gradient["log_gain"][image.chosen] = slope - slope.mean()
         if "bias_field" in value:
             c = value["bias_field"].astype(np.float64)
             total = np.zeros_like(c)

@@ -12,13 +12,14 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import slice_weights
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
-from g3r.fitting.objective import CloudObjective, ImageTerm, TermLoss
+from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
 from g3r.fitting.schedules import AnnealedWeight, cosine_decay
 from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
+from g3r.fitting.slice_turns import SliceTurns
 from g3r.gaussians import GaussianCloud, solve_amplitudes
 from g3r.gaussians.amplitudes import MAX_PROJECTION_BYTES
 from g3r.gaussians.render import CUTOFF_SIGMA
@@ -34,6 +35,7 @@ class SliceStageSettings:
 
     Args:
         n_steps: optimiser steps.
+        n_parts: steps in which every slice is seen once; two steps on halves do more than one on all slices.
         amplitude_iterations: conjugate-gradient steps for the amplitudes at the start; 0 keeps those of stage 1.
         scale_weight: weight of the scale regulariser.
         distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
@@ -52,12 +54,13 @@ class SliceStageSettings:
         rates: step sizes.
     """
 
-    n_steps: int = 80
+    n_steps: int = 130
+    n_parts: int = 2
     amplitude_iterations: int = 6
     scale_weight: float = 0.02
     distillation: AnnealedWeight = field(default_factory=lambda: AnnealedWeight(0.2, 0.02))
     prior_error: float = 0.05
-    distillation_planes: float = 0.1
+    distillation_planes: float = 0.05
     optimise_poses: bool = True
     pose_prior_mm: float = 10.0
     reweight_every: int = 20
@@ -161,6 +164,7 @@ def fit_slices(
         value, entry = loss.evaluate(fraction)
         if not guard.step(value, cosine_decay(fraction)):
             entry |= {"rollback": 1.0}
+            loss.turns.forget()
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
@@ -219,9 +223,9 @@ class SliceLoss:
             with_pose=self.unknowns.with_pose,
             cutoff_sigma=settings.cutoff_sigma,
         )
+        self.turns = SliceTurns(self.term, slices.stack_id, settings.n_parts)
         self.level = float(np.abs(slices.masked_value).mean()) if len(slices.masked_value) else 0.0
         self.objective = CloudObjective(parameters, settings.scale_weight)
-        self.last: TermLoss | None = None
         self.prior: ImageTerm | None = None
         if prior is not None:
             self.prior = ImageTerm.of(prior.planes, prior.value, prior.weight, cutoff_sigma=settings.cutoff_sigma)
@@ -245,27 +249,32 @@ class SliceLoss:
         return self.unknowns.state(self.slice_weight)
 
     def evaluate(self, fraction: float) -> tuple[float, dict[str, float]]:
-        """The loss at the present parameters and a fraction of the fit, and its terms by name."""
+        """The loss at the present parameters and a fraction of the fit, and its terms by name.
+
+        The gradient is that of the part of the slices whose turn it is; the loss is that of all (`SliceTurns`).
+        """
         settings, terms = self.settings, {"slices": (self.term, self.state())}
         if self.prior is not None:
             terms["prior"] = self.distilled, self.distilled_state
         step = self.objective.begin(terms)
-        slices = step.add("slices", 1.0)
-        loss, entry = slices.mean, {"image": slices.mean}
-        strength = prior_strength(settings, fraction, slices.mean)
+        slices = step.add("slices", 1.0, self.turns.next())
+        self.turns.put(slices)
+        image = self.turns.mean(self.slice_weight)
+        loss, entry = image, {"image": image}
+        strength = prior_strength(settings, fraction, image)
         if self.prior is not None and strength > 0:
             distance = step.add("prior", strength * self.prior_share).mean
             loss += strength * self.prior_share * distance
             entry |= {"distillation": distance, "distillation_weight": strength}
         loss += step.finish()
         loss += self.unknowns.finish(slices, settings.pose_prior_mm, settings.bias_field_ridge)
-        self.last = slices
         return loss, entry
 
     def reweight(self) -> float:
-        """Slice weights from the residuals of the last evaluation; returns the image term over what it was."""
-        assert self.last is not None, "nothing was evaluated yet"
-        residual = self.last.residual
+        """Slice weights from the last residual of every slice; returns the image term over what it was."""
+        if not self.turns.is_complete:  # after a rollback
+            return 1.0
+        residual = self.turns.residual
         before = self.term.mean(residual, self.slice_weight)
         typical = residual / np.maximum(self.term.total_weight, 1)
         self.slice_weight = slice_weights(typical).astype(np.float32).astype(np.float64)

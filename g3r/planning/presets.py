@@ -134,13 +134,13 @@ PRESETS: dict[str, ReconstructionSettings] = {
         share_probes=1,
         registration=replace(_QUICK_SEARCH, n_rounds=5, finest_voxel_mm=1.4, max_pixels=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=60),
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=110),
     ),
     "balanced": replace(_BALANCED, registration=replace(_BALANCED.registration, n_rounds=9, finest_voxel_mm=1.4)),
     "accurate": replace(
         _BALANCED,
         n_lattices=6,
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=110),  # the mean takes out what more steps add in noise
+        slice_stage=replace(_BALANCED.slice_stage, n_steps=200),  # the mean takes out what more steps add in noise
         # three stacks have found their poses after one round
         pose_rounds=PoseRoundSettings(two_stacks=4),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),

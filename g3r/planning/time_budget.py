@@ -73,7 +73,7 @@ TOO_LITTLE, NO_FIT = 4.0, 2.2
 QUICKEST_FIT = "fast"
 """Preset whose fit is made where no other fits; the deadline ends it."""
 
-SHARE_STEPS = 18
+SHARE_STEPS = 36
 """Optimiser steps that take as long as one probe for the map of the prior share."""
 
 PROBE_EVERY = 4
@@ -238,7 +238,7 @@ def fit_seconds(preset: ReconstructionSettings, step_s: float, number: float) ->
     return step * (in_first + AMPLITUDE_STEP * second.amplitude_iterations + second.n_steps)
 
 
-PRIOR_STEP, AMPLITUDE_STEP = 0.35, 0.8
+PRIOR_STEP, AMPLITUDE_STEP = 0.7, 1.5
 """Seconds of a step of stage 1, and of one conjugate-gradient step for the amplitudes, over a step of stage 2."""
 
 

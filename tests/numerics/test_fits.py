@@ -130,14 +130,12 @@ def test_a_prior_stage_on_scaled_volumes_is_the_same_scaled(factor: float, tally
 @pytest.mark.parametrize("factor", [10.0, 100.0])
 def test_steps_that_are_too_large_are_taken_back(factor: float, tally: Tally, caplog: pytest.LogCaptureFixture) -> None:
     plain = fit_at(1.0, n_steps=40)
-    slices = slices_of_small_head()[0]
     with tally.case():
         rash = fit_at(factor, n_steps=40)
         assert_finite(rash)
 
     def residual(result: SliceFit) -> float:
-        shown = render(result.cloud, result.slices.planes).numpy()
-        return float(np.abs(shown - slices.value)[slices.mask].mean())
+        return result.history[-1]["image"]  # with gains, whose steps were too large as well
 
     assert any("rollback" in entry for entry in rash.history)
     assert "back to the best state" in caplog.text
@@ -146,8 +144,10 @@ def test_steps_that_are_too_large_are_taken_back(factor: float, tally: Tally, ca
 
 
 def test_without_the_safeguard_they_end_worse_or_not_at_all() -> None:
+    image = [entry["image"] for entry in fit_at(100.0, guarded=False, n_steps=40).history]
+    assert image[-1] > 5 * image[0]
     with pytest.raises(NumericalError):
-        fit_at(100.0, guarded=False)
+        fit_at(300.0, guarded=False)
 
 
 def test_a_fit_that_goes_well_takes_the_same_steps_with_the_safeguard() -> None:

@@ -36,6 +36,7 @@ SETTINGS = SliceStageSettings(
     prior_error=0.05,
     distillation=AnnealedWeight(0.4, 0.1),
     distillation_planes=0.4,
+    n_parts=1,
 )
 FRACTION = 0.5
 
