@@ -53,3 +53,23 @@ def cosine_decay(fraction: float, hold: float = 0.4, floor: float = 0.05) -> flo
         return 1.0
     along = (fraction - hold) / (1 - hold)
     return floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * along))
+
+
+def prior_strength(schedule: AnnealedWeight, prior_error: float, fraction: float, residual: float) -> float:
+    """w(i) of G3R Eq. 9: annealed as there, but not below what the slices' residual and the prior's error ask for.
+
+    A voxel with confidence c counts as if 1 - c missing pixels had been read off the prior. Under L1 (Laplace
+    distributions) a pixel weighs one over its mean absolute error, so one read off the prior weighs
+    residual / prior_error times one that was measured: little where slices fit much better than the prior is
+    known to, much where noise or motion spoil them.
+
+    Args:
+        schedule: the annealed weight.
+        prior_error: mean absolute error of the prior; 0 leaves the schedule alone.
+        fraction: of the fit that is done.
+        residual: mean absolute residual of the slices at present.
+    """
+    annealed = schedule.at(fraction)
+    if prior_error <= 0 or not schedule.start > 0:
+        return annealed
+    return max(annealed, min(residual / prior_error, 1.0))  # at most that of a measured pixel

@@ -17,7 +17,7 @@ from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
-from g3r.fitting.schedules import AnnealedWeight, cosine_decay
+from g3r.fitting.schedules import AnnealedWeight, cosine_decay, prior_strength
 from g3r.fitting.slice_parameters import SliceParameters, slice_blocks
 from g3r.fitting.slice_turns import SliceTurns
 from g3r.gaussians import GaussianCloud, solve_amplitudes
@@ -283,22 +283,3 @@ class SliceLoss:
         typical = residual / np.maximum(self.term.total_weight, 1)
         self.slice_weight = slice_weights(typical).astype(np.float32).astype(np.float64)
         return self.term.mean(residual, self.slice_weight) / before if before > 0 else 1.0
-
-
-def prior_strength(settings: SliceStageSettings, fraction: float, residual: float) -> float:
-    """w(i) of G3R Eq. 9: annealed as there, but not below what the slices' residual and the prior's error ask for.
-
-    A voxel with confidence c counts as if 1 - c missing pixels had been read off the prior. Under L1 (Laplace
-    distributions) a pixel weighs one over its mean absolute error, so one read off the prior weighs
-    residual / prior_error times one that was measured: little where slices fit much better than the prior is
-    known to, much where noise or motion spoil them.
-
-    Args:
-        settings: the schedule, and the prior's error.
-        fraction: of the fit that is done.
-        residual: mean absolute residual of the slices at present.
-    """
-    annealed = settings.distillation.at(fraction)
-    if settings.prior_error <= 0 or not settings.distillation.start > 0:
-        return annealed
-    return max(annealed, min(residual / settings.prior_error, 1.0))  # at most that of a measured pixel

@@ -9,8 +9,7 @@ import torch
 
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
 from g3r.fitting.prior_stage import PriorStageSettings, VolumeTarget, fit_prior
-from g3r.fitting.schedules import AnnealedWeight
-from g3r.fitting.slice_stage import SliceStageSettings, prior_strength
+from g3r.fitting.schedules import AnnealedWeight, prior_strength
 from g3r.gaussians import GaussianCloud, render
 from tests.fitting.scene import BALL, GRID, fit, make_slices, seeded, true_volume
 
@@ -148,12 +147,11 @@ def test_the_same_seed_gives_the_same_fit(volume: np.ndarray) -> None:
 
 
 def test_the_prior_weighs_by_the_residual_over_its_error_and_never_more_than_a_pixel() -> None:
-    settings = SliceStageSettings(distillation=AnnealedWeight(0.5, 0.05), prior_error=0.05)
-    assert prior_strength(settings, 0.0, 0.001) == 0.5
-    assert prior_strength(settings, 1.0, 0.001) == pytest.approx(0.05)
-    assert prior_strength(settings, 1.0, 0.02) == pytest.approx(0.4)
-    assert prior_strength(replace(settings, prior_error=0.025), 1.0, 0.02) == pytest.approx(0.8)
-    assert prior_strength(settings, 1.0, 0.5) == 1.0
-    assert prior_strength(replace(settings, prior_error=0.0), 1.0, 0.5) == pytest.approx(0.05)
-    off = replace(settings, distillation=AnnealedWeight(0.0, 0.0))
-    assert prior_strength(off, 0.5, 0.5) == 0.0
+    schedule = AnnealedWeight(0.5, 0.05)
+    assert prior_strength(schedule, 0.05, 0.0, 0.001) == 0.5
+    assert prior_strength(schedule, 0.05, 1.0, 0.001) == pytest.approx(0.05)
+    assert prior_strength(schedule, 0.05, 1.0, 0.02) == pytest.approx(0.4)
+    assert prior_strength(schedule, 0.025, 1.0, 0.02) == pytest.approx(0.8)
+    assert prior_strength(schedule, 0.05, 1.0, 0.5) == 1.0
+    assert prior_strength(schedule, 0.0, 1.0, 0.5) == pytest.approx(0.05)
+    assert prior_strength(AnnealedWeight(0.0, 0.0), 0.05, 0.5, 0.5) == 0.0
