@@ -263,7 +263,7 @@ class SliceLoss:
         self.turns.put(slices)
         image = self.turns.mean(self.slice_weight)
         loss, entry = image, {"image": image}
-        strength = prior_strength(settings, fraction, image)
+        strength = prior_strength(settings.distillation, settings.prior_error, fraction, image)
         if self.prior is not None and strength > 0:
             distance = step.add("prior", strength * self.prior_share).mean
             loss += strength * self.prior_share * distance
