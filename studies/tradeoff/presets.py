@@ -43,7 +43,7 @@ def _subject(head: int, motion: int) -> SizedSubject:
 
 SUBJECTS = tuple(_subject(head, motion) for motion in range(len(MOTIONS)) for head in range(len(HEADS)))
 
-TRADE = ("fast", "balanced", "accurate")
+TRADE = ("preview", "fast", "balanced", "accurate")
 
 FEWER_STACKS = "balanced"
 """The preset in which two stacks and one are measured; two stacks in the most careful one, too."""
@@ -51,8 +51,9 @@ FEWER_STACKS = "balanced"
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """A reconstruction each: quick presets of all subjects first."""
-    several = ((TRADE[0], 3), (TRADE[1], 3), (FEWER_STACKS, 2), (TRADE[2], 2), (TRADE[2], 3))
-    for preset, n_stacks in (*several, (FEWER_STACKS, 1)):
+    quick, careful = TRADE[:-1], TRADE[-1]
+    wanted = (*((preset, 3) for preset in quick), (FEWER_STACKS, 2), (careful, 2), (careful, 3), (FEWER_STACKS, 1))
+    for preset, n_stacks in wanted:
         for spec in SUBJECTS:
             yield Task(f"{spec.name}, {n_stacks}, {preset}", measure, (spec, n_stacks, preset, options))
 

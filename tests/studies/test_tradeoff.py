@@ -123,15 +123,20 @@ def preset_row(subject: str, n_stacks: int, preset: str, psnr_db: float) -> dict
 
 def test_presets_are_compared_on_the_same_subjects_alone(tmp_path: Path) -> None:
     first, second, third = (spec.name for spec in presets.SUBJECTS[:3])
-    given = [(first, "fast", 30.0), (second, "fast", 31.0), (third, "fast", 20.0)]
+    given = [
+        (first, "preview", 22.0),
+        (second, "preview", 21.0),
+        (first, "fast", 30.0),
+        (second, "fast", 31.0),
+        (third, "fast", 20.0),
+    ]
     given += [(first, "balanced", 31.0), (second, "balanced", 30.5), (first, "accurate", 31.5)]
     rows = {f"{name}, 3, {preset}": preset_row(name, 3, preset, db) for name, preset, db in given}
     rows["two"] = preset_row(first, 2, "balanced", 28.0)
     rows["two, longer"] = preset_row(first, 2, "accurate", 28.5)
     found = presets.tables({"weights": "w", "rows": rows})
-    assert (
-        "| mean gain over the quicker one |  |  |  | +0.25 (least -0.50) |  | +0.50 (least +0.50) |" in found["presets"]
-    )
+    gains = "+9.00 (least +8.00) |  | +0.25 (least -0.50) |  | +0.50 (least +0.50)"
+    assert f"| mean gain over the quicker one |  |  |  | {gains} |" in found["presets"]
     for preset, values in (("balanced", "28.00 | 27.00 | 26.00"), ("accurate", "28.50 | 27.50 | 26.50")):
         assert f"| {first} | 2 | `{preset}` | 10 | {values} | +1.00 | 0.10 | 1 |" in found["fewer-stacks"]
     draw_presets(rows, presets.TRADE, tmp_path / "trade.png")
@@ -147,7 +152,7 @@ def test_subjects_of_the_presets_differ_in_size_and_are_not_those_that_were_trai
     first, *_ = presets.SUBJECTS
     for stack in first.acquisition(3):
         assert (stack.resolution_mm, stack.thickness_mm, stack.gap_mm) == (0.7, 3.0, 0.0)
-    assert len([task.key for task in presets.tasks(presets.STUDY.parser().parse_args([]))]) == 48
+    assert len([task.key for task in presets.tasks(presets.STUDY.parser().parse_args([]))]) == 56
 
 
 def test_rounds_are_shown_side_by_side() -> None:
