@@ -8,6 +8,7 @@ import pytest
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.fitting.gain_trends import GainTrends
+from g3r.planning.presets import PRESETS, adapted
 from tests.acquisition.nifti_files import stacks_of_two
 
 
@@ -48,3 +49,9 @@ def test_one_slice_has_no_trend(slices: Slices) -> None:
     value, gradient = GainTrends(slices.take(np.array([3]))).penalty(np.array([0.2]))
     assert value == 0
     np.testing.assert_array_equal(gradient, [0.0])
+
+
+def test_trends_are_held_from_three_stacks_on() -> None:
+    held = [adapted(PRESETS["fast"], n).slice_stage.gain_trend_ridge for n in (1, 2, 3)]
+    assert held[:2] == [0.0, 0.0]
+    assert held[2] > 0
