@@ -3,8 +3,7 @@
 A volume that is shaded along an axis, and gains that rise along the stack across it, explain the same pixels; in plane
 the fields of the other stacks do the rest. Registration has found gains from the slices alone. A fit that may change
 their trends freely follows whatever pulls at the volume, such as the brightness of V_prior: on a simulated head by 5 %
-from end to end, which cost 0.7 dB. A ridge, as that of the fields, keeps
-this part where it was.
+from end to end, which cost 0.7 dB. A ridge, as that of the fields, keeps this part where it was.
 """
 
 from __future__ import annotations
