@@ -210,7 +210,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
     """
     stage = settings.slice_stage
     if n_stacks < 3:
-        # registration knows the trends of gains from three stacks on; on three real pairs, holding them cost up to 0.5 dB
+        # registration knows gains' trends from three stacks on; on real pairs, holding them cost up to 0.5 dB
         stage = replace(stage, gain_trend_ridge=0.0)
     if n_stacks == 1:
         # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
