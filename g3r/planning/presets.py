@@ -73,7 +73,7 @@ class ReconstructionSettings:
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
     prior_halo_voxels: int = DEFAULT_TILING.halo_voxels
-    share_probes: int = 2
+    share_probes: int = 1
     least_squares_voxel_mm: float = 0.0
     use_prior: bool = True
     distillation: bool = True
@@ -131,7 +131,6 @@ PRESETS: dict[str, ReconstructionSettings] = {
         held_out=None,
         voxel_correction=None,
         prior_views=1,
-        share_probes=1,
         registration=replace(_QUICK_SEARCH, n_rounds=5, finest_voxel_mm=1.4, max_pixels=200_000),
         prior_stage=replace(_BALANCED.prior_stage, n_steps=15),
         slice_stage=replace(_BALANCED.slice_stage, n_steps=110),
@@ -140,11 +139,11 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         n_lattices=6,
-        slice_stage=replace(_BALANCED.slice_stage, n_steps=200),  # the mean takes out what more steps add in noise
         # three stacks have found their poses after one round
         pose_rounds=PoseRoundSettings(two_stacks=4),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
+        share_probes=2,
         voxel_correction=VoxelCorrectionSettings(hold=1.0),  # the mean of lattices leaves less to correct
     ),
 }

@@ -117,7 +117,7 @@ def register(
     held_out = None
     if not single:
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
-        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings.finest_voxel_mm)
+        fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings)
     overlap = overlap_of(slices, samples, fitted.slices.world_from_header()) if missing else None
     orientation = None
     if found.placed is not None and settings.standard_orientation:
@@ -169,7 +169,7 @@ def _with_rigid_stacks(
     rigid: list[int],
     found: SearchResult,
     fitted: FittedSlices,
-    voxel_mm: float,
+    settings: RegistrationSettings,
 ) -> tuple[FittedSlices, list[float]]:
     """Make stacks rigid again that gained nothing from slice poses of their own; agreement of all with the others.
 
@@ -183,7 +183,9 @@ def _with_rigid_stacks(
     if not rigid:
         return fitted, after.agreements(samples, fitted.weight)
     equal = np.ones(len(slices))
-    rigid_ncc = correlation_with_all(slices.with_motion(motion), equal, equal, voxel_mm)
+    rigid_ncc = correlation_with_all(
+        slices.with_motion(motion), equal, equal, settings.finest_voxel_mm, settings.max_pixels
+    )
     reverted = [
         sample
         for sample, old, new in zip(samples, before.correlations, after.correlations, strict=True)

@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 MIN_ROUNDS = 3
 """One round for each voxel size, whatever the deadline."""
 
+FIRST_ITERATIONS, FURTHER_ITERATIONS = 8, 5
+"""Conjugate-gradient steps of a volume from nothing, and of one that starts from the last round's."""
+
 N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
@@ -99,7 +102,7 @@ def refine_slices(
         logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
     n_rounds = max(settings.n_rounds, 1)  # a single stack has none, and is done
     progress(n_rounds, n_rounds)
-    ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm)
+    ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm, settings.max_pixels)
     return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
 
 
@@ -135,7 +138,7 @@ def fitted_in_place(
         history.append({"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": ncc, "moved": 0})
         logger.info("slices in place, round %d: residual %.4f", number + 1, width / 2)
     progress(max(n_rounds, 1), max(n_rounds, 1))
-    ncc_of_all = correlation_with_all(slices, gain, weight, voxel)
+    ncc_of_all = correlation_with_all(slices, gain, weight, voxel, settings.max_pixels)
     return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc_of_all, history=history)
 
 
@@ -157,12 +160,17 @@ def _volume_of(
         width = robust_width(residual, n_sigma=3)
         pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
     return solve_volume(
-        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
+        operator,
+        value.astype(np.float32),
+        pixel_weight,
+        start=start,
+        n_iterations=FIRST_ITERATIONS if start is None else FURTHER_ITERATIONS,
+        smoothness=smoothness,
     )
 
 
 def correlation_with_all(
-    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float
+    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], voxel_mm: float, max_pixels: int
 ) -> NDArray[np.float64]:
     """Correlation of each slice [K] with a volume made of all of them.
 
@@ -171,7 +179,8 @@ def correlation_with_all(
         gain: [K] intensity factors.
         weight: [K] slice weights.
         voxel_mm: of the volume.
+        max_pixels: about as many are looked at, at most.
     """
-    grid = grid_around(slices, voxel_mm)
-    volume = _volume_of(slices, grid, gain, weight, None, 0.03, 1)
-    return SliceModel(slices, volume, grid).evaluate(slices.planes, gain, 1.0).ncc
+    grid, stride = grid_around(slices, voxel_mm), max(1, round(len(slices.pixel_index) / max_pixels))
+    volume = _volume_of(slices, grid, gain, weight, None, 0.03, stride)
+    return SliceModel(slices, volume, grid, stride=stride).evaluate(slices.planes, gain, 1.0).ncc

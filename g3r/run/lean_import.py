@@ -1,8 +1,8 @@
-"""MONAI without the packages that it would import because they happen to be installed.
+"""MONAI and nibabel without the packages that they would import because they happen to be installed.
 
 `import monai` tries dozens of optional packages, plotting and statistics among them, and takes twice as long for those
-that it finds. A command of g3r uses nothing of them through MONAI. Elsewhere, in a notebook say, MONAI may be in use
-for other things, so that a program has to ask for this.
+that it finds; nibabel tries pydicom. A command of g3r uses nothing of them through these two. Elsewhere, in a notebook
+say, they may be in use for other things, so that a program has to ask for this.
 """
 
 from __future__ import annotations
@@ -10,24 +10,39 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 
-OPTIONAL = ("matplotlib", "pandas", "scipy.signal", "scipy.stats", "skimage", "itk", "tqdm")
+OPTIONAL = {
+    "monai": ("matplotlib", "pandas", "scipy.signal", "scipy.stats", "skimage", "itk", "tqdm"),
+    "nibabel": ("pydicom",),
+}
+"""What is hidden of which package's import."""
 
 _is_asked: list[bool] = []
 
 
 def import_lean() -> None:
-    """From now on networks are imported without what MONAI could do besides. For programs, not for libraries."""
+    """From now on networks are imported without what MONAI could do besides, and nibabel now without DICOM.
+
+    For programs, not for libraries.
+    """
     _is_asked[:] = [True]
+    with lean("nibabel"):
+        import_module("nibabel")
 
 
 @contextmanager
-def lean() -> Iterator[None]:
-    """Hide optional packages of MONAI while the block imports it, where a program asked for that.
+def lean(package: str = "monai") -> Iterator[None]:
+    """Hide optional packages of another one while the block imports it, where a program asked for that.
 
-    What is loaded already stays as it is. MONAI says what is missing where it is used.
+    What is loaded already stays as it is. The package says what is missing where it is used.
+
+    Args:
+        package: of `OPTIONAL`.
     """
-    hidden = [name for name in OPTIONAL if name not in sys.modules] if _is_asked and "monai" not in sys.modules else []
+    hidden = []
+    if _is_asked and package not in sys.modules:
+        hidden = [name for name in OPTIONAL[package] if name not in sys.modules]
     sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]
     try:
         yield

@@ -290,7 +290,8 @@ def test_the_table_of_changes_that_change_nothing(tally: Tally) -> None:
             if "2^" in name:
                 assert row["largest"] == 0, name  # scaling by a power of two is exact, to the last bit
             elif "times" in name:
-                assert row["mean"] < 0.01, name  # steps on halves of the slices enlarge rounding more than whole ones
+                # rounding decides which voxels at the rim belong to the brain, and with them where Gaussians stand
+                assert row["mean"] < 0.5 * plain, name
             elif "shifted" in name:
                 assert row["mean"] < 0.002, name
             elif "turned" in name:
