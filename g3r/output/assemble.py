@@ -67,7 +67,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             density=volumes.density,
             prior_grid=volumes.grid,
             least_weight=least,
-            rim_mm=settings.prior_rim_mm if settings.use_prior else 0.0,
+            rim_mm=settings.rim_mm,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
         )
         volume, left_to_prior, seen = mixture.volume(cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)

@@ -40,7 +40,7 @@ class ReconstructionSettings:
         held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         voxel_correction: how the volume is corrected by what slices say and Gaussians cannot show; None leaves that
-            out, as a single stack does.
+            out.
         prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`. 0 leaves its network out.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
@@ -86,6 +86,11 @@ class ReconstructionSettings:
     def lattice(self) -> LatticeSpacing:
         """How far the Gaussians are apart."""
         return LatticeSpacing(pixels=self.gaussian_spacing_pixels, at_most_mm=self.max_gaussian_spacing_mm)
+
+    @property
+    def rim_mm(self) -> float:
+        """How far beyond the support the volume is shown: where V_prior is soft, or stands alone."""
+        return self.prior_rim_mm if self.use_prior or not self.n_lattices else 0.0
 
     @property
     def tiling(self) -> Tiling:
@@ -218,7 +223,6 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
             settings,
             held_out=None,  # a narrow profile and a smooth volume look alike
             n_lattices=min(settings.n_lattices, 1),  # most of the volume is the prior
-            voxel_correction=None,
             pose_rounds=settings.pose_rounds if held else settings.pose_rounds.at_most(0),
             slice_stage=replace(stage, optimise_poses=stage.optimise_poses and held),
         )

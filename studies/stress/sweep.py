@@ -91,6 +91,9 @@ def _conditions() -> Iterator[Condition]:
     for pixels in (-4, -2, -1, 1, 2, 4):
         leave_out = "the mask of" if pixels < 0 else ""
         yield Condition(what="masks", level=f"{pixels:+d} pixels", damage=damage.masks_grown(pixels), fault=leave_out)
+    yield Condition(what="severe motion and", level="SNR 8", motion="severe", taken={"snr": 8.0})
+    yield Condition(what="severe motion and", level="4.4 mm", motion="severe", taken={"thickness_mm": 4.4})
+    yield Condition(what="severe motion and", level="two stacks", motion="severe", damage=damage.first_stacks(2))
     yield Condition(what="one stack", level="of another contrast", damage=damage.other_contrast(), fault=LAST)
     yield Condition(what="one stack", level="slices in reverse order", damage=damage.slices_reversed(), fault=LAST)
     yield Condition(what="one stack", level="slices sorted by time", damage=damage.halves_swapped(), fault=LAST)
