@@ -52,7 +52,7 @@ FEWER_STACKS = "balanced"
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
     """A reconstruction each: quick presets of all subjects first."""
     quick, careful = TRADE[:-1], TRADE[-1]
-    wanted = (*((preset, 3) for preset in quick), (FEWER_STACKS, 2), (careful, 2), (careful, 3), (FEWER_STACKS, 1))
+    wanted = (*((preset, 3) for preset in quick), (FEWER_STACKS, 2), (careful, 3), (FEWER_STACKS, 1), (careful, 2))
     for preset, n_stacks in wanted:
         for spec in SUBJECTS:
             yield Task(f"{spec.name}, {n_stacks}, {preset}", measure, (spec, n_stacks, preset, options))
