@@ -28,7 +28,7 @@ from g3r.cli.time_left import TimeLeft, expected_seconds, needs_compiling
 from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
 from g3r.run.idle_threads import let_threads_sleep
-from g3r.run.lean_import import import_lean
+from g3r.run.lean_import import import_lean, load_nibabel
 from g3r.run.log_file import LOG_NAME, LogFile
 from g3r.run.stop_request import StopRequest
 
@@ -94,6 +94,7 @@ def _way_on(folder: Path) -> str:
 def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Terminal) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
+    load_nibabel()
     with terminal.held_back():
         with stacks_on_disk(options, replaces=replaces) as dicom:
             networks = check_files(options, folder, replaces=replaces)  # before an image is read

@@ -22,11 +22,12 @@ _is_asked: list[bool] = []
 
 
 def import_lean() -> None:
-    """From now on networks are imported without what MONAI could do besides, and nibabel now without DICOM.
-
-    For programs, not for libraries.
-    """
+    """From now on networks are imported without what MONAI could do besides. For programs, not for libraries."""
     _is_asked[:] = [True]
+
+
+def load_nibabel() -> None:
+    """Import nibabel, without DICOM where a program asked for lean imports."""
     with lean("nibabel"):
         import_module("nibabel")
 
