@@ -27,9 +27,6 @@ logger = logging.getLogger(__name__)
 MIN_ROUNDS = 3
 """One round for each voxel size, whatever the deadline."""
 
-FIRST_ITERATIONS, FURTHER_ITERATIONS = 8, 5
-"""Conjugate-gradient steps of a volume from nothing, and of one that starts from the last round's."""
-
 N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
@@ -160,12 +157,7 @@ def _volume_of(
         width = robust_width(residual, n_sigma=3)
         pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
     return solve_volume(
-        operator,
-        value.astype(np.float32),
-        pixel_weight,
-        start=start,
-        n_iterations=FIRST_ITERATIONS if start is None else FURTHER_ITERATIONS,
-        smoothness=smoothness,
+        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
     )
 
 
