@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import affine_transform, spline_filter
+from scipy.ndimage import affine_transform
 
 from g3r.geometry.rigid import RigidPose
 
@@ -134,27 +134,23 @@ def bounding_box(mask: NDArray[np.bool_], margin: ArrayLike = 0) -> tuple[slice,
     return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
 
-def on_grid(
-    data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float, order: int = 1
-) -> NDArray[np.float32]:
-    """A map read on another grid by trilinear interpolation, or an image by splines.
+def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float) -> NDArray[np.float32]:
+    """A map read on another grid by trilinear interpolation.
 
     Args:
         data: [I, J, K] on `source`.
         source: its grid.
         target: the grid of the result.
         outside: value where `source` does not reach.
-        order: of the splines. Those of order 3 keep the edges of an image, and overshoot beside those of a map.
     """
     if source.shape == target.shape and np.allclose(source.affine, target.affine, atol=1e-9):
         return data.astype(np.float32)
     index, data = source.index_from_world @ target.affine, data.astype(np.float32)
-    data = data if order == 1 else spline_filter(data, order, output=np.float32)
     found = np.empty(target.shape, np.float32)
 
     def fill(first: int) -> None:
         shift, part = index[:3, 3] + index[:3, 0] * first, found[first : first + SLAB]
-        affine_transform(data, index[:3, :3], shift, part.shape, part, order, "constant", outside, prefilter=False)
+        affine_transform(data, index[:3, :3], shift, part.shape, part, order=1, mode="constant", cval=outside)
 
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:  # scipy takes one thread, and releases Python's lock
         list(pool.map(fill, range(0, len(found), SLAB)))

@@ -18,9 +18,6 @@ from g3r.uncertainty.unseen import UnseenPart
 LEAST_WEIGHT = 0.01
 """Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
 
-IMAGE_ORDER = 3
-"""Of the splines by which V_prior is read on another grid: trilinear ones blur it (0.2 dB of a preview)."""
-
 INSIDE = 0.5
 """A region of one grid holds a point of another where its interpolated share is at least this."""
 
@@ -85,7 +82,7 @@ class Mixture:
             ValueError: a grid with sheared axes.
         """
         shown = self._shown(grid)
-        prior = on_grid(self.prior, self.prior_grid, grid, outside=0.0, order=IMAGE_ORDER)
+        prior = on_grid(self.prior, self.prior_grid, grid, outside=0.0)
         if not len(cloud):
             return prior * shown
         weight = np.where(self._region(self.support, grid), self.left_to_prior(grid), 1)

@@ -117,7 +117,7 @@ def test_without_a_fit_the_prior_volume_is_shown_and_nothing_is_said_of_its_erro
     assert result.uncertainty is None
     assert result.prior_share is None
     assert verdict_of(result.record).word == "check"
-    prior = on_grid(result.prior, result.prior_grid, result.grid, outside=0.0, order=3)
+    prior = on_grid(result.prior, result.prior_grid, result.grid, outside=0.0)
     inside = result.mask & (result.volume != 0)
     assert inside.sum() > 0.95 * result.mask.sum()
     np.testing.assert_allclose(result.volume[inside], prior[inside], rtol=1e-5)
