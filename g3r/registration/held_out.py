@@ -190,23 +190,31 @@ def held_out_score(
 def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> list[float]:
     """How well the masked pixels of each stack are predicted by the others, finely enough to tell poses 0.3 mm apart.
 
+    Only pixels that others saw count: their volume is zero elsewhere, and the smaller the hole, the better would
+    be what closes it.
+
     Args:
         slices: of two or more stacks, at their present poses.
         gain: [K] intensity factors.
 
     Returns:
-        The correlation of each stack.
+        The correlation of each stack; 0 where the others saw nothing of it.
     """
     value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
     evened = replace(slices, value=value)
     found = []
     for stack in np.unique(slices.stack_id):
         operator, values, grid = _of_others(evened, stack, FINE_VOXEL_MM, None, FINE_PIXELS_OF_VOLUME)
-        volume = solve_volume(operator, values, np.ones(len(values), np.float32), n_iterations=8, smoothness=0.1)
+        weight = np.ones(len(values), np.float32)
+        volume = solve_volume(operator, values, weight, n_iterations=8, smoothness=0.1)
+        share = coverage_share(operator.adjoint(weight))
         own = evened.take(evened.stack_id == stack)
         index = own.pixel_index[:: max(1, len(own.pixel_index) // FINE_PIXELS_OF_VOLUME)]
-        predicted = VoxelOperator(own.planes, grid, index, (1, 1, 5)).forward(volume)
-        found.append(float(np.corrcoef(predicted, own.value[index])[0, 1]))
+        sampling = VoxelOperator(own.planes, grid, index, (1, 1, 5))
+        seen = sampling.forward(share) > 0.5
+        predicted, given = sampling.forward(volume)[seen], own.value[index[seen]]
+        varies = seen.sum() > 1 and predicted.std() > 0 and given.std() > 0
+        found.append(float(np.corrcoef(predicted, given)[0, 1]) if varies else 0.0)
     return found
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.least_squares import solve_volume
@@ -30,6 +31,13 @@ MIN_ROUNDS = 3
 N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
+
+
+CONTINUED_VOXELS = 1.5
+"""Standard deviation, in voxels, of the blur that continues a volume beyond the masks."""
+
+LEAST_SEEN = 1e-6
+"""Share of the highest blurred coverage below which a voxel is too far from all masks to be continued to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +77,10 @@ def refine_slices(
         progress(number, settings.n_rounds)
         # 1 in the last round; rounded, so that the steps below do not depend on the last digit
         fraction = round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9)
-        # coarse to fine: the capture range is about a voxel of the volume's blur
-        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.34 else 1.6 if fraction < 0.75 else 1.0)
-        smoothness = 0.3 if fraction < 0.2 else 0.1 if fraction < 0.5 else 0.03
+        # coarse to fine: the capture range is about a voxel of the volume's blur. Few coarse rounds, since blur moves
+        # what is round inwards, and slices follow it along their normal
+        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.1 else 1.6 if fraction < 0.45 else 1.0)
+        smoothness = 0.1 if fraction < 0.2 else 0.03 if fraction < 0.7 else 0.01
         if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
             grid, volume = grid_around(slices, voxel), None
         n_wanted = settings.max_pixels / (voxel / settings.finest_voxel_mm)
@@ -152,13 +161,30 @@ def _volume_of(
     operator = VoxelOperator(slices.planes, grid, index, (1, 1, 5))
     value = slices.value[index] / gain[operator.plane]
     pixel_weight = weight[operator.plane].astype(np.float32)
-    if start is not None:  # pixels far from the present volume (spikes, signal loss) count less
+    if start is None:
+        start = continued_outwards(operator, value.astype(np.float32), pixel_weight)
+    else:  # pixels far from the present volume (spikes, signal loss) count less
         residual = value - operator.forward(start)
         width = robust_width(residual, n_sigma=3)
         pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
     return solve_volume(
         operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
     )
+
+
+def continued_outwards(
+    operator: VoxelOperator, value: NDArray[np.float32], weight: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """A blurred volume [I, J, K] that goes on beyond the masks as it is at their rim.
+
+    Zeros there would be taken for what lies outside: pixels of the rim would seem too bright, and their slices would
+    move inwards, where nothing is lost, since pixels outside the mask are not asked. Normalised convolution
+    (Knutsson and Westin 1993) says nothing of what was not seen.
+    """
+    bright = gaussian_filter(operator.adjoint(weight * value), CONTINUED_VOXELS, truncate=6.0)
+    seen = gaussian_filter(operator.adjoint(weight), CONTINUED_VOXELS, truncate=6.0)
+    near = seen > LEAST_SEEN * seen.max(initial=0)
+    return np.divide(bright, seen, out=np.zeros_like(bright), where=near)
 
 
 def correlation_with_all(

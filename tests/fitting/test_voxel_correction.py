@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.fitting.slice_stage import SliceFit
-from g3r.fitting.voxel_correction import VoxelCorrection, VoxelCorrectionSettings, correct_on_voxels, too_fine
+from g3r.fitting.voxel_correction import QUIET, VoxelCorrection, VoxelCorrectionSettings, correct_on_voxels, too_fine
 from g3r.geometry import VolumeGrid
 from tests.fitting.scene import BALL, GRID, INDEX, make_slices, true_cloud, true_volume
 
@@ -135,3 +135,14 @@ def test_fine_voxels_show_no_grid_of_pixels() -> None:
         assert values.std() < pattern * values.mean()
     assert not too_fine(GRID.respaced(0.55), slices)
     assert too_fine(GRID.respaced(0.45), slices)
+
+
+def test_the_noisier_the_slices_the_stronger_the_pull() -> None:
+    by_noise = [SETTINGS.for_noise(noise) for noise in (0.0, QUIET, 2 * QUIET)]
+    assert [one.hold for one in by_noise] == pytest.approx([SETTINGS.hold, SETTINGS.hold, 4 * SETTINGS.hold])
+    assert by_noise[2].total_variation == pytest.approx(4 * SETTINGS.total_variation)
+    assert by_noise[2].loose_hold == SETTINGS.loose_hold
+    truth, clean = true_volume(), fit_of(np.ones(24))
+    noise = np.random.default_rng(4).normal(0, 3 * QUIET, len(clean.slices.value)).astype(np.float32)
+    noisy = replace(clean, slices=replace(clean.slices, value=clean.slices.value + noise))
+    assert correction(truth, noisy).record.hold == pytest.approx(9 * SETTINGS.hold, rel=0.15)

@@ -9,7 +9,13 @@ from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.held_out import best_initialisation, estimate_interleave, held_out_score, volume_without
+from g3r.registration.held_out import (
+    best_initialisation,
+    estimate_interleave,
+    fine_held_out_correlations,
+    held_out_score,
+    volume_without,
+)
 from g3r.registration.similarity import StackSamples
 from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed, stack_moved, turned_about
 
@@ -104,3 +110,28 @@ def test_the_interleave_of_the_least_movement_is_the_true_one(head: Phantom) -> 
         slices, truth = as_slices(simulated(head, level, n_stacks=1, interleave=interleave))
         (sample,) = StackSamples.of_all(slices)
         assert estimate_interleave(sample, truth) == interleave
+
+
+def test_the_fine_correlation_asks_only_where_others_saw(still_slices: tuple[Slices, RigidPose]) -> None:
+    """Zeros of what two of three stacks did not see say nothing of poses; closing the hole is no better than truth."""
+    slices, _ = still_slices
+    place = np.abs(slices.slice_index - np.median(slices.slice_index))
+    holed = slices.take((slices.stack_id == 0) | (place > 2))
+    center = holed.planes.center_mm.copy()
+    for stack in (1, 2):
+        rows = np.flatnonzero(holed.stack_id == stack)
+        side = np.sign(holed.slice_index[rows] - np.median(slices.slice_index))
+        center[rows] -= 1.5 * side[:, None] * holed.planes.rotation[rows, :, 2]
+    closed = holed.with_pose(RigidPose(holed.planes.rotation, center))
+    whole, right, wrong = (
+        float(np.mean(fine_held_out_correlations(one, np.ones(len(one))))) for one in (slices, holed, closed)
+    )
+    assert right > whole - 0.12
+    assert right > wrong + 0.01
+
+
+def test_a_stack_of_which_others_saw_nothing_correlates_by_zero(still_slices: tuple[Slices, RigidPose]) -> None:
+    slices, _ = still_slices
+    center = slices.planes.center_mm + np.array([0.0, 0.0, 500.0]) * (slices.stack_id == 2)[:, None]
+    apart = slices.with_pose(RigidPose(slices.planes.rotation, center)).take(slices.stack_id != 1)
+    assert fine_held_out_correlations(apart, np.ones(len(apart))) == [0.0, 0.0]
