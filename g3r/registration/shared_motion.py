@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import orthonormal, rotation_matrix
 from g3r.registration.held_out import fine_held_out_correlations
 
 MAX_FACTOR = 2.0
@@ -57,7 +55,8 @@ def carried_on(slices: Slices, gain: NDArray[np.float64], before: RigidPose, hel
     move = shared_move(slices, before)
 
     def moved_on(factor: float) -> tuple[Slices, float]:
-        further = _moved(slices, factor * move)
+        step = RigidPose.from_rotvec(factor * move[:, :3], factor * move[:, 3:])
+        further = slices.with_pose(slices.planes.pose @ step)
         return further, float(np.mean(fine_held_out_correlations(further, gain)))
 
     factor = _peak(held_out, moved_on(MAX_FACTOR / 2)[1], moved_on(MAX_FACTOR)[1])
@@ -77,11 +76,8 @@ def shared_move(slices: Slices, before: RigidPose) -> NDArray[np.float64]:
         slices: K slices after the move.
         before: [K] their poses before it.
     """
-    after = slices.planes.pose
-    back = before.rotation.transpose(0, 2, 1)
-    turn = Rotation.from_matrix(back @ after.rotation).as_rotvec()
-    shift_mm = np.einsum("kij,kj->ki", back, after.translation_mm - before.translation_mm)
-    move = np.concatenate([turn, shift_mm], axis=1)
+    last = before.inverse() @ slices.planes.pose
+    move = np.concatenate([last.rotvec_rad(), last.translation_mm], axis=1)
     n_pixels = np.bincount(slices.pixel_plane, minlength=len(slices))
     shared = np.zeros_like(move)
     for stack in np.unique(slices.stack_id):
@@ -94,16 +90,6 @@ def shared_move(slices: Slices, before: RigidPose) -> NDArray[np.float64]:
         coefficient = np.linalg.lstsq(basis * root, move[rows] * root, rcond=None)[0]
         shared[rows] = basis @ coefficient
     return shared
-
-
-def _moved(slices: Slices, move: NDArray[np.float64]) -> Slices:
-    pose = slices.planes.pose
-    return slices.with_pose(
-        RigidPose(
-            orthonormal(pose.rotation @ rotation_matrix(move[:, :3])),
-            pose.translation_mm + np.einsum("kij,kj->ki", pose.rotation, move[:, 3:]),
-        )
-    )
 
 
 def _peak(at_zero: float, at_half: float, at_end: float) -> float:

@@ -26,12 +26,11 @@ logger = logging.getLogger(__name__)
 
 
 MIN_ROUNDS = 3
-"""One round for each voxel size, whatever the deadline."""
+"""One with coarse voxels and two with the finest, whatever the deadline."""
 
 N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
-
 
 CONTINUED_VOXELS = 1.5
 """Standard deviation, in voxels, of the blur that continues a volume beyond the masks."""
