@@ -39,6 +39,8 @@ class LearningRates:
         bias_field: of the coefficients of the stacks' log-fields.
         rotation_rad: of the slices' rotation vectors.
         translation_mm: of the slices' translations.
+        shear: of the strain that two stacks leave open (`fitting.open_shear`). Larger ones follow noise where slices do
+            not tell it, in still heads.
     """
 
     mean_share: float = 0.04
@@ -49,6 +51,7 @@ class LearningRates:
     bias_field: float = 0.016
     rotation_rad: float = 2e-3
     translation_mm: float = 0.06
+    shear: float = 5e-4
 
 
 class FitParameters:

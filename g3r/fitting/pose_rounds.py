@@ -2,9 +2,7 @@
 
 Registration works on a least-squares volume that repeats the errors of its poses. The Gaussians are held to V_prior,
 which has learned what heads look like, and slices move with them: two stacks, which check each other only where they
-cross, come nearer to the truth with every round. What the slices of a stack moved by together is then carried on, as
-far as the two predict each other better (`registration.shared_motion`). A round is kept where stacks predict each
-other at least as well.
+cross, come nearer to the truth with every round. A round is kept where stacks predict each other at least as well.
 """
 
 from __future__ import annotations
@@ -27,7 +25,6 @@ from g3r.gaussians import render
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
 from g3r.registration.normal_equations import SliceModel as SamplingModel
-from g3r.registration.shared_motion import carried_on
 from g3r.registration.slice_registration import register_slices, try_neighbours
 
 logger = logging.getLogger(__name__)
@@ -77,13 +74,11 @@ class PoseRounds:
         held_out: mean correlation of each stack with a volume of the others, before the first round and after each, the
             undone one included; empty for a single stack.
         n_moved: slices that took the motion of a neighbour, in each round.
-        carried_on: how many times more the shared move of the slices was made, in each round of two stacks.
     """
 
     n_kept: int
     held_out: list[float]
     n_moved: list[int]
-    carried_on: list[float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,10 +154,9 @@ def refine_in_rounds(
         rng: draws what the fits draw.
         progress: called with (rounds done, rounds in all).
     """
-    n_stacks = prior.volumes.slices.n_stacks
-    checked = n_stacks > 1
+    checked = prior.volumes.slices.n_stacks > 1
     held_out = [_mean_held_out(registration)] if checked else []
-    n_kept, n_moved, factors = 0, list[int](), list[float]()
+    n_kept, n_moved = 0, list[int]()
     for number in range(n_rounds):
         progress(number, n_rounds)
         moved, neighbours = _registered_to_fit(
@@ -170,12 +164,7 @@ def refine_in_rounds(
         )
         n_moved.append(neighbours)
         if checked:
-            after = _mean_held_out(moved)
-            if n_stacks == 2:  # three have found their poses after one round
-                further = carried_on(moved.slices, moved.gain, registration.slices.planes.pose, after)
-                moved, after = replace(moved, slices=further.slices), further.held_out
-                factors.append(round(further.factor, 2))
-            held_out.append(after)
+            held_out.append(_mean_held_out(moved))
             logger.info("poses, round %d: held-out correlation %.4f, before %.4f", number + 1, *held_out[:-3:-1])
             if held_out[-1] < held_out[-2] - MAX_LOSS:
                 prior = prior_of(registration, True)
@@ -184,7 +173,7 @@ def refine_in_rounds(
         n_kept += 1
     progress(n_rounds, n_rounds)
     held_out = [round(value, 4) for value in held_out]
-    record = PoseRounds(n_kept=n_kept, held_out=held_out, n_moved=n_moved, carried_on=factors)
+    record = PoseRounds(n_kept=n_kept, held_out=held_out, n_moved=n_moved)
     return RefinedPoses(registration=registration, prior=prior, record=record)
 
 

@@ -11,6 +11,7 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.gain_trends import GainTrends
 from g3r.fitting.objective import TermLoss
+from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.gaussians.render import right_jacobian
@@ -22,6 +23,7 @@ def slice_blocks(
     bias_field: StackBiasField | None,
     rates: LearningRates,
     optimise_poses: bool,
+    open_shear: OpenShear | None = None,
 ) -> dict[str, Block]:
     """Parameters fitted along with the cloud: start values and step sizes, by name.
 
@@ -31,12 +33,15 @@ def slice_blocks(
         bias_field: fields of the stacks; None where they are not fitted.
         rates: step sizes.
         optimise_poses: whether slices move.
+        open_shear: moves slices and Gaussians together, where slices move.
     """
     n = len(slices)
     blocks: dict[str, Block] = {}
     if optimise_poses:
         blocks["rotation"] = np.zeros((n, 3)), rates.rotation_rad
         blocks["translation"] = np.zeros((n, 3)), rates.translation_mm
+        if open_shear is not None:
+            blocks["shear"] = np.zeros(1), rates.shear
     if n > 1:  # the gain of a single slice cannot be separated from the amplitudes
         blocks["log_gain"] = np.log(gain), rates.log_gain
     if bias_field:
@@ -48,16 +53,21 @@ class SliceParameters:
     """The state of the slices at the present parameters, and the gradients back.
 
     Blocks: rotation [K, 3] (rad) and translation [K, 3] (mm), R <- R exp(rotation), t <- t + translation;
-    log_gain [K], of which the mean is taken off; bias_field [n_stacks, 5]. What has no block stays as it is.
+    log_gain [K], of which the mean is taken off; bias_field [n_stacks, 5]; shear [1], zero between steps (`OpenShear`).
+    What has no block stays as it is.
 
     Args:
         slices: K slices.
         gain: [K] intensity factors, used where there is no block of gains.
         parameters: of the fit.
+        open_shear: where there is a block of it.
     """
 
-    def __init__(self, slices: Slices, gain: NDArray[np.float64], parameters: FitParameters) -> None:
+    def __init__(
+        self, slices: Slices, gain: NDArray[np.float64], parameters: FitParameters, open_shear: OpenShear | None = None
+    ) -> None:
         self.parameters, self.gain = parameters, gain.astype(np.float64)
+        self.open_shear = open_shear if "shear" in parameters.value else None
         self.start = PlaneState.of(slices.planes, parameters.origin_mm)
         _, self.stack = np.unique(slices.stack_id, return_inverse=True)
         corner_mm = np.sqrt(((slices.planes.shape * slices.planes.spacing_mm / 2) ** 2).sum(1))
@@ -111,6 +121,8 @@ class SliceParameters:
             after = np.einsum("kji,kj->ki", right_jacobian(rotation), image.plane_gradient[:, :3])
             gradient["rotation"][...] = after + pull * radius2 * rotation
             gradient["translation"][...] = image.plane_gradient[:, 3:6] + pull * translation
+            if self.open_shear is not None:  # after all that moves by it
+                gradient["shear"][0] = self.open_shear.slope(self.parameters)
         if "log_gain" in value:
             slope = image.plane_gradient[image.chosen, 6]  # the mean of slices that were not seen is not known
             gradient["log_gain"][...] = 0.0
@@ -125,3 +137,8 @@ class SliceParameters:
             loss += bias_field_ridge * float(np.mean(c**2))
             gradient["bias_field"][...] = total + 2 * bias_field_ridge / c.size * c
         return loss
+
+    def fold(self) -> None:
+        """Take the shear of the last step into what it moves."""
+        if self.open_shear is not None:
+            self.open_shear.fold(self.parameters)

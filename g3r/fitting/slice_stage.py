@@ -14,6 +14,7 @@ from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
+from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
@@ -145,7 +146,8 @@ def fit_slices(
         )
     several = slices.n_stacks > 1  # one stack cannot separate its bias field from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
-    blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses)
+    shear = OpenShear.of(slices, cloud.origin_mm)
+    blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses, shear)
     parameters = FitParameters(cloud, settings.rates, blocks)
     loss = SliceLoss(
         parameters,
@@ -156,6 +158,7 @@ def fit_slices(
         prior=prior,
         settings=settings,
         pixel_weight=counted,
+        open_shear=shear,
     )
     guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
@@ -167,6 +170,7 @@ def fit_slices(
         if not guard.step(value, cosine_decay(fraction)):
             entry |= {"rollback": 1.0}
             loss.turns.forget()
+        loss.unknowns.fold()
         history.append(entry)
         if step and step % settings.reweight_every == 0:
             guard.rescale(loss.reweight())
@@ -200,6 +204,7 @@ class SliceLoss:
         prior: distillation target, or None.
         settings: weights of the terms.
         pixel_weight: [P] not negative; the slices' masks when None.
+        open_shear: where there is a block of it.
     """
 
     def __init__(
@@ -213,10 +218,11 @@ class SliceLoss:
         prior: VolumeTarget | None,
         settings: SliceStageSettings,
         pixel_weight: NDArray[np.float32] | None = None,
+        open_shear: OpenShear | None = None,
     ) -> None:
         self.settings, self.slice_weight = settings, slice_weight
         self.origin_mm = parameters.origin_mm
-        self.unknowns = SliceParameters(slices, gain, parameters)
+        self.unknowns = SliceParameters(slices, gain, parameters, open_shear)
         self.term = ImageTerm.of(
             slices.planes,
             slices.value,

@@ -128,13 +128,3 @@ def test_held_out_correlation_tells_poses_half_a_millimetre_apart() -> None:
     dark = np.where(true.stack_id == 1, 0.5, 1.0)
     darker = replace(true, value=(true.value * dark[true.planes.plane_id()]).astype(np.float32))
     assert fine_held_out_correlations(darker, dark) == pytest.approx(right, abs=1e-5)
-
-
-def test_two_stacks_carry_on_what_they_moved_by_together() -> None:
-    true = make_slices()
-    start = registration_of(moved_away(true))
-    assert run(start, 1)[0].record.carried_on == []
-    two = true.take(true.stack_id < 2)
-    record = run(registration_of(moved_away(two)), 1)[0].record
-    assert len(record.carried_on) == 1
-    assert 0 <= record.carried_on[0] <= 2

@@ -1,0 +1,112 @@
+"""The shear of the head that slices of two orientations leave open, as one more parameter of a fit.
+
+Let n and m be the normals of two stacks and E a multiple of n m^T + m n^T. The motion x -> x + a E x of the head keeps
+every slice of either stack a rigid plane, to first order: E has no part within a slice, where one of its two factors is
+zero. Slices shift along the other normal and tilt. So Gaussians and slices that move by it together explain the same
+pixels, but for how slices are turned against others of their stack. Steps of single slices are slow to find it, since a
+slice that moves alone leaves the volume that the others made. It was most of what two stacks had wrong at the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting.parameters import FitParameters
+
+MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
+"""Singular values of the map from strains to what slices of all stacks see of them in plane: the least one of an open
+strain, and the next one. The first lets further stacks be 10 degrees from one of two orientations; the second asks for
+45 degrees between the two, since slices of one orientation leave more than one strain open."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenShear:
+    """How Gaussians and slices move together per unit of the shear.
+
+    Attributes:
+        strain: [3, 3] symmetric, of Frobenius norm 1.
+        middle_mm: [3] what stays in place, from the cloud's origin.
+        rotation: [K, 3] rad, after the rotation of each slice.
+        translation_mm: [K, 3].
+    """
+
+    strain: NDArray[np.float64]
+    middle_mm: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation_mm: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, slices: Slices, origin_mm: NDArray[np.float64]) -> OpenShear | None:
+        """The open shear of some slices; None where there is not exactly one.
+
+        Args:
+            slices: K slices at the start of a fit.
+            origin_mm: [3] of the cloud.
+        """
+        strain = open_strain(mean_normals(slices))
+        if strain is None:
+            return None
+        frame, center_mm = slices.planes.rotation, slices.planes.center_mm - origin_mm
+        middle_mm = center_mm.mean(0)
+        within = np.einsum("kji,jl,klm->kim", frame, strain, frame)
+        return cls(
+            strain=strain,
+            middle_mm=middle_mm,
+            rotation=np.stack([within[:, 2, 1], -within[:, 2, 0], np.zeros(len(slices))], axis=1),
+            translation_mm=(center_mm - middle_mm) @ strain,
+        )
+
+    def slope(self, parameters: FitParameters) -> float:
+        """The derivative of the loss in the shear.
+
+        Args:
+            parameters: with the gradients of `mean_mm`, `rotation` and `translation`.
+        """
+        gradient = parameters.gradient
+        along = np.vdot(gradient["mean_mm"].astype(np.float64), self._of_centres(parameters))
+        along += np.vdot(gradient["rotation"].astype(np.float64), self.rotation)
+        return float(along + np.vdot(gradient["translation"].astype(np.float64), self.translation_mm))
+
+    def fold(self, parameters: FitParameters) -> None:
+        """Move Gaussians and slices by the shear that the optimiser has arrived at, and set it to zero.
+
+        Args:
+            parameters: with a block `shear` [1].
+        """
+        value = parameters.value
+        amount = float(value["shear"][0])
+        value["shear"][0] = 0.0
+        value["mean_mm"] += (amount * self._of_centres(parameters)).astype(np.float32)
+        value["rotation"] += (amount * self.rotation).astype(np.float32)
+        value["translation"] += (amount * self.translation_mm).astype(np.float32)
+
+    def _of_centres(self, parameters: FitParameters) -> NDArray[np.float64]:
+        return np.asarray((parameters.value["mean_mm"].astype(np.float64) - self.middle_mm) @ self.strain)
+
+
+def mean_normals(slices: Slices) -> NDArray[np.float64]:
+    """The mean normal of each stack [n_stacks, 3]."""
+    normal = slices.planes.rotation[:, :, 2]
+    mean = np.stack([normal[slices.stack_id == stack].mean(0) for stack in np.unique(slices.stack_id)])
+    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
+
+
+def open_strain(normals: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The strain [3, 3] that no stack sees in plane; None where there is not exactly one.
+
+    Args:
+        normals: [n_stacks, 3].
+    """
+    units = [np.outer(one, other) for one in np.eye(3) for other in np.eye(3)]
+    strains = [unit + unit.T for unit in np.array(units)[[0, 1, 2, 4, 5, 8]]]
+    strains = [strain / np.linalg.norm(strain) for strain in strains]
+    in_plane = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    seen = np.stack([(in_plane @ strain @ in_plane).ravel() for strain in strains], axis=1)
+    _, size, combinations = np.linalg.svd(seen)
+    if size[-1] > MAX_CLOSED or size[-2] < MIN_OTHERS:
+        return None
+    return np.einsum("n,nij->ij", combinations[-1], np.stack(strains))

@@ -1,0 +1,169 @@
+"""The shear that two orientations leave open: which it is, that it changes no pixel, and that a fit follows it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting.open_shear import OpenShear, mean_normals, open_strain
+from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.slice_parameters import slice_blocks
+from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
+from g3r.gaussians import GaussianCloud, render
+from g3r.geometry import RigidPose
+from g3r.geometry.quaternion import rotation_from_quaternion
+from tests.fitting.scene import fit, make_slices, true_cloud, true_volume
+from tests.gaussians.scenes import cloud_of
+
+X, Y, Z = np.eye(3)
+
+
+def tilted(direction: np.ndarray, towards: np.ndarray, degrees: float) -> np.ndarray:
+    return np.cos(np.deg2rad(degrees)) * direction + np.sin(np.deg2rad(degrees)) * towards
+
+
+@pytest.mark.parametrize("other", [X, tilted(X, Z, 20), tilted(X, Z, -40)])
+def test_two_orientations_leave_the_product_of_their_normals_open(other: np.ndarray) -> None:
+    strain = open_strain(np.stack([Z, other]))
+    assert strain is not None
+    expected = np.outer(Z, other) + np.outer(other, Z)
+    assert abs(np.vdot(strain, expected / np.linalg.norm(expected))) == pytest.approx(1)
+    for normal in (Z, other):
+        in_plane = np.eye(3) - np.outer(normal, normal)
+        np.testing.assert_allclose(in_plane @ strain @ in_plane, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("third", [X, -Z, tilted(X, Y, 8)])
+def test_further_stacks_of_the_same_two_orientations_leave_it_open(third: np.ndarray) -> None:
+    assert open_strain(np.stack([Z, X, third])) is not None
+
+
+@pytest.mark.parametrize(
+    "normals", [[Z], [Z, Z], [Z, tilted(Z, X, 30)], [X, Y, Z], [X, Z, tilted(X, Y, 30)], [Z, tilted(Z, X, 5), -Z]]
+)
+def test_one_and_three_orientations_do_not_leave_one_strain(normals: list[np.ndarray]) -> None:
+    assert open_strain(np.stack(normals)) is None
+
+
+def turned_slices() -> Slices:
+    """Two stacks whose slices are turned against each other, as jerks turn them, with the pixels of the true cloud."""
+    slices = make_slices()
+    slices = slices.take(slices.stack_id < 2)
+    turn = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 0.12, (len(slices), 3))).as_matrix()
+    pose = slices.planes.pose
+    slices = slices.with_pose(RigidPose(pose.rotation @ turn, pose.translation_mm))
+    value = render(true_cloud(), slices.planes, cutoff_sigma=6.0).numpy()
+    mask = np.linalg.norm(slices.planes.pixel_world_mm(), axis=1) < 10
+    return replace(slices, value=value, mask=mask)
+
+
+def parameters_of(slices: Slices) -> tuple[FitParameters, OpenShear]:
+    cloud = true_cloud()
+    shear = OpenShear.of(slices, cloud.origin_mm)
+    assert shear is not None
+    blocks = slice_blocks(slices, np.ones(len(slices)), None, LearningRates(), True, shear)
+    return FitParameters(cloud, LearningRates(), blocks), shear
+
+
+def reshaped(cloud: GaussianCloud, motion: np.ndarray) -> GaussianCloud:
+    """Gaussians whose shapes follow a linear motion [3, 3], too, which a fit leaves to their own parameters."""
+    frame = rotation_from_quaternion(cloud.quaternion_wxyz).numpy()
+    half = motion @ frame * np.exp(cloud.log_scale.numpy())[:, None]
+    variance, axes = np.linalg.eigh(half @ half.transpose(0, 2, 1))
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]
+    turn = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
+    return cloud_of(cloud.mean_mm.numpy(), np.log(variance) / 2, turn, cloud.amplitude.numpy())
+
+
+def moved(slices: Slices, amount: float, *, alone: bool = False) -> np.ndarray:
+    """Pixels after the head and slices moved by a shear, or slices alone."""
+    parameters, shear = parameters_of(slices)
+    parameters.value["shear"][0] = amount
+    shear.fold(parameters)
+    assert parameters.value["shear"][0] == 0
+    cloud = true_cloud() if alone else reshaped(parameters.cloud(), np.eye(3) + amount * shear.strain)
+    pose = slices.planes.pose
+    rotation = pose.rotation @ Rotation.from_rotvec(parameters.value["rotation"]).as_matrix()
+    there = RigidPose(rotation, pose.translation_mm + parameters.value["translation"])
+    return render(cloud, slices.with_pose(there).planes, cutoff_sigma=6.0).numpy()
+
+
+def test_slices_and_gaussians_that_move_together_explain_the_same_pixels() -> None:
+    still = make_slices()
+    still = still.take(still.stack_id < 2)
+    before, amount = moved(still, 0.0), 0.04
+    together, alone = (np.abs(moved(still, amount, alone=one) - before).mean() for one in (False, True))
+    assert together < 0.1 * alone  # of second order, and the profile, which turns as slices do
+
+
+def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
+    slices = turned_slices()
+    noise = np.random.default_rng(2).normal(0, 0.05, slices.value.shape).astype(np.float32)
+    slices = replace(slices, value=slices.value + noise)
+
+    def loss_at(amount: float) -> tuple[float, float]:
+        parameters, shear = parameters_of(slices)
+        ones = np.ones(len(slices))
+        # every slice in its turn; tails of Gaussians that are cut off would jump
+        settings = SliceStageSettings(n_parts=1, scale_weight=0.0, gain_trend_ridge=0.0, cutoff_sigma=6.0)
+        loss = SliceLoss(
+            parameters,
+            slices,
+            gain=ones,
+            slice_weight=ones,
+            bias_field=None,
+            prior=None,
+            settings=settings,
+            open_shear=shear,
+        )
+        parameters.value["shear"][0] = amount
+        loss.unknowns.fold()
+        return loss.evaluate(0.5)[0], float(parameters.gradient["shear"][0])
+
+    step = 1e-3
+    slope = (loss_at(step)[0] - loss_at(-step)[0]) / (2 * step)
+    assert loss_at(0.0)[1] == pytest.approx(slope, rel=0.03)
+
+
+def strain_left(slices: Slices, true: Slices) -> float:
+    """How much of the open strain the poses differ by from the true ones."""
+    strain = open_strain(mean_normals(true))
+    assert strain is not None
+    place = true.planes.center_mm - true.planes.center_mm.mean(0)
+    away = slices.planes.center_mm - true.planes.center_mm
+    away = away - away.mean(0)
+    # a common turn of all slices is no error
+    turns = [np.cross(axis, place).ravel() for axis in np.eye(3)]
+    found = np.linalg.lstsq(np.stack([(place @ strain).ravel(), *turns], 1), away.ravel(), rcond=None)[0]
+    return float(found[0])
+
+
+def test_a_fit_finds_the_shear_that_slices_alone_are_slow_to_find() -> None:
+    true = turned_slices()
+    parameters, shear = parameters_of(true)
+    parameters.value["shear"][0] = 0.06
+    shear.fold(parameters)
+    pose = true.planes.pose
+    rotation = pose.rotation @ Rotation.from_rotvec(parameters.value["rotation"]).as_matrix()
+    sheared = true.with_pose(RigidPose(rotation, pose.translation_mm + parameters.value["translation"]))
+    left = {}
+    for rate in (0.0, 2e-3):
+        settings = SliceStageSettings(n_steps=80, rates=replace(LearningRates(), shear=rate))
+        left[rate] = strain_left(fit(true_volume(), sheared, settings=settings).slices, true)
+    assert abs(left[2e-3]) < 0.6 * abs(left[0.0])
+
+
+def test_three_orientations_have_no_such_parameter() -> None:
+    slices = make_slices()
+    blocks = slice_blocks(
+        slices, np.ones(len(slices)), None, LearningRates(), True, OpenShear.of(slices, true_cloud().origin_mm)
+    )
+    assert "shear" not in blocks
+    two = slices.take(slices.stack_id < 2)
+    shear = OpenShear.of(two, true_cloud().origin_mm)
+    assert shear is not None
+    assert "shear" not in slice_blocks(two, np.ones(len(two)), None, LearningRates(), False, shear)
