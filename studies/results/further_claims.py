@@ -97,6 +97,35 @@ def preset_gain(preset: str, over: str, n_stacks: int) -> Claim:
     )
 
 
+def over_prior(n_stacks: int, at_least: float) -> Claim:
+    """What the volume of `balanced` has over V_prior from one stack or two, on every subject.
+
+    Args:
+        n_stacks: of the subjects.
+        at_least: what each of them is to have.
+    """
+    words = f"{n_stacks} stack{'s' * (n_stacks != 1)}"
+
+    def find(block: Block) -> Finding | None:
+        rows = [row for row in block.tables[0].rows if (row["stacks"], row["preset"]) == (str(n_stacks), "`balanced`")]
+        gains = [gain for row in rows if (gain := value(row, "over V_prior")) is not None]
+        if not gains:
+            return None
+        figure = f"{sum(gain >= at_least for gain in gains)} of {len(gains)}, least {min(gains):+.2f} dB"
+        return Finding(
+            figure=figure, n=len(gains), of="subjects", holds=min(gains) >= at_least, enough=len(gains) >= FEW
+        )
+
+    return Claim(
+        text=f"The volume is above V_prior on every subject, {words}",
+        asked=f"{at_least:g} dB or more on each, asked for",
+        block="fewer-stacks",
+        find=find,
+        yes=f"From {words} `balanced` is above V_prior on every subject: {{figure}}.",
+        no=f"From {words} `balanced` is not as far above V_prior on every subject as was asked for: {{figure}}.",
+    )
+
+
 def preset_limit(preset: str) -> Claim:
     """Seconds of the whole command and decibels below `accurate`, against their limits in the table."""
 
@@ -221,6 +250,8 @@ def presets() -> Iterator[Claim]:
     yield preset_gain("balanced", "fast", 3)
     yield preset_gain("accurate", "balanced", 3)
     yield preset_gain("accurate", "balanced", 2)
+    yield over_prior(2, 0.0)
+    yield over_prior(1, 0.3)
     for name in ("preview", "fast", "balanced", "accurate"):
         yield preset_limit(name)
 
