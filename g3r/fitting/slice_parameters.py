@@ -11,7 +11,7 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.gain_trends import GainTrends
 from g3r.fitting.objective import TermLoss
-from g3r.fitting.open_shear import OpenShear
+from g3r.fitting.open_shear import OpenShear, mean_normals, open_strain
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.gaussians.render import right_jacobian
@@ -23,7 +23,6 @@ def slice_blocks(
     bias_field: StackBiasField | None,
     rates: LearningRates,
     optimise_poses: bool,
-    open_shear: OpenShear | None = None,
 ) -> dict[str, Block]:
     """Parameters fitted along with the cloud: start values and step sizes, by name.
 
@@ -33,14 +32,13 @@ def slice_blocks(
         bias_field: fields of the stacks; None where they are not fitted.
         rates: step sizes.
         optimise_poses: whether slices move.
-        open_shear: moves slices and Gaussians together, where slices move.
     """
     n = len(slices)
     blocks: dict[str, Block] = {}
     if optimise_poses:
         blocks["rotation"] = np.zeros((n, 3)), rates.rotation_rad
         blocks["translation"] = np.zeros((n, 3)), rates.translation_mm
-        if open_shear is not None:
+        if open_strain(mean_normals(slices)) is not None:
             blocks["shear"] = np.zeros(1), rates.shear
     if n > 1:  # the gain of a single slice cannot be separated from the amplitudes
         blocks["log_gain"] = np.log(gain), rates.log_gain
@@ -60,14 +58,11 @@ class SliceParameters:
         slices: K slices.
         gain: [K] intensity factors, used where there is no block of gains.
         parameters: of the fit.
-        open_shear: where there is a block of it.
     """
 
-    def __init__(
-        self, slices: Slices, gain: NDArray[np.float64], parameters: FitParameters, open_shear: OpenShear | None = None
-    ) -> None:
+    def __init__(self, slices: Slices, gain: NDArray[np.float64], parameters: FitParameters) -> None:
         self.parameters, self.gain = parameters, gain.astype(np.float64)
-        self.open_shear = open_shear if "shear" in parameters.value else None
+        self.open_shear = OpenShear.of(slices, parameters.origin_mm) if "shear" in parameters.value else None
         self.start = PlaneState.of(slices.planes, parameters.origin_mm)
         _, self.stack = np.unique(slices.stack_id, return_inverse=True)
         corner_mm = np.sqrt(((slices.planes.shape * slices.planes.spacing_mm / 2) ** 2).sum(1))

@@ -14,7 +14,6 @@ from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.divergence_guard import DivergenceGuard
 from g3r.fitting.objective import CloudObjective, ImageTerm
 from g3r.fitting.observer import FitMoment, FitObserver, SliceMoment, is_due
-from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import FitParameters, LearningRates
 from g3r.fitting.plane_state import PlaneState
 from g3r.fitting.prior_stage import NO_PROGRESS, STEPS_PER_DRAW, VolumeTarget
@@ -146,8 +145,7 @@ def fit_slices(
         )
     several = slices.n_stacks > 1  # one stack cannot separate its bias field from anatomy
     bias_field = StackBiasField(slices) if settings.optimise_bias_field and several else None
-    shear = OpenShear.of(slices, cloud.origin_mm)
-    blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses, shear)
+    blocks = slice_blocks(slices, gain, bias_field, settings.rates, settings.optimise_poses)
     parameters = FitParameters(cloud, settings.rates, blocks)
     loss = SliceLoss(
         parameters,
@@ -158,7 +156,6 @@ def fit_slices(
         prior=prior,
         settings=settings,
         pixel_weight=counted,
-        open_shear=shear,
     )
     guard = DivergenceGuard(parameters, loss.level)
     history: list[dict[str, float]] = []
@@ -204,7 +201,6 @@ class SliceLoss:
         prior: distillation target, or None.
         settings: weights of the terms.
         pixel_weight: [P] not negative; the slices' masks when None.
-        open_shear: where there is a block of it.
     """
 
     def __init__(
@@ -218,11 +214,10 @@ class SliceLoss:
         prior: VolumeTarget | None,
         settings: SliceStageSettings,
         pixel_weight: NDArray[np.float32] | None = None,
-        open_shear: OpenShear | None = None,
     ) -> None:
         self.settings, self.slice_weight = settings, slice_weight
         self.origin_mm = parameters.origin_mm
-        self.unknowns = SliceParameters(slices, gain, parameters, open_shear)
+        self.unknowns = SliceParameters(slices, gain, parameters)
         self.term = ImageTerm.of(
             slices.planes,
             slices.value,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.open_shear import OpenShear, mean_normals, open_strain
-from g3r.fitting.parameters import FitParameters, LearningRates
+from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.slice_parameters import slice_blocks
 from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
@@ -65,8 +65,23 @@ def parameters_of(slices: Slices) -> tuple[FitParameters, OpenShear]:
     cloud = true_cloud()
     shear = OpenShear.of(slices, cloud.origin_mm)
     assert shear is not None
-    blocks = slice_blocks(slices, np.ones(len(slices)), None, LearningRates(), True, shear)
-    return FitParameters(cloud, LearningRates(), blocks), shear
+    return FitParameters(cloud, LearningRates(), blocks_of(slices)), shear
+
+
+def blocks_of(slices: Slices, *, optimise_poses: bool = True) -> dict[str, Block]:
+    return slice_blocks(slices, np.ones(len(slices)), None, LearningRates(), optimise_poses)
+
+
+def sheared(slices: Slices, amount: float) -> tuple[GaussianCloud, Slices]:
+    """The true cloud and slices, both moved by a shear."""
+    parameters, shear = parameters_of(slices)
+    parameters.value["shear"][0] = amount
+    shear.fold(parameters)
+    assert parameters.value["shear"][0] == 0
+    pose = slices.planes.pose
+    rotation = pose.rotation @ Rotation.from_rotvec(parameters.value["rotation"]).as_matrix()
+    there = slices.with_pose(RigidPose(rotation, pose.translation_mm + parameters.value["translation"]))
+    return reshaped(parameters.cloud(), np.eye(3) + amount * shear.strain), there
 
 
 def reshaped(cloud: GaussianCloud, motion: np.ndarray) -> GaussianCloud:
@@ -79,25 +94,16 @@ def reshaped(cloud: GaussianCloud, motion: np.ndarray) -> GaussianCloud:
     return cloud_of(cloud.mean_mm.numpy(), np.log(variance) / 2, turn, cloud.amplitude.numpy())
 
 
-def moved(slices: Slices, amount: float, *, alone: bool = False) -> np.ndarray:
-    """Pixels after the head and slices moved by a shear, or slices alone."""
-    parameters, shear = parameters_of(slices)
-    parameters.value["shear"][0] = amount
-    shear.fold(parameters)
-    assert parameters.value["shear"][0] == 0
-    cloud = true_cloud() if alone else reshaped(parameters.cloud(), np.eye(3) + amount * shear.strain)
-    pose = slices.planes.pose
-    rotation = pose.rotation @ Rotation.from_rotvec(parameters.value["rotation"]).as_matrix()
-    there = RigidPose(rotation, pose.translation_mm + parameters.value["translation"])
-    return render(cloud, slices.with_pose(there).planes, cutoff_sigma=6.0).numpy()
-
-
 def test_slices_and_gaussians_that_move_together_explain_the_same_pixels() -> None:
     still = make_slices()
     still = still.take(still.stack_id < 2)
-    before, amount = moved(still, 0.0), 0.04
-    together, alone = (np.abs(moved(still, amount, alone=one) - before).mean() for one in (False, True))
-    assert together < 0.1 * alone  # of second order, and the profile, which turns as slices do
+    cloud, slices = sheared(still, 0.04)
+    before, together, alone = (
+        render(head, planes.planes, cutoff_sigma=6.0).numpy()
+        for head, planes in ((true_cloud(), still), (cloud, slices), (true_cloud(), slices))
+    )
+    # of second order, and the profile, which turns as slices do
+    assert np.abs(together - before).mean() < 0.1 * np.abs(alone - before).mean()
 
 
 def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
@@ -106,19 +112,12 @@ def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
     slices = replace(slices, value=slices.value + noise)
 
     def loss_at(amount: float) -> tuple[float, float]:
-        parameters, shear = parameters_of(slices)
+        parameters, _ = parameters_of(slices)
         ones = np.ones(len(slices))
         # every slice in its turn; tails of Gaussians that are cut off would jump
         settings = SliceStageSettings(n_parts=1, scale_weight=0.0, gain_trend_ridge=0.0, cutoff_sigma=6.0)
         loss = SliceLoss(
-            parameters,
-            slices,
-            gain=ones,
-            slice_weight=ones,
-            bias_field=None,
-            prior=None,
-            settings=settings,
-            open_shear=shear,
+            parameters, slices, gain=ones, slice_weight=ones, bias_field=None, prior=None, settings=settings
         )
         parameters.value["shear"][0] = amount
         loss.unknowns.fold()
@@ -144,26 +143,29 @@ def strain_left(slices: Slices, true: Slices) -> float:
 
 def test_a_fit_finds_the_shear_that_slices_alone_are_slow_to_find() -> None:
     true = turned_slices()
-    parameters, shear = parameters_of(true)
-    parameters.value["shear"][0] = 0.06
-    shear.fold(parameters)
-    pose = true.planes.pose
-    rotation = pose.rotation @ Rotation.from_rotvec(parameters.value["rotation"]).as_matrix()
-    sheared = true.with_pose(RigidPose(rotation, pose.translation_mm + parameters.value["translation"]))
+    _, start = sheared(true, 0.06)
     left = {}
     for rate in (0.0, 2e-3):
         settings = SliceStageSettings(n_steps=80, rates=replace(LearningRates(), shear=rate))
-        left[rate] = strain_left(fit(true_volume(), sheared, settings=settings).slices, true)
+        left[rate] = strain_left(fit(true_volume(), start, settings=settings).slices, true)
     assert abs(left[2e-3]) < 0.6 * abs(left[0.0])
 
 
-def test_three_orientations_have_no_such_parameter() -> None:
+def test_only_slices_that_move_in_two_orientations_have_such_a_parameter() -> None:
+    three = make_slices()
+    two = three.take(three.stack_id < 2)
+    assert "shear" in blocks_of(two)
+    assert "shear" not in blocks_of(two, optimise_poses=False)
+    assert "shear" not in blocks_of(three)
+
+
+def test_a_stack_without_an_orientation_leaves_none_open() -> None:
     slices = make_slices()
-    blocks = slice_blocks(
-        slices, np.ones(len(slices)), None, LearningRates(), True, OpenShear.of(slices, true_cloud().origin_mm)
-    )
-    assert "shear" not in blocks
-    two = slices.take(slices.stack_id < 2)
-    shear = OpenShear.of(two, true_cloud().origin_mm)
-    assert shear is not None
-    assert "shear" not in slice_blocks(two, np.ones(len(two)), None, LearningRates(), False, shear)
+    slices = slices.take(slices.stack_id < 2)
+    pose, own = slices.planes.pose, np.flatnonzero(slices.stack_id == 1)
+    turn = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, len(own), endpoint=False)[:, None] * X).as_matrix()
+    rotation = pose.rotation.copy()
+    rotation[own] = rotation[own] @ turn
+    radial = slices.with_pose(RigidPose(rotation, pose.translation_mm))
+    assert np.linalg.norm(mean_normals(radial)[1]) < 1e-9
+    assert OpenShear.of(radial, true_cloud().origin_mm) is None
