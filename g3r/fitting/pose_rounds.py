@@ -43,14 +43,14 @@ class PoseRoundSettings:
     Args:
         single_stack: rounds with one stack, which nothing but the prior holds in place.
         two_stacks: with two stacks.
-        more_stacks: with three or more, whose poses are nearer to the truth from the start.
+        more_stacks: with three or more, whose poses are nearer to the truth without one.
         prior_steps, slice_steps: of both stages of the fit in a round.
         newton_steps: Gauss-Newton steps of all slices against the fitted volume.
     """
 
     single_stack: int = 1
     two_stacks: int = 2
-    more_stacks: int = 1
+    more_stacks: int = 0
     prior_steps: int = 12
     slice_steps: int = 110
     newton_steps: int = 4

@@ -119,7 +119,7 @@ _QUICK_SEARCH = replace(
 PRESETS: dict[str, ReconstructionSettings] = {
     "preview": replace(  # least squares alone: neither torch nor a network is loaded
         _BALANCED,
-        pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0, more_stacks=0),
+        pose_rounds=PoseRoundSettings(single_stack=0, two_stacks=0),
         held_out=None,
         n_lattices=0,
         voxel_correction=None,
@@ -132,7 +132,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
     "fast": replace(
         _BALANCED,
-        pose_rounds=PoseRoundSettings(two_stacks=1, more_stacks=0),
+        pose_rounds=PoseRoundSettings(two_stacks=1),
         held_out=None,
         voxel_correction=None,
         prior_views=1,
@@ -144,8 +144,8 @@ PRESETS: dict[str, ReconstructionSettings] = {
     "accurate": replace(
         _BALANCED,
         n_lattices=6,
-        # three stacks have found their poses after one round
-        pose_rounds=PoseRoundSettings(two_stacks=4),
+        # a second round of three stacks changed nothing
+        pose_rounds=PoseRoundSettings(two_stacks=4, more_stacks=1),
         held_out=HeldOutSettings(slab=0.4, n_steps=25),
         prior_views=8,
         share_probes=2,
