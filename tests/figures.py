@@ -22,8 +22,8 @@ PEERS, PAPER, TRADEOFF = DOCS / "peers.md", DOCS / "paper.md", DOCS / "tradeoff.
 WHAT = {
     "`preview`": "least squares alone, without networks, fit and maps",
     "`fast`": "a shorter registration, one fit",
-    "`balanced`": "a round of poses and volume, two for two stacks; measured slice profiles",
-    "`accurate`": "the mean of six fits; four rounds for two stacks",
+    "`balanced`": "measured slice profiles; two rounds of poses and volume for two stacks",
+    "`accurate`": "the mean of six fits; a round of poses and volume, four for two stacks",
 }
 """What the presets do, in the order of the table."""
 

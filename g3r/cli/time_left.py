@@ -13,11 +13,20 @@ from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, 
 BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.3, PREPARING: 0.4}
 """Seconds of three stacks on two cores, before the first stage that a run keeps."""
 
-AFTER_S = {"volume": 0.2, "prior share": 1.5, "uncertainty": 0.6, WRITING: 1.2}
+ROUNDS = "poses in rounds"
+
+AFTER_S = {"prior share": 1.2, "uncertainty": 0.6, WRITING: 1.2}
 
 EXPECTED_S = {
-    "preview": {"registration": 3.5, "coarse volume": 1.0, "prior": 0.7},
-    "fast": {"registration": 4.0, "coarse volume": 1.4, "prior": 1.6, "fit to prior": 1.0, "fit to slices": 3.2},
+    "preview": {"registration": 3.5, "coarse volume": 1.0, "prior": 0.7, "volume": 0.3},
+    "fast": {
+        "registration": 3.5,
+        "coarse volume": 1.2,
+        "prior": 1.8,
+        "fit to prior": 1.0,
+        "fit to slices": 3.4,
+        "volume": 0.3,
+    },
     "balanced": {
         "registration": 7.0,
         "coarse volume": 1.4,
@@ -25,7 +34,8 @@ EXPECTED_S = {
         "poses in rounds": 8.0,
         "fit to prior": 1.1,
         "held-out slices": 3.0,
-        "fit to slices": 4.0,
+        "fit to slices": 4.2,
+        "volume": 1.5,
     },
     "accurate": {
         "registration": 7.0,
@@ -34,7 +44,8 @@ EXPECTED_S = {
         "poses in rounds": 12.0,
         "fit to prior": 1.1,
         "held-out slices": 4.2,
-        "fit to slices": 38.0,
+        "fit to slices": 27.0,
+        "volume": 1.5,
     },
 }
 """The same of each preset, with all programs compiled, by stage in their order."""
@@ -56,6 +67,9 @@ MASK_S = 8.0
 
 ONLY_WITH_PRIOR = ("prior share",)
 ONLY_WITH_FIT = ("prior share", "uncertainty")
+
+FEW_STACKS = 2
+"""Up to so many stacks `balanced` makes rounds of poses and volume."""
 
 STEADY_S = 5.0
 """Seconds that the expectation counts for against what was measured."""
@@ -93,13 +107,15 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     if options.dry_run:
         return before
     stages = before | EXPECTED_S["balanced" if options.time_budget else options.preset] | AFTER_S
+    if options.preset == "balanced" and not 0 < len(options.stacks or ()) <= FEW_STACKS:
+        del stages[ROUNDS]
     if options.preset == "preview" and not options.time_budget:
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_FIT}
     if options.no_prior:
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_PRIOR}
     if compiling:
         stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
-        if "poses in rounds" not in stages and "fit to slices" in stages:
+        if ROUNDS not in stages and "fit to slices" in stages:
             stages["fit to slices"] += COMPILING_FIT_S
     if options.time_budget:
         shorter = max(options.time_budget, 1.0) / sum(stages.values())

@@ -109,6 +109,10 @@ def test_what_the_options_say_is_expected() -> None:
     assert total(compiling=True) > total()
     assert total("--time-budget", "90") == pytest.approx(90)
     assert "prior share" not in expected_seconds(parsed_options([*STACKS, "--no-prior"]), compiling=False)
+    three = parsed_options(["--stacks", "a.nii", "b.nii", "c.nii", "--output", "o"])
+    rounds = str(Stage.POSE_ROUNDS)
+    assert rounds in expected_seconds(parsed_options(STACKS), compiling=False)
+    assert rounds not in expected_seconds(three, compiling=False)
 
 
 def test_compiled_kernels_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
