@@ -23,6 +23,7 @@ EXPECTED_S = {
         "registration": 3.5,
         "coarse volume": 1.2,
         "prior": 1.8,
+        "poses in rounds": 4.0,
         "fit to prior": 1.0,
         "fit to slices": 3.4,
         "volume": 0.3,
@@ -31,7 +32,7 @@ EXPECTED_S = {
         "registration": 7.0,
         "coarse volume": 1.4,
         "prior": 1.6,
-        "poses in rounds": 8.0,
+        "poses in rounds": 4.0,
         "fit to prior": 1.1,
         "held-out slices": 3.0,
         "fit to slices": 4.2,
@@ -41,14 +42,18 @@ EXPECTED_S = {
         "registration": 7.0,
         "coarse volume": 1.4,
         "prior": 1.6,
-        "poses in rounds": 12.0,
+        "poses in rounds": 6.0,
         "fit to prior": 1.1,
         "held-out slices": 4.2,
         "fit to slices": 27.0,
         "volume": 1.5,
     },
 }
-"""The same of each preset, with all programs compiled, by stage in their order."""
+"""The same of each preset, with all programs compiled, by stage in their order; of poses in rounds one round."""
+
+POSE_ROUNDS = {"preview": (0, 0, 0), "fast": (1, 1, 0), "balanced": (1, 2, 0), "accurate": (1, 4, 1)}
+"""Rounds of poses and volume with one stack, two, and more. A test holds them equal to those of the presets, which
+load too slowly to be asked here."""
 
 COMPILING_S = {
     "registration": 9.0,
@@ -67,9 +72,6 @@ MASK_S = 8.0
 
 ONLY_WITH_PRIOR = ("prior share",)
 ONLY_WITH_FIT = ("prior share", "uncertainty")
-
-FEW_STACKS = 2
-"""Up to so many stacks `balanced` makes rounds of poses and volume."""
 
 STEADY_S = 5.0
 """Seconds that the expectation counts for against what was measured."""
@@ -106,9 +108,12 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     before[FINDING_MASKS] += MASK_S * n_to_find
     if options.dry_run:
         return before
-    stages = before | EXPECTED_S["balanced" if options.time_budget else options.preset] | AFTER_S
-    if options.preset == "balanced" and not 0 < len(options.stacks or ()) <= FEW_STACKS:
-        del stages[ROUNDS]
+    preset = "balanced" if options.time_budget else options.preset
+    stages = before | EXPECTED_S[preset] | AFTER_S
+    if n_rounds := POSE_ROUNDS[preset][min(len(options.stacks or ()) or 3, 3) - 1]:
+        stages[ROUNDS] *= n_rounds
+    else:
+        stages.pop(ROUNDS, None)
     if options.preset == "preview" and not options.time_budget:
         stages = {name: seconds for name, seconds in stages.items() if name not in ONLY_WITH_FIT}
     if options.no_prior:

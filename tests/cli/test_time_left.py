@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from g3r.cli.infer_options import parsed_options
-from g3r.cli.time_left import EXPECTED_S, TimeLeft, expected_seconds, needs_compiling
+from g3r.cli.time_left import EXPECTED_S, POSE_ROUNDS, TimeLeft, expected_seconds, needs_compiling
 from g3r.planning import PRESET_NAMES
+from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.report.stage_words import DOING, FINDING_MASKS, LINES, PREPARING, STARTING, WITHOUT_FACTS, line
 
@@ -113,6 +114,22 @@ def test_what_the_options_say_is_expected() -> None:
     rounds = str(Stage.POSE_ROUNDS)
     assert rounds in expected_seconds(parsed_options(STACKS), compiling=False)
     assert rounds not in expected_seconds(three, compiling=False)
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_rounds_are_those_of_the_preset(preset: str) -> None:
+    assert POSE_ROUNDS[preset] == tuple(PRESETS[preset].pose_rounds.n_rounds(n) for n in (1, 2, 3))
+
+
+def test_each_round_is_expected() -> None:
+    def rounds_s(n_stacks: int, preset: str) -> float:
+        options = parsed_options(["--stacks", *"abc"[:n_stacks], "--output", "o", "--preset", preset])
+        return expected_seconds(options, compiling=False).get(str(Stage.POSE_ROUNDS), 0.0)
+
+    one = rounds_s(3, "accurate")
+    assert one > 0
+    assert rounds_s(2, "accurate") == pytest.approx(4 * one)
+    assert rounds_s(2, "fast") > rounds_s(3, "fast") == 0
 
 
 def test_compiled_kernels_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
