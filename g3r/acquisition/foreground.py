@@ -7,7 +7,7 @@ never by the absence of a mask.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from scipy.ndimage import binary_dilation, binary_fill_holes, gaussian_filter, l
 from scipy.spatial import ConvexHull, QhullError
 
 from g3r.acquisition.coverage import UNSEEN_BELOW, coverage
+from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slice_spacing_mm
 from g3r.acquisition.voxel_operator import VoxelOperator
@@ -22,16 +23,28 @@ from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 INSIDE_SHARE = 1 / 3
-"""Share of the slices over a voxel whose masks must contain it: one of three stacks. At one half, the edge of a
-mask, the volume of the brain is right to 1 %, but some outermost voxels are lost, and with them 1 to 4 dB; one
-third is generous by about a quarter of the slice spacing (docs/method.md, "Mask")."""
+"""Share of the slices over a voxel whose masks must contain it, for the volume to be fitted there: one of three stacks.
+At one half some outermost voxels are lost, and with them 1 to 4 dB; one third is generous by about a quarter of the
+slice spacing (docs/method.md, "Mask")."""
+
+CORE_SHARE = 0.5
+"""Share of a voxel that is brain, from which on it is in the mask that is written, so that its volume is right."""
+
+EDGE = (0.03, 0.15)
+"""Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
+
+MASK_WIDTH = 0.5
+"""Width of a mask's profile over that of its slice: whoever draws a mask says where the middle of a pixel lies."""
+
+SMOOTH_SHARE = 0.18
+"""How smooth the share is, as a length over the slice distance."""
+
+N_ITERATIONS = 4
+"""From a start that is nearly right."""
 
 SEEN_SHARE = 1 / 3
 """Coverage, in shares of what one stack gives on average, below which a voxel is unseen: with the smoothing over half
 the slice spacing it ends 0.75 of the spacing beyond a stack's last slice."""
-
-CORE_SHARE = 1 / 2
-"""The same share for the mask that is written: the edge of a mask, so that its volume is right."""
 
 THIN_MARGIN_VOXELS = 2
 
@@ -49,15 +62,31 @@ class Foreground:
 
     Attributes:
         brain: [I, J, K] seen, and called brain by a third of the slices.
-        core: [I, J, K] the same by one half.
+        share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is not seen.
         unseen: [I, J, K] not seen.
         thin: [I, J, K] hardly seen or not, between two slices as well.
     """
 
     brain: NDArray[np.bool_]
-    core: NDArray[np.bool_]
+    share: NDArray[np.float32]
     unseen: NDArray[np.bool_]
     thin: NDArray[np.bool_]
+
+    @property
+    def core(self) -> NDArray[np.bool_]:
+        """Voxels [I, J, K] of the seen brain that are brain by half or more."""
+        return self.brain & (self.share > CORE_SHARE)
+
+    def edge(self, support: NDArray[np.bool_]) -> NDArray[np.float16]:
+        """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
+
+        Args:
+            support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full. Nothing is shown
+                further than a voxel from it.
+        """
+        low, high = EDGE
+        faded = np.clip((self.share - low) / (high - low), 0, 1) * binary_dilation(support)
+        return np.where(self.unseen | self.thin, support, faded).astype(np.float16)
 
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
@@ -101,8 +130,9 @@ class Foreground:
 def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Foreground:
     """What the slices in their places say of each voxel.
 
-    Masked pixels are spread through their PSF and compared with the coverage of whole slices. Both are smoothed over
-    half the slice spacing, which closes gaps between neighbouring slices.
+    How much of a voxel is brain is a volume whose slices are the masks, found by least squares. It starts from the
+    masked pixels, spread through their PSF, over the coverage of whole slices, both smoothed over half the slice
+    spacing, which closes gaps between neighbouring slices.
 
     Args:
         slices: K slices in place.
@@ -120,7 +150,8 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     total = coverage(slices, grid, weight)
     stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
     distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
-    sigma = 0.5 * distance_mm.max() / grid.spacing_mm.mean()
+    distance_voxels = float(distance_mm.max() / grid.spacing_mm.mean())
+    sigma = 0.5 * distance_voxels
     thin = total < 2 * UNSEEN_BELOW * np.median(weight)
     inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
     thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
@@ -129,8 +160,33 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     brain = seen & (inside > INSIDE_SHARE * total)
     if not brain.any():
         raise InputError("no voxel is covered by a slice; check masks and headers")
-    core = seen & (inside > CORE_SHARE * total)
-    return Foreground(brain, core, ~seen, thin)
+    rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
+    share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
+    return Foreground(brain, np.where(seen, share, 0).clip(0, 1), ~seen, thin)
+
+
+def _sharpened(
+    rough: NDArray[np.float32], slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating], smooth_voxels: float
+) -> NDArray[np.float32]:
+    """Minimise sum_p w_p (A f - m)_p^2 + r (smooth |grad f|)^2 for masks m and the mean coverage r of a voxel.
+
+    Args:
+        rough: [I, J, K] where it begins.
+        slices: K slices in place.
+        grid: of the share.
+        weight: [K] slice weights.
+        smooth_voxels: a length.
+    """
+    planes = replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * MASK_WIDTH**2)
+    operator = VoxelOperator(planes, grid)
+    return solve_volume(
+        operator,
+        slices.mask.astype(np.float32),
+        weight[operator.plane].astype(np.float32),
+        start=rough,
+        n_iterations=N_ITERATIONS,
+        smoothness=smooth_voxels**2,
+    )
 
 
 def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:

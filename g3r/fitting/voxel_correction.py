@@ -58,7 +58,7 @@ class VoxelCorrectionSettings:
 
     hold: float = 0.6
     loose_hold: float = 0.3
-    total_variation: float = 0.01
+    total_variation: float = 0.015
     tip: float = 0.02
     n_rounds: int = 2
     n_iterations: int = 8

@@ -58,7 +58,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     cloud = mean_cloud(fit := found.fit or found.no_fit())
     uncertainty, prior_share, uncertainty_record = None, None, None
     with run.timed(Stage.VOLUME) as tell:
-        mask, support = masks_on(grid, found.prior, fit)
+        mask, support, edge = masks_on(grid, found.prior, fit)
         least = least_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
         mixture = Mixture(
             grid=grid,
@@ -67,7 +67,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             density=volumes.density,
             prior_grid=volumes.grid,
             least_weight=least,
-            rim_mm=settings.rim_mm,
+            edge=edge,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
         )
         volume, left_to_prior, seen = mixture.volume(cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
@@ -142,6 +142,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         mask=mask,
         unseen=unseen,
         support=support,
+        edge=edge,
         grid=grid,
         prior=found.prior.values * intensity,
         coarse=volumes.coarse * intensity,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from g3r.acquisition.coverage import UNSEEN_BELOW, UNSEEN_POWER
 from g3r.acquisition.planes import volume_from_pixels, volume_planes
@@ -24,11 +23,11 @@ INSIDE = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """What makes the written volume: V = [V_G + w (V_prior - V_G) + D] where it is shown, 0 elsewhere.
+    """What makes the written volume: V = e [V_G + w (V_prior - V_G) + D].
 
-    V_G are the Gaussians, rendered. The weight w of V_prior is 1 where no slice looked and outside the support of the
-    Gaussians, and falls with the density to its least value. D is what the slices say beyond both
-    (`fitting.voxel_correction`). All intensities are those of the fit.
+    e is 1 in the brain and fades to 0 at its edge. V_G are the Gaussians, rendered. The weight w of V_prior is 1 where
+    no slice looked and outside the support of the Gaussians, and falls with the density to its least value. D is what
+    the slices say beyond both (`fitting.voxel_correction`). All intensities are those of the fit.
 
     Attributes:
         grid: of `support`: that of the run's volume.
@@ -37,7 +36,7 @@ class Mixture:
         density: M_rho [I, J, K] on `prior_grid`.
         prior_grid: of these two and the correction.
         least_weight: of V_prior, where slices are dense.
-        rim_mm: how far beyond the support V_prior is shown.
+        edge: e [I, J, K] on `grid`, how much of the volume is shown.
         cutoff_sigma: where a Gaussian ends.
         correction: D [I, J, K] on `prior_grid`; None where there is none.
     """
@@ -48,7 +47,7 @@ class Mixture:
     density: NDArray[np.float32]
     prior_grid: VolumeGrid
     least_weight: float
-    rim_mm: float
+    edge: NDArray[np.float16]
     cutoff_sigma: float
     correction: NDArray[np.float16] | None = None
 
@@ -72,7 +71,7 @@ class Mixture:
         """The volume [I, J, K] on a grid; the prior alone where the cloud is empty, before there is a fit.
 
         On the run's own grid this is the run's volume. On another one the Gaussians are evaluated at its points, and
-        V_prior, density, correction, support and rim are interpolated from their grids.
+        V_prior, density, correction, support and edge are interpolated from their grids.
 
         Args:
             cloud: the Gaussians.
@@ -100,19 +99,13 @@ class Mixture:
         left = np.exp(-UNSEEN_POWER * self.density)
         return (self._region(self.support, self.prior_grid) * (1 - left)).astype(np.float32)
 
-    def _shown(self, grid: VolumeGrid) -> NDArray[np.bool_]:
-        """Where [I, J, K] of a grid there is a volume: the support and its rim."""
-        return self._region(self.support | _margin(self.support, self.rim_mm, self.grid), grid)
+    def _shown(self, grid: VolumeGrid) -> NDArray[np.float32]:
+        """How much [I, J, K] of the volume is shown on a grid."""
+        return on_grid(self.edge, self.grid, grid, outside=0.0)
 
     def _region(self, inside: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.bool_]:
         """A region of the run's grid on another one."""
         return on_grid(inside.astype(np.float32), self.grid, grid, outside=0.0) >= INSIDE
-
-
-def _margin(inside: NDArray[np.bool_], margin_mm: float, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Voxels [I, J, K] outside a region that are within a distance of it, in whole voxels along the axes."""
-    n_voxels = round(margin_mm / float(grid.spacing_mm.mean()))
-    return binary_dilation(inside, iterations=n_voxels) & ~inside if n_voxels else np.zeros_like(inside)
 
 
 @dataclass(frozen=True, kw_only=True)

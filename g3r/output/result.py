@@ -47,6 +47,7 @@ class ReconstructionResult:
         volume, mask: [I, J, K] on `grid`.
         unseen: [I, J, K] on `grid`, the part of the brain that no slice saw; inside the mask if it is shown at all.
         support: [I, J, K] on `grid`, where Gaussians were fitted.
+        edge: [I, J, K] on `grid`, how much of the volume is shown (`Mixture`).
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None where there is none.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
@@ -65,6 +66,7 @@ class ReconstructionResult:
     mask: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
     support: NDArray[np.bool_]
+    edge: NDArray[np.float16]
     grid: VolumeGrid
     prior: NDArray[np.float32]
     coarse: NDArray[np.float32]
@@ -191,6 +193,7 @@ class ReconstructionResult:
         return ReuseRecord(
             grid=self.grid,
             support=self.support,
+            edge=self.edge,
             prior_grid=self.prior_grid,
             correction=self.correction,
             intensity_scale=self.intensity_scale,

@@ -53,6 +53,7 @@ class ReuseRecord:
     Attributes:
         grid: of the volume.
         support: [I, J, K] on it, where Gaussians were fitted.
+        edge: [I, J, K] on it, how much of the volume is shown, see `Mixture`.
         prior_grid: of V_prior, density and correction.
         correction: [I, J, K] on `prior_grid`, see `Mixture`; None where there is none.
         intensity_scale: what an intensity of 1 in the fit is in the stacks.
@@ -63,6 +64,7 @@ class ReuseRecord:
 
     grid: VolumeGrid
     support: NDArray[np.bool_]
+    edge: NDArray[np.float16]
     prior_grid: VolumeGrid
     correction: NDArray[np.float16] | None = None
     intensity_scale: float
@@ -88,6 +90,7 @@ class ReuseRecord:
             "grid_shape": np.array(self.grid.shape),
             "grid_affine": self.grid.affine,
             "support": np.packbits(self.support),
+            "edge": self.edge,
             "prior_grid_shape": np.array(self.prior_grid.shape),
             "prior_grid_affine": self.prior_grid.affine,
             "intensity_scale": np.float64(self.intensity_scale),
@@ -146,12 +149,15 @@ def _record(data: dict[str, NDArray[Any]]) -> ReuseRecord:
     axes = [FileAxes(int(axis), (bool(first), bool(second))) for axis, (first, second) in turned]
     stacks = zip(data["stack_shape"], data["stack_affine"], axes, strict=True)
     prior_grid = _grid(data["prior_grid_shape"], data["prior_grid_affine"])
+    if data["edge"].shape != grid.shape:
+        raise ValueError(f"an edge of {data['edge'].shape} voxels; expected {grid.shape}")
     correction = data.get("correction")
     if correction is not None and correction.shape != prior_grid.shape:
         raise ValueError(f"a correction of {correction.shape} voxels; expected {prior_grid.shape}")
     return ReuseRecord(
         grid=grid,
         support=_bits(data["support"], math.prod(grid.shape)).reshape(grid.shape),
+        edge=data["edge"],
         prior_grid=prior_grid,
         correction=correction,
         intensity_scale=float(data["intensity_scale"]),

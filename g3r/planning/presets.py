@@ -41,7 +41,6 @@ class ReconstructionSettings:
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
         voxel_correction: how the volume is corrected by what slices say and Gaussians cannot show; None leaves that
             out.
-        prior_rim_mm: how far beyond the support, which ends on whole voxels, V_prior is shown.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`. 0 leaves its network out.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
@@ -68,7 +67,6 @@ class ReconstructionSettings:
     held_out: HeldOutSettings | None = field(default_factory=HeldOutSettings)
     prior_weight: float = 0.3
     voxel_correction: VoxelCorrectionSettings | None = field(default_factory=VoxelCorrectionSettings)
-    prior_rim_mm: float = 0.8
     prior_views: int = 2
     prior_whole_voxels: int = DEFAULT_TILING.max_whole_voxels
     prior_tile_voxels: int = DEFAULT_TILING.tile_voxels
@@ -86,11 +84,6 @@ class ReconstructionSettings:
     def lattice(self) -> LatticeSpacing:
         """How far the Gaussians are apart."""
         return LatticeSpacing(pixels=self.gaussian_spacing_pixels, at_most_mm=self.max_gaussian_spacing_mm)
-
-    @property
-    def rim_mm(self) -> float:
-        """How far beyond the support the volume is shown: where V_prior is soft, or stands alone."""
-        return self.prior_rim_mm if self.use_prior or not self.n_lattices else 0.0
 
     @property
     def tiling(self) -> Tiling:

@@ -105,7 +105,7 @@ class FinishedRun:
             density=density.data,
             prior_grid=found.prior_grid,
             least_weight=self.record.prior_weight,
-            rim_mm=settings.rim_mm,
+            edge=found.edge,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
             correction=found.correction,
         )

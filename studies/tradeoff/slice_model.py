@@ -21,7 +21,6 @@ WITHOUT: dict[str, Mapping[str, Any]] = {
     "measured profile": {"held_out": None, "slice_model.through_plane": 1.0},
     "less width in plane": {"slice_model.in_plane": 1.0},
     "prior in the volume": {"prior_weight": 0.0},
-    "prior at the rim": {"prior_rim_mm": 0.0},
 }
 """The parts, and the settings that leave each out."""
 

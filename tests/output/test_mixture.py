@@ -20,7 +20,7 @@ MIXTURE = Mixture(
     density=np.where(INDEX[..., 2] > 4, 3, 0).astype(np.float32),
     prior_grid=GRID,
     least_weight=0.2,
-    rim_mm=0.0,
+    edge=BALL.astype(np.float16),
     cutoff_sigma=3.0,
     correction=SLOPE,
 )
@@ -38,6 +38,11 @@ def test_it_is_added_where_the_volume_is_shown() -> None:
     assert not found[~BALL].any()
     mixed = replace(MIXTURE, correction=None).volume(true_cloud(), GRID)
     np.testing.assert_array_equal(MIXTURE.corrected(mixed, GRID), MIXTURE.volume(true_cloud(), GRID))
+
+
+def test_the_whole_volume_fades_at_the_edge() -> None:
+    faded = replace(MIXTURE, edge=(0.25 * BALL).astype(np.float16))
+    np.testing.assert_allclose(faded.volume(true_cloud(), GRID), 0.25 * MIXTURE.volume(true_cloud(), GRID), atol=1e-6)
 
 
 def test_on_another_grid_it_is_interpolated() -> None:
