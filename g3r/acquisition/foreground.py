@@ -77,16 +77,17 @@ class Foreground:
         """Voxels [I, J, K] of the seen brain that are brain by half or more."""
         return self.brain & (self.share > CORE_SHARE)
 
-    def edge(self, support: NDArray[np.bool_]) -> NDArray[np.float16]:
+    def edge(self, support: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.float16]:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
 
         Args:
             support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full. Nothing is shown
                 further than a voxel from it.
+            mask: [I, J, K] the brain, holes that were filled included: shown in full.
         """
         low, high = EDGE
         faded = np.clip((self.share - low) / (high - low), 0, 1) * binary_dilation(support)
-        return np.where(self.unseen | self.thin, support, faded).astype(np.float16)
+        return np.where(mask | self.unseen | self.thin, mask | support, faded).astype(np.float16)
 
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.

@@ -95,7 +95,7 @@ def test_before_the_fit_to_slices_the_prior_is_the_volume(
         assert json.loads((out / "run.json").read_text())["stopped_at"]["stage"] == "fit to prior"
         volume, prior, mask = (load_volume(out / f"{name}.nii.gz").data for name in ("volume", "prior", "mask"))
         np.testing.assert_array_equal(volume[mask > 0], prior[mask > 0])
-        assert ((volume == prior) | (volume == 0)).all()
+        assert (np.abs(volume) <= np.abs(prior)).all()  # it fades at its edge
         assert len(GaussianCloud.load(out / "gaussians.npz")) == 0
 
 
