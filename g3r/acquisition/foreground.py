@@ -27,8 +27,8 @@ INSIDE_SHARE = 1 / 3
 At one half some outermost voxels are lost, and with them 1 to 4 dB; one third is generous by about a quarter of the
 slice spacing (docs/method.md, "Mask")."""
 
-CORE_SHARE = 0.5
-"""Share of a voxel that is brain, from which on it is in the mask that is written, so that its volume is right."""
+CORE_SHARE = 1 / 2
+"""The same share for the mask that is written: the edge of a mask, so that its volume is right."""
 
 EDGE = (0.03, 0.15)
 """Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
@@ -62,20 +62,17 @@ class Foreground:
 
     Attributes:
         brain: [I, J, K] seen, and called brain by a third of the slices.
+        core: [I, J, K] the same by one half.
         share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is not seen.
         unseen: [I, J, K] not seen.
         thin: [I, J, K] hardly seen or not, between two slices as well.
     """
 
     brain: NDArray[np.bool_]
+    core: NDArray[np.bool_]
     share: NDArray[np.float32]
     unseen: NDArray[np.bool_]
     thin: NDArray[np.bool_]
-
-    @property
-    def core(self) -> NDArray[np.bool_]:
-        """Voxels [I, J, K] of the seen brain that are brain by half or more."""
-        return self.brain & (self.share > CORE_SHARE)
 
     def edge(self, support: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.float16]:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
@@ -163,7 +160,8 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
         raise InputError("no voxel is covered by a slice; check masks and headers")
     rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
     share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
-    return Foreground(brain, np.where(seen, share, 0).clip(0, 1), ~seen, thin)
+    core = seen & (inside > CORE_SHARE * total)
+    return Foreground(brain, core, np.where(seen, share, 0).clip(0, 1), ~seen, thin)
 
 
 def _sharpened(

@@ -67,10 +67,7 @@ def test_each_part_of_the_slice_model_is_left_out_once_and_all_of_them_together(
     scores = {name: {"psnr_db": 30.0 - n, "ssim": 0.9} for n, name in enumerate(slice_model.VARIANTS)}
     row = {"n_stacks": 3, "scores": scores, "prior": {name: scores[name] for name in ("as shipped", "none of these")}}
     text = slice_model.tables({"preset": "balanced", "weights": "w", "rows": {"one": row}})["slice-model"]
-    assert (
-        "| one | 3 | 30.00 | 29.00 | 28.00 | 27.00 | 26.00 | 25.00 | 24.00 | 0.900 / 0.900 | 30.00 / 24.00 |"
-        in text
-    )
+    assert "| one | 3 | 30.00 | 29.00 | 28.00 | 27.00 | 26.00 | 25.00 | 24.00 | 0.900 / 0.900 | 30.00 / 24.00 |" in text
     assert slice_model.line("one", row).startswith("one: as shipped 30.00, without common bias field 29.00")
 
 
