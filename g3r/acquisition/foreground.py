@@ -33,6 +33,10 @@ CORE_SHARE = 1 / 2
 EDGE = (0.03, 0.15)
 """Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
 
+SINGLE_RIM_MM = 1.6
+"""Beyond the support the volume of a single stack is shown so far: its slices may lie a millimetre off, and no other
+stack says where the brain ends."""
+
 MASK_WIDTH = 0.5
 """Width of a mask's profile over that of its slice: whoever draws a mask says where the middle of a pixel lies."""
 
@@ -63,9 +67,11 @@ class Foreground:
     Attributes:
         brain: [I, J, K] seen, and called brain by a third of the slices.
         core: [I, J, K] the same by one half.
-        share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is not seen.
+        share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. Of a single
+            stack not known: 1.
         unseen: [I, J, K] not seen.
         thin: [I, J, K] hardly seen or not, between two slices as well.
+        rim_voxels: how far the volume is shown beyond the support, at most.
     """
 
     brain: NDArray[np.bool_]
@@ -73,18 +79,19 @@ class Foreground:
     share: NDArray[np.float32]
     unseen: NDArray[np.bool_]
     thin: NDArray[np.bool_]
+    rim_voxels: int = 1
 
     def edge(self, support: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.float16]:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
 
         Args:
-            support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full. Nothing is shown
-                further than a voxel from it.
+            support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full.
             mask: [I, J, K] the brain, holes that were filled included: shown in full.
         """
         low, high = EDGE
-        faded = np.clip((self.share - low) / (high - low), 0, 1) * binary_dilation(support)
-        return np.where(mask | self.unseen | self.thin, mask | support, faded).astype(np.float16)
+        faded = np.clip((self.share - low) / (high - low), 0, 1)
+        near = binary_dilation(mask | support, iterations=self.rim_voxels)
+        return np.maximum(faded * near, mask | ((self.unseen | self.thin) & support)).astype(np.float16)
 
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
@@ -159,9 +166,14 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     if not brain.any():
         raise InputError("no voxel is covered by a slice; check masks and headers")
     rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
-    share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
+    share, rim_voxels = np.ones_like(rough), 1
+    if len(stacks) > 1:
+        share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
+        share = np.where(seen & ~thin, share, 0).clip(0, 1)
+    else:
+        rim_voxels = max(1, round(SINGLE_RIM_MM / float(grid.spacing_mm.mean())))
     core = seen & (inside > CORE_SHARE * total)
-    return Foreground(brain, core, np.where(seen, share, 0).clip(0, 1), ~seen, thin)
+    return Foreground(brain, core, share, ~seen, thin, rim_voxels)
 
 
 def _sharpened(

@@ -159,7 +159,9 @@ def _choose_hold(
         errors = (round(before, 5), round(after, 5))
         if after < before:
             return loose, errors
-    return settings.for_noise(whole.noise(volume, grid)), errors
+    # how far slices of a single stack are off counts as noise: no other stack checks their poses
+    spread = whole.error if whole.slices.n_stacks == 1 else whole.noise
+    return settings.for_noise(spread(volume, grid)), errors
 
 
 @dataclass(frozen=True, kw_only=True)
