@@ -146,3 +146,14 @@ def test_the_noisier_the_slices_the_stronger_the_pull() -> None:
     noise = np.random.default_rng(4).normal(0, 3 * QUIET, len(clean.slices.value)).astype(np.float32)
     noisy = replace(clean, slices=replace(clean.slices, value=clean.slices.value + noise))
     assert correction(truth, noisy).record.hold == pytest.approx(9 * SETTINGS.hold, rel=0.15)
+
+
+@pytest.mark.parametrize("n_stacks", [1, 3])
+def test_what_a_single_stack_disagrees_by_is_noise_in_full(n_stacks: int) -> None:
+    """One slice in eight is off. Where other stacks check the poses this hardly counts."""
+    fit, off = fit_of(np.ones(24)), 5 * QUIET
+    sign = np.random.default_rng(5).choice([-off, off], len(fit.slices.value)).astype(np.float32)
+    value = fit.slices.value + np.where(fit.slices.planes.plane_id() % 8 == 3, sign, 0)
+    slices = replace(fit.slices, value=value, stack_id=np.minimum(fit.slices.stack_id, n_stacks - 1))
+    expected = SETTINGS.hold * (25 / 8 if n_stacks == 1 else 1)
+    assert correction(true_volume(), replace(fit, slices=slices)).record.hold == pytest.approx(expected, rel=0.5)
