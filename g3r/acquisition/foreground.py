@@ -67,8 +67,8 @@ class Foreground:
     Attributes:
         brain: [I, J, K] seen, and called brain by a third of the slices.
         core: [I, J, K] the same by one half.
-        share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. With one stack
-            it is not known, and 1 in all that is seen.
+        share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. With a
+            single stack it is not known, and 1 in all that is seen.
         unseen: [I, J, K] not seen.
         thin: [I, J, K] hardly seen or not, between two slices as well.
         rim_voxels: how far the volume is shown beyond the support, at most.

@@ -14,6 +14,9 @@ from g3r.acquisition.stacks import Stack
 from g3r.registration.estimate import Registration
 from g3r.registration.thresholds import (
     DOWNWEIGHTED_BELOW,
+    IN_PLACE_NCC,
+    IN_PLACE_SHARE,
+    LEEWAY,
     MAX_DOWNWEIGHTED_SHARE,
     MIN_HELD_OUT,
     MIN_NCC,
@@ -104,7 +107,9 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
 def shortfalls(one: StackQuality) -> list[str]:
     """What is worse of a stack than of registered ones, each with what is good; empty where nothing is."""
     found = []
-    if one.held_out_correlation is not None and one.held_out_correlation < MIN_HELD_OUT:
+    leeway = LEEWAY if _in_place(one) else 0.0
+    least, least_overlap = MIN_HELD_OUT - leeway, MIN_OVERLAP_CORRELATION - leeway
+    if one.held_out_correlation is not None and one.held_out_correlation < least:
         found.append(f"agreement {one.held_out_correlation:.3g}; good is {MIN_HELD_OUT:g} and above")
     if one.median_slice_ncc is not None and one.median_slice_ncc < MIN_NCC:
         found.append(f"its slices agree with the volume by {one.median_slice_ncc:.3g}; good is {MIN_NCC:g} and above")
@@ -114,10 +119,16 @@ def shortfalls(one: StackQuality) -> list[str]:
     # the template that stood for what others did not see agrees with any head
     if one.overlap_share is not None and one.overlap_share < MIN_OVERLAP_SHARE:
         found.append(f"others saw {100 * one.overlap_share:.3g}% of it; good is {MIN_OVERLAP_SHARE:.0%} and above")
-    if one.overlap_correlation is not None and one.overlap_correlation < MIN_OVERLAP_CORRELATION:
+    if one.overlap_correlation is not None and one.overlap_correlation < least_overlap:
         good = f"good is {MIN_OVERLAP_CORRELATION:g} and above"
         found.append(f"agreement {one.overlap_correlation:.3g} where others saw it; {good}")
     return found
+
+
+def _in_place(one: StackQuality) -> bool:
+    """Whether slices fit a volume that others made, too, as only those of stacks in place do."""
+    seen_by_others = one.overlap_share is None or one.overlap_share >= IN_PLACE_SHARE
+    return one.median_slice_ncc is not None and one.median_slice_ncc >= IN_PLACE_NCC and seen_by_others
 
 
 def pose_warnings(registration: Registration, qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -> list[str]:

@@ -13,7 +13,7 @@ from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.overlap import Overlap
 from g3r.registration.quality import StackQuality, pose_warnings, registration_summary, stack_qualities
-from g3r.registration.thresholds import MIN_HELD_OUT, MIN_NCC
+from g3r.registration.thresholds import IN_PLACE_NCC, LEEWAY, MIN_HELD_OUT, MIN_NCC, MIN_OVERLAP_CORRELATION
 from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
 
 QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)
@@ -91,7 +91,9 @@ def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[f
     ("held_out", "ncc", "weight", "reliable"),
     [
         (0.8, 0.95, 1.0, True),
-        (MIN_HELD_OUT - 0.01, 0.95, 1.0, False),
+        (MIN_HELD_OUT - 0.01, IN_PLACE_NCC - 0.01, 1.0, False),
+        (MIN_HELD_OUT - LEEWAY - 0.01, 0.99, 1.0, False),
+        (MIN_HELD_OUT - LEEWAY, IN_PLACE_NCC, 1.0, True),
         (0.8, MIN_NCC - 0.01, 1.0, False),
         (0.8, 0.95, 0.4, False),
     ],
@@ -112,6 +114,14 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "overlap_share": None,
         "overlap_correlation": None,
     }
+
+
+@pytest.mark.parametrize(("share", "reliable"), [(1.0, True), (0.5, False)])
+def test_a_good_fit_counts_where_others_saw_the_stack(share: float, reliable: bool) -> None:
+    """Alone it would agree with itself."""
+    estimate = estimate_with([0.8, 0.8], [IN_PLACE_NCC] * 2, [1.0] * 2, [0, 1])
+    estimate.overlap = SimpleNamespace(stack_share=[1.0, share], correlation=[0.9, MIN_OVERLAP_CORRELATION - LEEWAY])
+    assert [one.reliable for one in stack_qualities(estimate, 2)] == [True, reliable]
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]) -> None:
