@@ -68,7 +68,7 @@ class Foreground:
         brain: [I, J, K] seen, and called brain by a third of the slices.
         core: [I, J, K] the same by one half.
         share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. With a
-            single stack it is not known, and 1.
+            single stack it is not known, and 1 in all that is seen.
         unseen: [I, J, K] not seen.
         thin: [I, J, K] hardly seen or not, between two slices as well.
         rim_voxels: how far the volume is shown beyond the support, at most.
@@ -166,7 +166,7 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     if not brain.any():
         raise InputError("no voxel is covered by a slice; check masks and headers")
     rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
-    share, rim_voxels = np.ones_like(rough), 1
+    share, rim_voxels = seen.astype(np.float32), 1
     if len(stacks) > 1:
         share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
         share = np.where(seen & ~thin, share, 0).clip(0, 1)

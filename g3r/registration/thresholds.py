@@ -56,9 +56,9 @@ It does not tell 3 or 4 mm from 1 mm (0.70 to 0.77). Cases of docs/motion.md, "M
 
 IN_PLACE_NCC = 0.94
 """Median correlation of slices with the volume from which on a stack is in place, even if its two correlations with the
-others are lower than the limits above by `LEEWAY`: sharp, flat phantoms have 0.60 to 0.65 where poses are right. Stacks
-in place have 0.944 to 0.969 (four heads, two and three stacks). After one stack of them was turned by 6 to 180 degrees
-or moved by 6 mm and rounds of registration, those that ended 2 mm off or more had 0.928 at most. Only where others saw
+others are lower than the limits above by `LEEWAY`, as they are at times for sharp, flat phantoms. Stacks in place have
+0.944 to 0.969 (four heads, two and three stacks). After one stack of them was turned by 6 to 180 degrees or moved by 6
+mm and rounds of registration, runs that ended 2 mm off or more had 0.928 at most (by hand). Only where others saw
 `IN_PLACE_SHARE` of the stack or more: alone it agrees with itself."""
 
 IN_PLACE_SHARE, LEEWAY = 0.9, 0.05
