@@ -22,5 +22,8 @@ if stack.read_bytes().startswith(b"hungry"):
     held[::4096] = b"x" * len(held[::4096])  # pages that are not written are not taken
     seconds = 600
 time.sleep(seconds)
-shutil.copytree(result, output)
+staging = output.with_name("unfinished")  # as g3r-infer does, it is there whole or not at all
+shutil.copytree(result, staging, dirs_exist_ok=True)
+shutil.rmtree(output, ignore_errors=True)
+staging.rename(output)
 note.write_text(json.dumps({**json.loads(note.read_text()), "ended": time.time()}))
