@@ -132,6 +132,66 @@ class Foreground:
         return binary_fill_holes(brain)
 
 
+@dataclass(frozen=True)
+class Votes:
+    """What the masks of slices in place say of each voxel, before it is known how much of a voxel is brain.
+
+    Attributes:
+        slices: K slices in place.
+        grid: of what follows.
+        weight: [K] slice weights.
+        brain, core, unseen, thin: see `Foreground`.
+        rough: [I, J, K] share of the slices over a voxel whose masks contain it.
+        distance_voxels: of slices.
+    """
+
+    slices: Slices
+    grid: VolumeGrid
+    weight: NDArray[np.float64]
+    brain: NDArray[np.bool_]
+    core: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
+    thin: NDArray[np.bool_]
+    rough: NDArray[np.float32]
+    distance_voxels: float
+
+    @classmethod
+    def of(cls, slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Votes:
+        """Count them; see `foreground`."""
+        counts = np.ones(len(slices)) if weight is None else np.asarray(weight, dtype=np.float64)
+        planes = slices.planes
+        operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
+        amount = planes.spacing_mm.prod(1) * slices.thickness_mm * counts / grid.voxel_volume_mm3
+        inside = operator.adjoint(amount[operator.plane].astype(np.float32))
+        total = coverage(slices, grid, counts)
+        stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
+        distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
+        distance_voxels = float(distance_mm.max() / grid.spacing_mm.mean())
+        sigma = 0.5 * distance_voxels
+        thin = total < 2 * UNSEEN_BELOW * np.median(counts)
+        inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
+        thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
+        lone = float((thickness_mm / distance_mm).min() * np.median(counts))
+        seen = total > max(SEEN_SHARE * lone, np.finfo(np.float32).tiny)
+        brain = seen & (inside > INSIDE_SHARE * total)
+        if not brain.any():
+            raise InputError("no voxel is covered by a slice; check masks and headers")
+        rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
+        core = seen & (inside > CORE_SHARE * total)
+        return cls(slices, grid, counts, brain, core, ~seen, thin, rough, distance_voxels)
+
+    def foreground(self) -> Foreground:
+        """With the share of brain, which takes longer than all else."""
+        share, rim_voxels = (~self.unseen).astype(np.float32), 1
+        if self.slices.n_stacks > 1:
+            smooth_voxels = SMOOTH_SHARE * self.distance_voxels
+            share = _sharpened(self.rough, self.slices, self.grid, self.weight, smooth_voxels)
+            share = np.where(self.unseen | self.thin, 0, share).clip(0, 1)
+        else:
+            rim_voxels = max(1, round(SINGLE_RIM_MM / float(self.grid.spacing_mm.mean())))
+        return Foreground(self.brain, self.core, share, self.unseen, self.thin, rim_voxels)
+
+
 def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Foreground:
     """What the slices in their places say of each voxel.
 
@@ -147,33 +207,7 @@ def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | 
     Raises:
         InputError: no voxel is brain.
     """
-    weight = np.ones(len(slices)) if weight is None else np.asarray(weight, dtype=np.float64)
-    planes = slices.planes
-    operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
-    amount = planes.spacing_mm.prod(1) * slices.thickness_mm * weight / grid.voxel_volume_mm3
-    inside = operator.adjoint(amount[operator.plane].astype(np.float32))
-    total = coverage(slices, grid, weight)
-    stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
-    distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
-    distance_voxels = float(distance_mm.max() / grid.spacing_mm.mean())
-    sigma = 0.5 * distance_voxels
-    thin = total < 2 * UNSEEN_BELOW * np.median(weight)
-    inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
-    thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
-    lone = float((thickness_mm / distance_mm).min() * np.median(weight))
-    seen = total > max(SEEN_SHARE * lone, np.finfo(np.float32).tiny)
-    brain = seen & (inside > INSIDE_SHARE * total)
-    if not brain.any():
-        raise InputError("no voxel is covered by a slice; check masks and headers")
-    rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
-    share, rim_voxels = seen.astype(np.float32), 1
-    if len(stacks) > 1:
-        share = _sharpened(rough, slices, grid, weight, SMOOTH_SHARE * distance_voxels)
-        share = np.where(seen & ~thin, share, 0).clip(0, 1)
-    else:
-        rim_voxels = max(1, round(SINGLE_RIM_MM / float(grid.spacing_mm.mean())))
-    core = seen & (inside > CORE_SHARE * total)
-    return Foreground(brain, core, share, ~seen, thin, rim_voxels)
+    return Votes.of(slices, grid, weight).foreground()
 
 
 def _sharpened(

@@ -24,6 +24,27 @@ def join(buffers, volume):
                     volume[x, y, z] += buffers[b, x + 1, y + 1, z + 1]
 
 
+@numba.njit(inline="always")
+def divergence_at(volume, weight, weighted, x, y, z):
+    """One voxel of D^T W D V, see `fill_divergence`."""
+    n_x, n_y, n_z = volume.shape
+    here, total = volume[x, y, z], volume.dtype.type(0)
+    own = weight[x, y, z] if weighted else volume.dtype.type(1)
+    if x + 1 < n_x:
+        total += own * (here - volume[x + 1, y, z])
+    if y + 1 < n_y:
+        total += own * (here - volume[x, y + 1, z])
+    if z + 1 < n_z:
+        total += own * (here - volume[x, y, z + 1])
+    if x > 0:
+        total += (weight[x - 1, y, z] if weighted else own) * (here - volume[x - 1, y, z])
+    if y > 0:
+        total += (weight[x, y - 1, z] if weighted else own) * (here - volume[x, y - 1, z])
+    if z > 0:
+        total += (weight[x, y, z - 1] if weighted else own) * (here - volume[x, y, z - 1])
+    return total
+
+
 @numba.njit(parallel=True, nogil=True, cache=True)
 def fill_divergence(volume, weight, weighted, out):
     """Write D^T W D V with forward differences D and free edges.
@@ -38,18 +59,65 @@ def fill_divergence(volume, weight, weighted, out):
     for x in numba.prange(n_x):
         for y in range(n_y):
             for z in range(n_z):
-                here, total = volume[x, y, z], volume.dtype.type(0)
-                own = weight[x, y, z] if weighted else volume.dtype.type(1)
-                if x + 1 < n_x:
-                    total += own * (here - volume[x + 1, y, z])
-                if y + 1 < n_y:
-                    total += own * (here - volume[x, y + 1, z])
-                if z + 1 < n_z:
-                    total += own * (here - volume[x, y, z + 1])
-                if x > 0:
-                    total += (weight[x - 1, y, z] if weighted else own) * (here - volume[x - 1, y, z])
-                if y > 0:
-                    total += (weight[x, y - 1, z] if weighted else own) * (here - volume[x, y - 1, z])
-                if z > 0:
-                    total += (weight[x, y, z - 1] if weighted else own) * (here - volume[x, y, z - 1])
-                out[x, y, z] = total
+                out[x, y, z] = divergence_at(volume, weight, weighted, x, y, z)
+
+
+@numba.njit(parallel=True, nogil=True, cache=True)
+def add_roughness(volume, weight, strength, image, along):
+    """Add s D^T D V to what else a system makes of V, and multiply the sum with V.
+
+    Args:
+        volume: [I, J, K].
+        weight: [1, 1, 1] of its type, not read.
+        strength: s.
+        image: [I, J, K], changed.
+        along: [I] float64, the sum over each plane of voxels, written: the same for any number of threads.
+    """
+    n_x, n_y, n_z = volume.shape
+    for x in numba.prange(n_x):
+        total = 0.0
+        for y in range(n_y):
+            for z in range(n_z):
+                image[x, y, z] += strength * divergence_at(volume, weight, False, x, y, z)
+                total += volume[x, y, z] * image[x, y, z]
+        along[x] = total
+
+
+@numba.njit(parallel=True, nogil=True, cache=True)
+def descend(volume, residual, direction, image, step, square):
+    """Go one step of conjugate gradients.
+
+    Args:
+        volume: [I, J, K], changed.
+        residual: [I, J, K], changed.
+        direction: [I, J, K].
+        image: [I, J, K] of the direction.
+        step: its length.
+        square: [I] float64, the residual's sum of squares over each plane of voxels, written.
+    """
+    n_x, n_y, n_z = volume.shape
+    for x in numba.prange(n_x):
+        total = 0.0
+        for y in range(n_y):
+            for z in range(n_z):
+                volume[x, y, z] += step * direction[x, y, z]
+                left = residual[x, y, z] - step * image[x, y, z]
+                residual[x, y, z] = left
+                total += left * left
+        square[x] = total
+
+
+@numba.njit(parallel=True, nogil=True, cache=True)
+def turn(direction, residual, share):
+    """Write the next direction: the residual, and a share of the last direction.
+
+    Args:
+        direction: [I, J, K], changed.
+        residual: [I, J, K].
+        share: of the last one.
+    """
+    n_x, n_y, n_z = direction.shape
+    for x in numba.prange(n_x):
+        for y in range(n_y):
+            for z in range(n_z):
+                direction[x, y, z] = residual[x, y, z] + share * direction[x, y, z]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.acquisition.kernels_voxels import add_roughness, descend, turn
 from g3r.acquisition.planes import Slices
-from g3r.acquisition.total_variation import divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 
@@ -78,11 +78,15 @@ def solve_volume(
     seen = operator.adjoint(weight.astype(np.float32))
     typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
     strength = np.float32(smoothness * typical)
+    along, square = (np.empty(operator.grid.shape[0]) for _ in range(2))
+    plain = np.ones((1, 1, 1), np.float32)
 
     def normal(volume: NDArray[np.float32]) -> NDArray[np.float32]:
-        return operator.adjoint(weight * operator.forward(volume)) + strength * divergence_of_gradient(volume, None)
+        image = operator.adjoint(weight * operator.forward(volume))
+        add_roughness(volume, plain, strength, image, along)
+        return image
 
-    volume = np.zeros(operator.grid.shape, np.float32) if start is None else start.astype(np.float32)
+    volume = np.zeros(operator.grid.shape, np.float32) if start is None else start.astype(np.float32, order="C")
     residual = operator.adjoint((weight * value).astype(np.float32)) - normal(volume)
     direction = residual.copy()
     norm = float(np.vdot(residual, residual))
@@ -90,10 +94,8 @@ def solve_volume(
         if norm == 0:
             break
         image = normal(direction)
-        step = norm / float(np.vdot(direction, image))
-        volume = volume + np.float32(step) * direction
-        residual -= np.float32(step) * image
-        new_norm = float(np.vdot(residual, residual))
-        direction = residual + np.float32(new_norm / norm) * direction
+        descend(volume, residual, direction, image, np.float32(norm / along.sum()), square)
+        new_norm = float(square.sum())
+        turn(direction, residual, np.float32(new_norm / norm))
         norm = new_norm
     return volume

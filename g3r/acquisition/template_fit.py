@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter
 
 from g3r.geometry import VolumeGrid
@@ -209,6 +208,8 @@ class _Deformation:
 
 def _cubic_basis(position: NDArray[np.float64], n_spans: int) -> NDArray[np.float64]:
     """Values [n, n_spans + 3] of the uniform cubic B-splines at positions in units of their distance."""
+    from scipy.interpolate import BSpline  # it takes a tenth of a second, and a preview fits no template
+
     knots = np.arange(-3, n_spans + 4, dtype=np.float64)
     inside = np.clip(position, 0, n_spans * (1 - 1e-12))
     return np.asarray(BSpline.design_matrix(inside, knots, 3).toarray())

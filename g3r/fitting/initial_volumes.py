@@ -12,7 +12,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.common_bias_field import common_log_field, without_field
 from g3r.acquisition.coverage import brain_share, coverage
-from g3r.acquisition.foreground import Foreground, foreground
+from g3r.acquisition.foreground import Foreground, Votes
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
@@ -79,11 +79,11 @@ class InitialVolumes:
         slice_weight = weight[slices.pixel_plane]
         coarse, masked = coarse_and_density(slices, grid, gain, slice_weight)
         sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
-        seen = foreground(slices, grid, weight)
+        votes = Votes.of(slices, grid, weight)
         field_rms = 0.0
         with ThreadPoolExecutor(1) as pool:  # N4 has one thread, and releases Python's lock
-            field = pool.submit(common_log_field, sharp, seen.core, grid) if common_bias_field else None
-            density = coverage(slices, grid, weight)
+            field = pool.submit(common_log_field, sharp, votes.core, grid) if common_bias_field else None
+            density, seen = coverage(slices, grid, weight), votes.foreground()
         if field is not None:
             log_field = field.result()
             slices = without_field(slices, log_field, grid)

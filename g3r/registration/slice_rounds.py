@@ -32,6 +32,9 @@ N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
 
+VOLUME_STEPS = 5
+"""Of conjugate gradients in each round, which goes on from the volume before: three more changed no pose by 0.05 mm."""
+
 CONTINUED_VOXELS = 1.5
 """Standard deviation, in voxels, of the blur that continues a volume beyond the masks."""
 
@@ -167,7 +170,7 @@ def _volume_of(
         width = robust_width(residual, n_sigma=3)
         pixel_weight = (pixel_weight / (1 + (residual / width) ** 2)).astype(np.float32)
     return solve_volume(
-        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=8, smoothness=smoothness
+        operator, value.astype(np.float32), pixel_weight, start=start, n_iterations=VOLUME_STEPS, smoothness=smoothness
     )
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from g3r.acquisition.coverage import UNSEEN_POWER
 
@@ -104,6 +103,8 @@ def fit_model(
     least = np.array([MIN_COEFFICIENT.get(name, 0.0) for name in names]) * spread
     start[1:] = least
     bounds = [(None, None), *[(float(bound), None) for bound in least]]
+    from scipy.optimize import minimize  # it takes a tenth of a second, and no reconstruction fits this model
+
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     slopes = found[1:] / spread
     return ErrorModel(float(found[0] - slopes @ middle), {n: float(b) for n, b in zip(names, slopes, strict=True)})
