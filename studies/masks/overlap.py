@@ -72,16 +72,25 @@ def scored(image: NDArray[np.float32], true: NDArray[np.bool_], spacing_mm: Sequ
     }
     if not true.any():
         return row
-    spacing = np.asarray(spacing_mm)
-    area, shared = true.sum((0, 1)), (true & found.mask).sum((0, 1))
-    off = np.argwhere(true).mean(0) * spacing - found.centre_mm
+    off = np.argwhere(true).mean(0) * np.asarray(spacing_mm) - found.centre_mm
+    centre_mm = round(float(np.linalg.norm(off)), 2) if found.found else None
+    return {**row, **overlap(found.mask, true, spacing_mm), "centre_mm": centre_mm}
+
+
+def overlap(found: NDArray[np.bool_], true: NDArray[np.bool_], spacing_mm: Sequence[float]) -> Row:
+    """Compare a mask with the true one.
+
+    Args:
+        found: [I, J, K].
+        true: [I, J, K], not empty.
+        spacing_mm: [3].
+    """
+    area, shared = true.sum((0, 1)), (true & found).sum((0, 1))
     return {
-        **row,
-        "true_ml": round(float(true.sum() * spacing.prod() / 1000), 1),
-        "dice": round(float(2 * shared.sum() / (true.sum() + found.mask.sum())), 4),
+        "true_ml": round(float(true.sum() * np.prod(spacing_mm) / 1000), 1),
+        "dice": round(float(2 * shared.sum() / (true.sum() + found.sum())), 4),
         "recall": round(float(shared.sum() / true.sum()), 4),
         "lost_slices": int(((area > LOST_PIXELS) & (shared == 0)).sum()),
-        "centre_mm": round(float(np.linalg.norm(off)), 2) if found.found else None,
     }
 
 

@@ -1,20 +1,32 @@
-"""`python -m studies.masks.real`: brain masks found in real stacks, compared with masks drawn by hand."""
+"""`python -m studies.masks.real`: brain masks found in real stacks, compared with masks drawn by hand.
+
+The network sees one stack. What `g3r-infer --masks auto` writes was compared between stacks, too: the subjects with
+three stacks or more are reconstructed once with masks that are found, and once without each stack, which the volume
+then predicts, as it does when made with the masks drawn by hand.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from g3r.acquisition.stacks import load_stack
+from g3r.acquisition.images import Volume
+from g3r.acquisition.stacks import Stack, load_stack, load_stacks
 from g3r.errors import InputError
+from g3r.evaluation.held_out_stack import predict_stack
+from g3r.reconstruct import GaussianReconstructor
 from studies.harness import Record, Row, Study, Task
-from studies.masks.overlap import EACH, OPTIONS, line, scored, settings
+from studies.masks.overlap import EACH, OPTIONS, line, mask_model, overlap, scored, settings
 from studies.subjects import data_folder
-from studies.tables import table
+from studies.tables import Cell, table
 
 MASK_ENDING = "_desc-brain_mask.nii.gz"
+
+ERODED_PIXELS = 4
+"""Rim of a drawn mask that does not count when its stack is predicted."""
 
 
 def stacks_with_masks() -> list[tuple[Path, Path]]:
@@ -34,10 +46,26 @@ def stacks_with_masks() -> list[tuple[Path, Path]]:
     return found
 
 
-def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per stack."""
+def subjects_with_masks() -> dict[str, list[tuple[Path, Path]]]:
+    """The same by subject, of those with three stacks or more."""
+    subjects: dict[str, list[tuple[Path, Path]]] = {}
     for stack, mask in stacks_with_masks():
-        yield Task(stack.name.removesuffix(".nii.gz"), measure, (stack, mask, options))
+        subjects.setdefault(stack.name.split("_")[0], []).append((stack, mask))
+    return {name: pairs for name, pairs in subjects.items() if len(pairs) > 2}
+
+
+def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """A measurement per stack, one per subject, and two per stack that is left out."""
+    for stack, mask in stacks_with_masks():
+        yield Task(_name(stack), measure, (stack, mask, options))
+    for name, pairs in subjects_with_masks().items():
+        yield Task(f"{name}, written", measure_written, (pairs, options))
+        for n, (stack, _) in enumerate(pairs):
+            yield Task(f"{_name(stack)}, predicted", measure_predicted, (pairs, n, options))
+
+
+def _name(stack: Path) -> str:
+    return stack.name.removesuffix(".nii.gz")
 
 
 def measure(stack: Path, mask: Path, options: argparse.Namespace) -> Row:
@@ -52,20 +80,94 @@ def measure(stack: Path, mask: Path, options: argparse.Namespace) -> Row:
     return scored(true.image, true.mask, true.spacing_mm.tolist(), options.masks)
 
 
+def measure_written(pairs: Sequence[tuple[Path, Path]], options: argparse.Namespace) -> Row:
+    """The masks of a subject as they are written, each beside the one drawn by hand.
+
+    Args:
+        pairs: files of the stacks and of the masks drawn on them.
+        options: of the command.
+    """
+    drawn = _loaded(pairs)
+    written = GaussianReconstructor(settings=options.preset).reconstruct(_found(drawn, options.masks)).stacks
+    rows = {}
+    for (path, _), one, true in zip(pairs, written, drawn, strict=True):
+        volume_ml = round(float(one.mask.sum() * true.grid.voxel_volume_mm3 / 1000), 1)
+        rows[_name(path)] = {"volume_ml": volume_ml, **overlap(one.mask, true.mask, true.spacing_mm.tolist())}
+    return {"written": rows}
+
+
+def measure_predicted(pairs: Sequence[tuple[Path, Path]], left_out: int, options: argparse.Namespace) -> Row:
+    """How well volumes of the other stacks predict one, by whose masks they were made.
+
+    Args:
+        pairs: files of the stacks and of the masks drawn on them.
+        left_out: number of the one to predict, in its own drawn mask.
+        options: of the command.
+    """
+    stacks = _loaded(pairs)
+    target, others = stacks[left_out], [stack for n, stack in enumerate(stacks) if n != left_out]
+    reconstructor, row = GaussianReconstructor(settings=options.preset), {}
+    for name, made_of in (("drawn", others), ("found", _found(others, options.masks))):
+        result = reconstructor.reconstruct(made_of)
+        volume = Volume(result.volume, result.grid.affine, f"{name} masks")
+        row[f"{name}_db"] = round(predict_stack(volume, target, eroded_pixels=ERODED_PIXELS).figures()["psnr_db"], 3)
+    return {"predicted": row}
+
+
+def _loaded(pairs: Sequence[tuple[Path, Path]]) -> list[Stack]:
+    return load_stacks([stack for stack, _ in pairs], [mask for _, mask in pairs])
+
+
+def _found(stacks: Sequence[Stack], source: str | None) -> list[Stack]:
+    """The stacks with the masks that the network finds."""
+    from g3r.mask_network.inference import find_brain
+
+    masks = [find_brain(stack.image, stack.spacing_mm.tolist(), mask_model(source)).mask for stack in stacks]
+    return [replace(stack, mask=mask, mask_source="automatic") for stack, mask in zip(stacks, masks, strict=True)]
+
+
+def said(key: str, row: Row) -> str:
+    """A finished measurement."""
+    if "written" in row:
+        return f"{key}: Dice " + ", ".join(f"{one['dice']:.3f}" for one in row["written"].values())
+    if "predicted" in row:
+        return f"{key}: {_db(row['predicted'])}"
+    return line(key, row)
+
+
+def _db(row: Mapping[str, float]) -> str:
+    return f"masks drawn {row['drawn_db']:.2f} dB, found {row['found_db']:.2f} dB"
+
+
+WRITTEN: dict[str, Cell] = {
+    **{name: EACH[name] for name in ("stack", "true ml", "found ml", "Dice", "recall", "slices lost")},
+    "predicted, masks drawn, dB": lambda row: f"{row['drawn_db']:.2f}" if "drawn_db" in row else "-",
+    "predicted, masks found, dB": lambda row: f"{row['found_db']:.2f}" if "found_db" in row else "-",
+}
+"""Columns of the table of masks as they are written."""
+
+
 def tables(record: Record) -> dict[str, str]:
-    """A row per stack."""
-    return {"masks-real": table(({"name": name, **row} for name, row in record["rows"].items()), EACH)}
+    """What the network finds, and what is written; a row per stack."""
+    rows = record["rows"]
+    alone = [{"name": name, **row} for name, row in rows.items() if "dice" in row]
+    written = [
+        {"name": name, **one, **rows.get(f"{name}, predicted", {}).get("predicted", {})}
+        for row in rows.values()
+        for name, one in row.get("written", {}).items()
+    ]
+    return {"masks-real": table(alone, EACH)} | ({"masks-written": table(written, WRITTEN)} if written else {})
 
 
 STUDY = Study(
     name="masks.real",
     about="Find the brain in the real stacks of the test data that have masks drawn by hand.",
     document="masks.md",
-    shared=(),
+    shared=("--preset",),
     options=OPTIONS,
     settings=settings,
     tasks=tasks,
-    line=line,
+    line=said,
     tables=tables,
 )
 

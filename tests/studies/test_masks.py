@@ -17,6 +17,8 @@ from studies.harness import Row
 from studies.masks import overlap, real, simulated
 from studies.masks.surrounded import SLICES_BEYOND, surrounded
 
+TRUE = np.ones((1, 3, 3), dtype=bool), (1.0, 1.0, 1.0)
+
 
 def found_mask(mask: np.ndarray, spacing_mm: np.ndarray) -> inference.BrainMask:
     centre = np.argwhere(mask).mean(0) * spacing_mm if mask.any() else np.full(3, np.nan)
@@ -56,7 +58,14 @@ def test_tables(row: Row) -> None:
     text = simulated.tables({"rows": {"a": row, "b": missed, "c": without}})["masks-simulated"]
     assert "2 stacks with a head: found in 1, centre within 5 mm in 1" in text
     assert "1 stacks without a head: in 1 of them one was found" in text
-    assert "| a |" in real.tables({"rows": {"a": row}})["masks-real"]
+    written = {"written": {"a": {"volume_ml": 9.0, **overlap.overlap(np.eye(3, dtype=bool)[None], *TRUE)}}}
+    rows = {"a": row, "a, predicted": {"predicted": {"drawn_db": 24.0, "found_db": 23.875}}, "all, written": written}
+    shown = real.tables({"rows": rows})
+    assert "| a |" in shown["masks-real"]
+    assert "predicted" not in shown["masks-real"]
+    assert "| a | 0 | 9 | 0.500 | 0.333 | 0 | 24.00 | 23.88 |" in shown["masks-written"]
+    assert "0.500" in real.said("all, written", written)
+    assert "found 23.88" in real.said("a, predicted", rows["a, predicted"])
     assert "one found" in overlap.line("c", without)
 
 

@@ -14,6 +14,7 @@ from studies.results.blocks import NO_MEASUREMENT, PAGE, Block, origin, publishe
 from studies.results.findings import FAILS, HOLDS, MISSING, UNSAID, Claim, Finding, Judged, judged, paired, shares
 from studies.results.page import MARKER, TOPICS, judgements, main, page
 from studies.results.paper_claims import one_stack, parts, table_1
+from studies.results.picture_claims import real_masks, volumes_of_real_masks
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +104,25 @@ def test_claims_follow_the_figures() -> None:
     assert found.verdict == f"{UNSAID} (n too small; so far it {FAILS})"
     assert "3 subjects" in found.conclusion
     assert outcome(claims, "Better LPIPS", methods("| g3r | 16 | 1 | 30 | 1 | |", "")).outcome == MISSING
+
+
+def test_real_masks() -> None:
+    head = "| stack | Dice | slices lost | predicted, masks drawn, dB | predicted, masks found, dB |\n"
+    head += "| --- | ---: | ---: | ---: | ---: |\n"
+    one, two, poor = (
+        f"| {s} |"
+        for s in ("s1_a | 0.93 | 0 | 24.0 | 23.6", "s2_a | 0.92 | 0 | 24.0 | 23.4", "s3_a | 0.91 | 0 | - | -")
+    )
+    block = Block("masks-written", "masks.md", "", head + f"{one}\n{two}")
+    alike, as_well = (outcome([claim()], "real stacks", block) for claim in (real_masks, volumes_of_real_masks))
+    assert alike.finding is not None
+    assert (alike.finding.holds, alike.finding.n, alike.finding.enough) == (True, 2, False)
+    assert as_well.finding is not None
+    assert as_well.finding.figure == "-0.50 dB, least -0.60"
+    for more in (poor, poor.replace("0.91 | 0", "0.95 | 1")):
+        worse = outcome([real_masks()], "real stacks", replace(block, text=f"{block.text}\n{more}"))
+        assert worse.finding is not None
+        assert not worse.finding.holds
 
 
 def test_one_stack_and_the_parts() -> None:
