@@ -13,10 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from g3r.acquisition.images import Volume
 from g3r.acquisition.stacks import Stack, load_stack, load_stacks
 from g3r.errors import InputError
-from g3r.evaluation.held_out_stack import predict_stack
+from g3r.evaluation.held_out_stack import predicted_pixels, score_prediction
 from g3r.reconstruct import GaussianReconstructor
 from studies.harness import Record, Row, Study, Task
 from studies.masks.overlap import EACH, OPTIONS, line, mask_model, overlap, scored, settings
@@ -97,7 +99,7 @@ def measure_written(pairs: Sequence[tuple[Path, Path]], options: argparse.Namesp
 
 
 def measure_predicted(pairs: Sequence[tuple[Path, Path]], left_out: int, options: argparse.Namespace) -> Row:
-    """How well volumes of the other stacks predict one, by whose masks they were made.
+    """How well volumes of the other stacks predict one, by whose masks they were made, where both show the brain.
 
     Args:
         pairs: files of the stacks and of the masks drawn on them.
@@ -106,12 +108,17 @@ def measure_predicted(pairs: Sequence[tuple[Path, Path]], left_out: int, options
     """
     stacks = _loaded(pairs)
     target, others = stacks[left_out], [stack for n, stack in enumerate(stacks) if n != left_out]
-    reconstructor, row = GaussianReconstructor(settings=options.preset), {}
+    reconstructor, pixels = GaussianReconstructor(settings=options.preset), {}
     for name, made_of in (("drawn", others), ("found", _found(others, options.masks))):
         result = reconstructor.reconstruct(made_of)
         volume = Volume(result.volume, result.grid.affine, f"{name} masks")
-        row[f"{name}_db"] = round(predict_stack(volume, target, eroded_pixels=ERODED_PIXELS).figures()["psnr_db"], 3)
-    return {"predicted": row}
+        pixels[name] = predicted_pixels(volume, target, support=result.mask)
+    seen = np.minimum(*(one.seen for one in pixels.values()))
+    scores = {
+        name: score_prediction(replace(one, seen=seen), target.name, f"{name} masks", ERODED_PIXELS)
+        for name, one in pixels.items()
+    }
+    return {"predicted": {f"{name}_db": round(one.figures()["psnr_db"], 3) for name, one in scores.items()}}
 
 
 def _loaded(pairs: Sequence[tuple[Path, Path]]) -> list[Stack]:
