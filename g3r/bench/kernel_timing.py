@@ -175,7 +175,7 @@ def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
     def step() -> None:
         loss = objective.begin({"slices": (term, unknowns.state(ones))})
         image = loss.add("slices", 1.0)
-        parameters.step(image.mean + loss.finish() + unknowns.finish(image, 10.0, 0.0, 0.0), STEP_FACTOR)
+        parameters.step(image.mean + loss.finish() + unknowns.finish(image, 10.0, 0.0), STEP_FACTOR)
 
     setattr(fit_kernels, plain.__name__, timed)
     try:

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.bias_basis import N_TERMS
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.gain_trends import GainTrends
 from g3r.fitting.objective import TermLoss
 from g3r.fitting.open_shear import OpenShear, mean_normals, open_strain
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
@@ -67,7 +66,6 @@ class SliceParameters:
         _, self.stack = np.unique(slices.stack_id, return_inverse=True)
         corner_mm = np.sqrt(((slices.planes.shape * slices.planes.spacing_mm / 2) ** 2).sum(1))
         self.radius_mm = float(corner_mm.mean()) / 2
-        self.trends = GainTrends(slices)
 
     @property
     def with_pose(self) -> bool:
@@ -95,7 +93,7 @@ class SliceParameters:
             rotation=orientation, center_mm=center_mm, gain=gain, slice_weight=slice_weight, coefficients=coefficients
         )
 
-    def finish(self, image: TermLoss, pose_prior_mm: float, bias_field_ridge: float, gain_trend_ridge: float) -> float:
+    def finish(self, image: TermLoss, pose_prior_mm: float, bias_field_ridge: float) -> float:
         """Write the gradients of poses, gains and fields; returns the terms of those alone.
 
         Args:
@@ -103,7 +101,6 @@ class SliceParameters:
                 movement of a slice over pose_prior_mm^2.
             pose_prior_mm: movement at which the pose prior of a slice equals the image term.
             bias_field_ridge: weight of the mean squared coefficient of the fields.
-            gain_trend_ridge: the same of how the trends of gains have changed, see `GainTrends`.
         """
         value, gradient = self.parameters.value, self.parameters.gradient
         loss = 0.0
@@ -122,9 +119,6 @@ class SliceParameters:
             slope = image.plane_gradient[image.chosen, 6]  # the mean of slices that were not seen is not known
             gradient["log_gain"][...] = 0.0
             gradient["log_gain"][image.chosen] = slope - slope.mean()
-            penalty, away = self.trends.penalty(value["log_gain"] - np.log(self.gain))
-            loss += gain_trend_ridge * penalty
-            gradient["log_gain"] += gain_trend_ridge * away
         if "bias_field" in value:
             c = value["bias_field"].astype(np.float64)
             total = np.zeros_like(c)

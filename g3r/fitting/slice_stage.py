@@ -49,7 +49,6 @@ class SliceStageSettings:
         reweight_every: steps between two estimates of the slice weights.
         optimise_bias_field: whether stacks have a smooth intensity field each (two stacks or more).
         bias_field_ridge: weight of the mean squared coefficient of the fields.
-        gain_trend_ridge: the same of how the trends of gains along a stack have changed; see `GainTrends`.
         cutoff_sigma: where a Gaussian ends, here and in the volume; smaller is faster and less exact.
         projection_bytes: see `solve_amplitudes`; less memory, more seconds, the same result.
         rates: step sizes.
@@ -67,7 +66,6 @@ class SliceStageSettings:
     reweight_every: int = 20
     optimise_bias_field: bool = True
     bias_field_ridge: float = 0.02
-    gain_trend_ridge: float = 0.1
     cutoff_sigma: float = CUTOFF_SIGMA
     projection_bytes: int = MAX_PROJECTION_BYTES
     rates: LearningRates = field(default_factory=LearningRates)
@@ -270,9 +268,7 @@ class SliceLoss:
             loss += strength * self.prior_share * distance
             entry |= {"distillation": distance, "distillation_weight": strength}
         loss += step.finish()
-        loss += self.unknowns.finish(
-            slices, settings.pose_prior_mm, settings.bias_field_ridge, settings.gain_trend_ridge
-        )
+        loss += self.unknowns.finish(slices, settings.pose_prior_mm, settings.bias_field_ridge)
         return loss, entry
 
     def reweight(self) -> float:

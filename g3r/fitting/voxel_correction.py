@@ -21,7 +21,6 @@ from g3r.acquisition.robust import robust_width
 from g3r.acquisition.total_variation import diffusivity, divergence_of_gradient
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.held_out_slices import held_out_rows
 from g3r.fitting.slice_stage import SliceFit
 from g3r.geometry import VolumeGrid
 
@@ -37,12 +36,6 @@ that of stacks with a signal-to-noise ratio of 20 (0.024), since what V_0 lacks 
 noisier slices counts less, by the square of it, as in a MAP estimate: with a ratio of 5 and two stacks of a simulated
 subject an unchanged hold cost 0.6 dB against no correction."""
 
-SEEN_BEFORE = 1.04
-"""How much worse, as a factor of the error, slices may be predicted by a volume made without them than by V_0, for V_0
-to lack what the slices know. Four phantoms, whose edges are sharper than the prior knows, had 1.02 to 1.04 and gained
-0.2 to 0.3 dB with the loose hold; simulated and real heads had 1.05 and more, and lost 0.1 to 0.2 dB. Where noise is
-most of both errors they are alike, so that only quiet slices are asked that way."""
-
 PROBE_SIGMA_MM, KEPT_SIGMA_MM = 0.4, 3.2
 """Width of the random change by which it is found how much of V_0 stays, and of the neighbourhoods in which answers are
 compared (as in `uncertainty.prior_share`). Of wider changes less stays; of this one about as much as of V_prior - V_G,
@@ -55,7 +48,6 @@ class VoxelCorrectionSettings:
 
     Args:
         hold: h, pull towards V_0, over what slices measure in a voxel.
-        loose_hold: h where held-out slices are predicted nearly as well with it as by V_0.
         total_variation: s.
         tip: change from voxel to voxel, in normalised intensities, below which total variation is a square.
         n_rounds: solutions, each with the edges of the one before.
@@ -63,7 +55,6 @@ class VoxelCorrectionSettings:
     """
 
     hold: float = 0.6
-    loose_hold: float = 0.3
     total_variation: float = 0.015
     tip: float = 0.02
     n_rounds: int = 2
@@ -80,14 +71,11 @@ class VoxelCorrectionRecord:
     """What was corrected.
 
     Attributes:
-        hold: that was taken, the noise of the slices included.
-        held_out: root mean square error of held-out slices, in normalised intensities: by V_0, which has seen them,
-            and by V with the loose hold, made without them; None where none could be held out.
+        hold: that was taken, by the noise of the slices.
         size: root mean square of the correction in the brain, in normalised intensities.
     """
 
     hold: float
-    held_out: tuple[float, float] | None
     size: float
 
 
@@ -136,7 +124,8 @@ def correct_on_voxels(
         rng: draws the change by which `kept` is found.
     """
     whole = _Pixels.of(fit, pixel_weight)
-    chosen, errors = _choose_hold(volume, whole, fit, grid, settings)
+    # how far slices of a single stack are off counts as noise: no other stack checks their poses
+    chosen = settings.for_noise((whole.error if fit.slices.n_stacks == 1 else whole.noise)(volume, grid))
     problem = _Problem(whole, grid, chosen)
     found = problem.solved(volume)
     values = ((found - volume) * reach).astype(np.float16)
@@ -144,30 +133,8 @@ def correct_on_voxels(
     size = float(np.sqrt((values[inside].astype(np.float64) ** 2).mean())) if inside.any() else 0.0
     kept = 1 - reach * (1 - problem.kept(found, rng))
     return VoxelCorrection(
-        values=values,
-        kept=kept,
-        record=VoxelCorrectionRecord(hold=round(chosen.hold, 3), held_out=errors, size=round(size, 5)),
+        values=values, kept=kept, record=VoxelCorrectionRecord(hold=round(chosen.hold, 3), size=round(size, 5))
     )
-
-
-def _choose_hold(
-    volume: Array, whole: _Pixels, fit: SliceFit, grid: VolumeGrid, settings: VoxelCorrectionSettings
-) -> tuple[VoxelCorrectionSettings, tuple[float, float] | None]:
-    """The loose hold if slices that were held out of it are predicted nearly as well as by V_0, which has seen them.
-
-    Else V_0 lacks little, and how far the slices are believed depends on their noise.
-    """
-    # how far slices of a single stack are off counts as noise: no other stack checks their poses
-    noise = (whole.error if whole.slices.n_stacks == 1 else whole.noise)(volume, grid)
-    held, errors = held_out_rows(fit.slices, fit.weight)[whole.plane], None
-    if held.any() and not held.all():
-        loose = replace(settings, hold=settings.loose_hold)
-        found = _Problem(whole.take(~held), grid, loose).solved(volume)
-        before, after = (whole.take(held).error(one, grid) for one in (volume, found))
-        errors = (round(before, 5), round(after, 5))
-        if after < (SEEN_BEFORE if noise <= QUIET else 1.0) * before:
-            return loose, errors
-    return settings.for_noise(noise), errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,15 +163,6 @@ class _Pixels:
             value = value / np.exp(StackBiasField(slices).log_field(np.array(fit.bias_field))[index])
         weight = pixel_weight[index] * fit.weight[plane]
         return cls(slices=slices, index=index, plane=plane, value=value.astype(np.float32), weight=weight.astype("f4"))
-
-    def take(self, chosen: NDArray[np.bool_]) -> _Pixels:
-        return replace(
-            self,
-            index=self.index[chosen],
-            plane=self.plane[chosen],
-            value=self.value[chosen],
-            weight=self.weight[chosen],
-        )
 
     def operator(self, grid: VolumeGrid) -> VoxelOperator:
         in_plane = 3 if _voxel_over_pixel(grid, self.slices) < FINE_VOXEL else 1

@@ -207,9 +207,6 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
         n_stacks: with slices.
     """
     stage = settings.slice_stage
-    if n_stacks < 3:
-        # registration knows gains' trends from three stacks on; on real pairs, holding them cost up to 0.5 dB
-        stage = replace(stage, gain_trend_ridge=0.0)
     if n_stacks == 1:
         # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
         held = settings.use_prior and settings.distillation and settings.registration.segments

@@ -83,9 +83,7 @@ class Scene:
         self.image = step.add("slices", 1.0)
         distance = step.add("prior", STRENGTH).mean
         regulariser = step.finish()
-        others = self.unknowns.finish(
-            self.image, SETTINGS.pose_prior_mm, SETTINGS.bias_field_ridge, SETTINGS.gain_trend_ridge
-        )
+        others = self.unknowns.finish(self.image, SETTINGS.pose_prior_mm, SETTINGS.bias_field_ridge)
         return self.image.mean + STRENGTH * distance + regulariser + others
 
     def oracle(self) -> tuple[float, dict[str, np.ndarray]]:
@@ -109,15 +107,6 @@ class Scene:
         away = leaves["log_scale"] - torch.tensor(self.seed)
         loss = loss + SETTINGS.scale_weight * away.square().mean()
         loss = loss + SETTINGS.bias_field_ridge * leaves["bias_field"].square().mean()
-        trends = []
-        for stack in np.unique(self.slices.stack_id):
-            rows = np.flatnonzero(self.slices.stack_id == stack)
-            header = self.slices.header_pose
-            along = header.translation_mm[rows] @ header.rotation[rows[0], :, 2] / 40.0
-            powers = torch.tensor(np.vander(along - along.mean(), min(3, len(rows)), increasing=True))
-            change = leaves["log_gain"][rows] - torch.tensor(np.log(self.unknowns.gain[rows]))
-            trends.append(torch.linalg.lstsq(powers, change[:, None]).solution[1:, 0])
-        loss = loss + SETTINGS.gain_trend_ridge * torch.cat(trends).square().mean()
         radius = np.sqrt(((self.slices.planes.shape * self.slices.planes.spacing_mm / 2) ** 2).sum(1)).mean() / 2
         moved = leaves["translation"].square().sum(1) + (radius * leaves["rotation"]).square().sum(1)
         loss = loss + image.item() * moved.mean() / SETTINGS.pose_prior_mm**2
@@ -152,7 +141,7 @@ def test_gradients_are_finite_differences_of_the_value(volume: np.ndarray) -> No
             values.append(scene.evaluate())
             # the image's value scales the pose prior as a constant
             one = replace(scene.image, mean=1.0)
-            values[-1] += (image - scene.image.mean) * scene.unknowns.finish(one, SETTINGS.pose_prior_mm, 0.0, 0.0)
+            values[-1] += (image - scene.image.mean) * scene.unknowns.finish(one, SETTINGS.pose_prior_mm, 0.0)
         value[...] = start
         slope = float((g * direction).sum())
         assert (values[0] - values[1]) / 2 == pytest.approx(slope, rel=0.03), name

@@ -115,7 +115,7 @@ def test_the_slope_is_the_finite_difference_of_the_loss() -> None:
         parameters, _ = parameters_of(slices)
         ones = np.ones(len(slices))
         # every slice in its turn; tails of Gaussians that are cut off would jump
-        settings = SliceStageSettings(n_parts=1, scale_weight=0.0, gain_trend_ridge=0.0, cutoff_sigma=6.0)
+        settings = SliceStageSettings(n_parts=1, scale_weight=0.0, cutoff_sigma=6.0)
         loss = SliceLoss(
             parameters, slices, gain=ones, slice_weight=ones, bias_field=None, prior=None, settings=settings
         )

@@ -148,12 +148,7 @@ class CompleteLoss:
         moved = (value["translation"] ** 2).sum(1) + radius**2 * (value["rotation"] ** 2).sum(1)
         loss += frozen * moved.mean() / SETTINGS.pose_prior_mm**2
         loss += SETTINGS.bias_field_ridge * (value["bias_field"] ** 2).mean()
-        header, change = self.slices.header_pose, value["log_gain"] - np.log(self.gain)
-        slopes = []
-        for first in (0, 2, 4):  # stacks of two slices, between which a trend is a line
-            rise = (header.translation_mm[first + 1] - header.translation_mm[first]) @ header.rotation[first, :, 2]
-            slopes.append(40.0 * (change[first + 1] - change[first]) / rise)
-        return float(loss + SETTINGS.gain_trend_ridge * np.mean(np.square(slopes)))
+        return float(loss)
 
     def _is_chosen(self) -> np.ndarray:
         drawn = self.loss.distilled.planes.center_mm[:, 2]
@@ -201,7 +196,6 @@ def test_a_wrong_term_would_be_seen(tally: Tally) -> None:
         "scale": {"scale_weight": 0.0},
         "poses": {"pose_prior_mm": 1e9},
         "bias field": {"bias_field_ridge": 0.0},
-        "gain trends": {"gain_trend_ridge": 0.0},
         "distillation": {"distillation": AnnealedWeight(0.0, 0.0)},
     }
     for name, change in changes.items():
