@@ -63,12 +63,11 @@ def fill_divergence(volume, weight, weighted, out):
 
 
 @numba.njit(parallel=True, nogil=True, cache=True)
-def add_roughness(volume, weight, strength, image, along):
+def add_roughness(volume, strength, image, along):
     """Add s D^T D V to what else a system makes of V, and multiply the sum with V.
 
     Args:
         volume: [I, J, K].
-        weight: [1, 1, 1] of its type, not read.
         strength: s.
         image: [I, J, K], changed.
         along: [I] float64, the sum over each plane of voxels, written: the same for any number of threads.
@@ -78,7 +77,7 @@ def add_roughness(volume, weight, strength, image, along):
         total = 0.0
         for y in range(n_y):
             for z in range(n_z):
-                image[x, y, z] += strength * divergence_at(volume, weight, False, x, y, z)
+                image[x, y, z] += strength * divergence_at(volume, volume, False, x, y, z)
                 total += volume[x, y, z] * image[x, y, z]
         along[x] = total
 

@@ -79,11 +79,10 @@ def solve_volume(
     typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
     strength = np.float32(smoothness * typical)
     along, square = (np.empty(operator.grid.shape[0]) for _ in range(2))
-    plain = np.ones((1, 1, 1), np.float32)
 
     def normal(volume: NDArray[np.float32]) -> NDArray[np.float32]:
         image = operator.adjoint(weight * operator.forward(volume))
-        add_roughness(volume, plain, strength, image, along)
+        add_roughness(volume, strength, image, along)
         return image
 
     volume = np.zeros(operator.grid.shape, np.float32) if start is None else start.astype(np.float32, order="C")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,7 +57,7 @@ def subjects_with_masks() -> dict[str, list[tuple[Path, Path]]]:
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
-    """A measurement per stack, one per subject, and two per stack that is left out."""
+    """A measurement per stack, one per subject, and one per stack that is left out."""
     for stack, mask in stacks_with_masks():
         yield Task(_name(stack), measure, (stack, mask, options))
     for name, pairs in subjects_with_masks().items():
@@ -138,12 +138,9 @@ def said(key: str, row: Row) -> str:
     if "written" in row:
         return f"{key}: Dice " + ", ".join(f"{one['dice']:.3f}" for one in row["written"].values())
     if "predicted" in row:
-        return f"{key}: {_db(row['predicted'])}"
+        drawn, found = (row["predicted"][f"{name}_db"] for name in ("drawn", "found"))
+        return f"{key}: masks drawn {drawn:.2f} dB, found {found:.2f} dB"
     return line(key, row)
-
-
-def _db(row: Mapping[str, float]) -> str:
-    return f"masks drawn {row['drawn_db']:.2f} dB, found {row['found_db']:.2f} dB"
 
 
 WRITTEN: dict[str, Cell] = {

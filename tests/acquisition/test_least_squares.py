@@ -1,7 +1,9 @@
 """V_sharp: nearer to the head than V_coarse, and what its convention promises."""
 
+import numba
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_synth.atlas import TruthVolume
 from data_synth.heads import PhantomSubject, load_volume_of
@@ -10,7 +12,7 @@ from data_synth.simulator import orthogonal_settings, simulate_stacks
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.least_squares import SHARP_CONVENTION, sharpened_volume, solve_volume
-from g3r.acquisition.planes import Slices
+from g3r.acquisition.planes import Planes, Slices
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
@@ -55,6 +57,56 @@ def test_gain_and_weight_count(head: TruthVolume, slices: Slices) -> None:
     without = sharpened_volume(dark, grid, coarse_without, weight=slice_weight)
     accepted = sharpened_volume(dark, grid, coarse_and_density(dark, grid)[0])
     assert np.abs(without - plain).mean() < 0.5 * np.abs(accepted - plain).mean()
+
+
+def small_problem() -> tuple[VoxelOperator, np.ndarray, np.ndarray]:
+    """Every third pixel of four oblique slices, and a 5 x 4 x 6 grid, pixels with noise and weights."""
+    rng = np.random.default_rng(2)
+    grid = VolumeGrid.isotropic([-4, -3, -5], [4, 3, 5], 2.0)
+    planes = Planes(
+        rotation=Rotation.from_rotvec(rng.normal(0, 0.6, (4, 3))).as_matrix(),
+        center_mm=rng.normal(0, 1.0, (4, 3)),
+        spacing_mm=np.tile([1.4, 1.2], (4, 1)),
+        shape=np.full((4, 2), 7),
+        psf_var_mm2=np.tile([0.4, 0.4, 1.1], (4, 1)),
+    )
+    index = np.arange(0, planes.n_pixels, 3)
+    return VoxelOperator(planes, grid, index), *rng.uniform(0.2, 1, (2, len(index))).astype("f4")
+
+
+def test_many_steps_find_the_direct_solution() -> None:
+    """Of the same normal equations, built column by column and solved in float64."""
+    operator, value, weight = small_problem()
+    n = int(np.prod(operator.grid.shape))
+    unit = np.eye(n, dtype=np.float32).reshape(n, *operator.grid.shape)
+    matrix = np.stack([operator.forward(one).astype(float) for one in unit], 1)
+    differences = np.concatenate([np.diff(unit, axis=axis).reshape(n, -1).T for axis in (1, 2, 3)]).astype(float)
+    seen = matrix.T @ weight
+    strength = 0.3 * seen[seen > 0.1 * seen.max()].mean()
+    normal = matrix.T @ (weight[:, None] * matrix) + strength * differences.T @ differences
+    expected = np.linalg.solve(normal, matrix.T @ (weight * value)).reshape(operator.grid.shape)
+    found = solve_volume(operator, value, weight, n_iterations=80, smoothness=0.3)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_two_threads_find_what_one_finds() -> None:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
+        pytest.skip("needs two threads")
+    problem, before = small_problem(), numba.get_num_threads()
+    try:
+        found = []
+        for n_threads in (1, 2):
+            numba.set_num_threads(n_threads)
+            found.append(solve_volume(*problem, n_iterations=6))
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+
+
+def test_nothing_measured_leaves_the_start_as_it_is() -> None:
+    operator, value, weight = small_problem()
+    flat = np.full(operator.grid.shape, 0.7, np.float32)
+    np.testing.assert_array_equal(solve_volume(operator, value, 0 * weight, start=flat), flat)
 
 
 def test_the_convention_names_what_it_depends_on() -> None:
