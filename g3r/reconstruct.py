@@ -95,7 +95,7 @@ class GaussianReconstructor:
         poses = self._poses(slices, registration, plan, run)
         stacks, poses = self._masks(stacks, poses, intensity, plan, run)
         maker = self.networks.subject_prior(plan.settings)
-        volumes = run.stage(Stage.COARSE, lambda: maker.volumes(poses))
+        poses, stack_fields, volumes = run.stage(Stage.COARSE, lambda: maker.first_volumes(poses))
         prior = self._prior(volumes, poses, plan, run)
         prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
@@ -104,6 +104,7 @@ class GaussianReconstructor:
         found = StageResults(
             stacks=stacks,
             registration=poses,
+            stack_fields=stack_fields,
             prior=prior,
             rounds=rounds,
             intensity=intensity * prior.scale,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
+from g3r.fitting.intensity_matching import match_intensities
 from g3r.fitting.mask_agreement import RefinedMasks, refine_masks
 from g3r.fitting.prior_volume import placed_template, prior_volume
 from g3r.prior.maps import Tiling
@@ -54,6 +55,19 @@ class SubjectPrior:
             intensity: of 1 in these slices.
         """
         return refine_masks(stacks, poses, intensity, placed_template(self.network, poses.orientation))
+
+    def first_volumes(self, poses: Registration) -> tuple[Registration, list[list[float]], InitialVolumes]:
+        """Intensities are matched before volumes are made, see `match_intensities`.
+
+        Args:
+            poses: from registration, with masks that stay.
+
+        Returns:
+            The poses with slices and gains that match, coefficients of the fields that were divided out, `volumes`.
+        """
+        matched = match_intensities(poses.slices, poses.gain, poses.weight)
+        poses = replace(poses, slices=matched.slices, gain=matched.gain)
+        return poses, matched.coefficients, self.volumes(poses)
 
     def volumes(self, poses: Registration) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""

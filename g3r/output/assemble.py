@@ -210,6 +210,7 @@ def _record(
         pose_network=found.pose_record,
         stacks=stack_records(found.stacks, found.registration, qualities, fit.weight, fit.slices),
         registration=RegistrationRecord.of(found.registration, qualities, fit.slices),
+        stack_fields=found.stack_fields,
         bias_field=fit.bias_field,
         common_bias_rms=found.prior.volumes.field_rms,
         n_gaussians=len(fit.cloud) + sum(len(cloud) for cloud in fit.further),

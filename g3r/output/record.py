@@ -150,7 +150,8 @@ class RunRecord:
         inputs, command, memory, header_text: what the command adds; None from Python.
         prior, pose_network: the networks' own records; None where one was not used.
         registration: None where the file is only a configuration.
-        bias_field: coefficients of each stack's bias field; empty where it was not estimated.
+        stack_fields: coefficients of each stack's bias field that was divided out before; empty for a single stack.
+        bias_field: those that the fit added; empty where it was not estimated.
         common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
         pose_rounds: what rounds of poses and volume did; None where there was none.
         held_out: what held-out slices chose; None where they were not asked.
@@ -177,6 +178,7 @@ class RunRecord:
     pose_network: dict[str, Any] | None = None
     stacks: list[StackRecord]
     registration: RegistrationRecord | None = None
+    stack_fields: list[list[float]] = field(default_factory=list)
     bias_field: list[list[float]] = field(default_factory=list)
     common_bias_rms: float = 0.0
     n_gaussians: int = 0

@@ -22,7 +22,8 @@ class StageResults:
 
     Attributes:
         stacks: as they were given.
-        registration: poses of their slices.
+        registration: poses of their slices, intensities as they were matched.
+        stack_fields: coefficients of the fields that matching divided out.
         prior: the prior volume and what it was made of.
         intensity: intensity of 1 in the fit.
         rounds: what rounds of poses and volume did; None where there was none.
@@ -35,6 +36,7 @@ class StageResults:
 
     stacks: Sequence[Stack]
     registration: Registration
+    stack_fields: list[list[float]]
     prior: PriorVolume
     rounds: PoseRounds | None
     intensity: float

@@ -1,0 +1,168 @@
+"""Gains of slices and fields of stacks, as far as slices that cross each other determine them.
+
+Registration finds gains along with poses, from slices whose slow trends were divided out
+(`registration.bias_correction`), and with them slow changes of the anatomy. For what comes next they are found anew,
+from the slices as they are and in their poses: where slices of several stacks cross, their log-intensities differ by
+the gains of the slices and by the fields of their stacks.
+
+Not all of that is determined. With three orthogonal stacks a volume that is shaded along x or x^2, or the same in y or
+z, and gains and fields that make up for it, explain the same pixels. That part is set to zero after every round; a
+volume keeps such shading until `common_bias_field` takes it for what it is. Left alone it would grow round by round:
+a blurred volume is less dark than the slices where the head ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from g3r.acquisition.bias_basis import LENGTH_MM, N_TERMS
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.bias_field import StackBiasField
+
+Array = NDArray[np.float64]
+
+VOXEL_MM = 4.0
+"""About as wide as slices are thick: what differs between slices that cross within a voxel is mostly gain and field."""
+
+MAX_PIXELS = 60_000
+"""Evenly spread; hundreds of each slice."""
+
+N_ROUNDS = 4
+"""Of volume, gains and fields. After two, coefficients of a development case change by less than 0.003."""
+
+MIN_INTENSITY = 0.1
+"""Darker pixels count with this share of the mean intensity, for the sake of the logarithm."""
+
+SHARED = 0.3
+"""Share of a quadratic shading that gains and fields cannot show, below which slices hardly determine it."""
+
+RIDGE = 1e-3
+"""Of the coefficients of a field, over what its pixels measure: a stack that is a line of pixels has no y."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchedIntensities:
+    """Slices whose intensities agree where they cross.
+
+    Attributes:
+        slices: K slices without the fields of their stacks.
+        gain: [K] intensity factors, still in the slices.
+        coefficients: [N][5] of the fields that were divided out, see `StackBiasField`; empty for a single stack.
+    """
+
+    slices: Slices
+    gain: Array
+    coefficients: list[list[float]]
+
+
+def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating]) -> MatchedIntensities:
+    """Gains and fields from slices in place.
+
+    Args:
+        slices: K slices; a single stack stays as it is.
+        gain: [K] intensity factors to start with; slices without weight keep them.
+        weight: [K] slice weights.
+    """
+    counts = weight[slices.pixel_plane] > 0
+    if slices.n_stacks < 2 or not counts.any():
+        return MatchedIntensities(slices=slices, gain=gain, coefficients=[])
+    index = slices.pixel_index[counts]
+    pixels = _Pixels(slices, index[:: max(1, len(index) // MAX_PIXELS)], weight)
+    factors = pixels.without_shared(pixels.fitted(np.log(gain)[pixels.plane], pixels.weight))
+    for _ in range(N_ROUNDS):
+        off = pixels.off(factors)
+        left = off - pixels.of(factors)
+        robust = pixels.weight / (1 + (left / robust_width(left, n_sigma=2)) ** 2)
+        factors = pixels.without_shared(pixels.fitted(off, robust))
+    log_gain = np.where(pixels.measured, factors.log_gain, np.log(gain))
+    field = np.exp(pixels.fields.log_field(factors.coefficients))
+    return MatchedIntensities(
+        slices=replace(slices, value=(slices.value / field).astype(np.float32)),
+        gain=np.asarray(np.exp(log_gain - log_gain.mean())),
+        coefficients=factors.coefficients.tolist(),
+    )
+
+
+@dataclass(frozen=True)
+class _Factors:
+    """log_gain [K] of the slices and coefficients [N, 5] of the fields of their stacks."""
+
+    log_gain: Array
+    coefficients: Array
+
+
+class _Pixels:
+    """P' pixels that gains and fields are fitted to.
+
+    Args:
+        slices: K slices.
+        index: [P'] numbers of the pixels.
+        weight: [K] slice weights.
+    """
+
+    def __init__(self, slices: Slices, index: NDArray[np.int64], weight: NDArray[np.floating]) -> None:
+        self.fields = StackBiasField(slices)
+        self.n_slices = len(slices)
+        self.operator = VoxelOperator(slices.planes, grid_around(slices, VOXEL_MM, VOXEL_MM), index, (1, 1, 1))
+        self.plane = self.operator.plane
+        self.weight = weight[self.plane].astype(np.float64)
+        self.seen = self.operator.adjoint(self.weight.astype(np.float32))
+        self.measured = np.bincount(self.plane, self.weight, self.n_slices) > 0
+        value = slices.value[index].astype(np.float64)
+        self.log_value = np.log(np.maximum(value, MIN_INTENSITY * value.mean()))
+        self.terms = self.fields.basis[:, index].T.astype(np.float64)
+        _, self.stack = np.unique(slices.stack_id, return_inverse=True)
+        self.rows = [np.flatnonzero(self.stack[self.plane] == n) for n in range(len(self.fields.stacks))]
+        # every stack counts alike, however many pixels it has
+        self.alike = self.weight.copy()
+        for rows in self.rows:
+            self.alike[rows] /= max(float(self.alike[rows].sum()), 1e-30)
+        self.shading = self._shared_shading(slices.planes.pixel_world_mm(index) / LENGTH_MM)
+
+    def _shared_shading(self, place: Array) -> Array:
+        """Quadratics of places [P', 3] that gains and fields can show in every stack: [P', n], orthonormal."""
+        place = place - np.average(place, axis=0, weights=self.alike)
+        terms = np.column_stack([place, *(place[:, i] * place[:, j] for i in range(3) for j in range(i, 3))])
+        terms -= np.average(terms, axis=0, weights=self.alike)
+        left = np.column_stack([term - self.of(self.fitted(term, self.alike)) for term in terms.T])
+        whole = (terms.T * self.alike) @ terms
+        share, mode = eigh((left.T * self.alike) @ left, whole + 1e-6 * np.trace(whole) * np.eye(len(whole)))
+        return np.asarray(terms @ mode[:, share < SHARED])
+
+    def of(self, factors: _Factors) -> Array:
+        """Their sum [P'] at each pixel."""
+        return factors.log_gain[self.plane] + (factors.coefficients[self.stack[self.plane]] * self.terms).sum(1)
+
+    def off(self, factors: _Factors) -> Array:
+        """Log-intensities [P'] over those of the volume that pixels give with these factors."""
+        volume = self.operator.adjoint((self.weight * (self.log_value - self.of(factors))).astype(np.float32))
+        np.divide(volume, self.seen, out=volume, where=self.seen > 0)
+        return self.log_value - self.operator.forward(volume)
+
+    def fitted(self, values: Array, weight: Array) -> _Factors:
+        """Weighted least squares to values [P']: a constant for each slice, the terms of a field for each stack."""
+        total = np.maximum(np.bincount(self.plane, weight, self.n_slices), 1e-30)
+
+        def mean(of: Array) -> Array:
+            return np.bincount(self.plane, weight * of, self.n_slices) / total
+
+        mean_value, mean_terms = mean(values), np.column_stack([mean(term) for term in self.terms.T])
+        coefficients = np.zeros((len(self.rows), N_TERMS))
+        for n, rows in enumerate(self.rows):
+            own, plane = weight[rows, None], self.plane[rows]
+            terms, value = self.terms[rows] - mean_terms[plane], values[rows] - mean_value[plane]
+            ridge = RIDGE * max(float(own.sum()), 1e-30) * np.eye(N_TERMS)
+            coefficients[n] = np.linalg.solve(terms.T @ (own * terms) + ridge, terms.T @ (own[:, 0] * value))
+        return _Factors(mean_value - (mean_terms * coefficients[self.stack]).sum(1), coefficients)
+
+    def without_shared(self, factors: _Factors) -> _Factors:
+        """The factors without what a shaded volume would explain as well."""
+        shared = self.fitted(self.shading @ (self.shading.T @ (self.alike * self.of(factors))), self.alike)
+        return _Factors(factors.log_gain - shared.log_gain, factors.coefficients - shared.coefficients)
