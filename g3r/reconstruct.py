@@ -95,8 +95,8 @@ class GaussianReconstructor:
         poses = self._poses(slices, registration, plan, run)
         stacks, poses = self._masks(stacks, poses, intensity, plan, run)
         maker = self.networks.subject_prior(plan.settings)
-        poses, stack_fields, volumes = run.stage(Stage.COARSE, lambda: maker.first_volumes(poses))
-        prior = self._prior(volumes, poses, plan, run)
+        poses, stack_fields = maker.matched(poses)  # quick, so not kept
+        prior = self._prior(run.stage(Stage.COARSE, lambda: maker.volumes(poses)), poses, plan, run)
         prior, poses, rounds = self._rounds(prior, poses, plan, run)
         cloud = self._fit_to_prior(prior, plan, run)
         held_out = self._held_out(cloud, prior, poses, plan, run)

@@ -56,18 +56,10 @@ class SubjectPrior:
         """
         return refine_masks(stacks, poses, intensity, placed_template(self.network, poses.orientation))
 
-    def first_volumes(self, poses: Registration) -> tuple[Registration, list[list[float]], InitialVolumes]:
-        """Intensities are matched before volumes are made, see `match_intensities`.
-
-        Args:
-            poses: from registration, with masks that stay.
-
-        Returns:
-            The poses with slices and gains that match, coefficients of the fields that were divided out, `volumes`.
-        """
-        matched = match_intensities(poses.slices, poses.gain, poses.weight)
-        poses = replace(poses, slices=matched.slices, gain=matched.gain)
-        return poses, matched.coefficients, self.volumes(poses)
+    def matched(self, poses: Registration) -> tuple[Registration, list[list[float]]]:
+        """Poses with slices and gains that match, and the fields that were divided out; see `match_intensities`."""
+        found = match_intensities(poses.slices, poses.gain, poses.weight)
+        return replace(poses, slices=found.slices, gain=found.gain), found.coefficients
 
     def volumes(self, poses: Registration) -> InitialVolumes:
         """V_coarse and M_rho (Eq. 6), V_sharp and the foreground."""

@@ -73,7 +73,7 @@ def test_stage_2_lowers_the_loss_and_sharpens_the_volume(volume: np.ndarray) -> 
     assert np.mean(image[-5:]) < 0.6 * image[0]
     assert volume_error(result.cloud, volume) < 0.5 * volume_error(seeded(blurred), volume)
     assert "distillation" not in result.history[0]
-    assert (result.weight > 0.5).all()
+    assert (result.weight > 0.3).all()  # none is thrown out
 
 
 def test_with_poses_off_no_slice_moves(volume: np.ndarray) -> None:
