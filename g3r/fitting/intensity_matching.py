@@ -35,7 +35,8 @@ MAX_PIXELS = 60_000
 """Evenly spread; hundreds of each slice."""
 
 N_ROUNDS = 4
-"""Of volume, gains and fields. After two, coefficients of a development case change by less than 0.003."""
+"""Of volume, gains and fields. What crossing slices determine least comes slowly: with 28 more, coefficients of two
+development cases of up to 0.15 still change by up to 0.018."""
 
 MIN_INTENSITY = 0.1
 """Darker pixels count with this share of the mean intensity, for the sake of the logarithm."""
