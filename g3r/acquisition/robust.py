@@ -11,6 +11,13 @@ SIGMA_PER_MAD = 1.4826
 MAX_DROPPED_SHARE, DROPPED_WEIGHT = 0.2, 0.1
 """At most this share of the slices may weigh less than `DROPPED_WEIGHT`; where more fit badly, poses are at fault."""
 
+DARK = 0.5
+"""Share of the usual gain below which a slice weighs less, by the square of it: its noise over its signal. A slice that
+lost its signal is explained by a gain near zero whatever the volume, so its residual does not give it away."""
+
+MIN_WEIGHT = 1e-3
+"""Of a slice: never zero."""
+
 
 def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: float = 1e-6) -> float:
     """A number of robust standard deviations (1.4826 MAD) of residuals with median zero, plus a floor.
@@ -23,18 +30,23 @@ def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: fl
     return n_sigma * SIGMA_PER_MAD * float(np.median(np.abs(residual))) + floor
 
 
-def slice_weights(loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weight of each slice [K], lower where its mean robust loss is unusually large.
+def slice_weights(loss: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weight of each slice [K], lower where its mean robust loss is unusually large, or where it is dark.
 
-    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and below
-    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices.
+    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and for its loss below
+    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices. For dark slices see `DARK`.
+
+    Args:
+        loss: [K] of the slices.
+        gain: [K] their intensity factors.
     """
     median = np.median(loss)
     spread = robust_width(loss - median, floor=0.0) + 0.05 * median + 1e-12
     excess = np.maximum(0.0, (loss - median) / spread - 2.0)
-    weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, 1e-3)
+    weight = np.maximum(1.0 / (1.0 + (excess / 2.0) ** 2) ** 2, MIN_WEIGHT)
     n_dropped = int(MAX_DROPPED_SHARE * len(weight))
     by_weight = np.argsort(weight, kind="stable")
     kept = by_weight[n_dropped:]
     weight[kept] = np.maximum(weight[kept], DROPPED_WEIGHT)
-    return weight
+    light = np.minimum(1.0, gain / (DARK * np.median(gain))) ** 2
+    return np.maximum(weight * light, MIN_WEIGHT)

@@ -197,7 +197,7 @@ def _registered_to_fit(
         registration,
         slices=registration.slices.with_pose(slices.planes.pose),
         gain=gain,
-        weight=slice_weights(at_end.loss),
+        weight=slice_weights(at_end.loss, gain),
         ncc=at_end.ncc,
     )
     return moved, n_moved

@@ -278,5 +278,5 @@ class SliceLoss:
         residual = self.turns.residual
         before = self.term.mean(residual, self.slice_weight)
         typical = residual / np.maximum(self.term.total_weight, 1)
-        self.slice_weight = slice_weights(typical).astype(np.float32).astype(np.float64)
+        self.slice_weight = slice_weights(typical, self.state().gain).astype(np.float32).astype(np.float64)
         return self.term.mean(residual, self.slice_weight) / before if before > 0 else 1.0

@@ -97,7 +97,7 @@ def refine_slices(
         slices, gain, fit = register_slices(
             model, slices, gain, n_steps=settings.steps_per_round, width=width, normal_tie=normal_tie
         )
-        weight = slice_weights(fit.loss)
+        weight = slice_weights(fit.loss, gain)
         history.append(
             {
                 "round": number,
@@ -141,7 +141,7 @@ def fitted_in_place(
         log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE))
         gain = np.exp(log_gain - log_gain.mean())
         fit = model.evaluate(slices.planes, gain, width)
-        weight = slice_weights(fit.loss)
+        weight = slice_weights(fit.loss, gain)
         ncc = float(np.median(fit.ncc))
         history.append({"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": ncc, "moved": 0})
         logger.info("slices in place, round %d: residual %.4f", number + 1, width / 2)

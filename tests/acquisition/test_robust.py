@@ -4,8 +4,16 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE, robust_width, slice_weights
+from g3r.acquisition.robust import DARK, DROPPED_WEIGHT, MAX_DROPPED_SHARE, robust_width, slice_weights
+
+Array = NDArray[np.float64]
+
+
+def weights(loss: Array) -> Array:
+    """Of slices that are equally bright."""
+    return slice_weights(loss, np.full(len(loss), 1.3))
 
 
 def test_slice_weights_are_smooth_and_never_zero() -> None:
@@ -13,7 +21,7 @@ def test_slice_weights_are_smooth_and_never_zero() -> None:
     usual = rng.normal(1.0, 0.1, 200).clip(0.1)
     previous = None
     for bad in np.linspace(0.9, 5, 1500):
-        weight = slice_weights(np.append(usual, bad))
+        weight = weights(np.append(usual, bad))
         assert weight.min() > 0
         assert weight.max() == 1.0
         if previous is not None:
@@ -22,11 +30,11 @@ def test_slice_weights_are_smooth_and_never_zero() -> None:
         previous = weight[-1]
     assert previous is not None
     assert previous <= 2e-3
-    assert np.median(slice_weights(usual)) == 1.0
-    assert (slice_weights(np.zeros(5)) == 1).all()
-    assert (slice_weights(np.full(5, 3.3)) == 1).all()
+    assert np.median(weights(usual)) == 1.0
+    assert (weights(np.zeros(5)) == 1).all()
+    assert (weights(np.full(5, 3.3)) == 1).all()
     for a, b in itertools.pairwise((1e-6, 1.0, 1e6)):  # a pure number of the loss
-        np.testing.assert_allclose(slice_weights(usual * a), slice_weights(usual * b), rtol=1e-3)
+        np.testing.assert_allclose(weights(usual * a), weights(usual * b), rtol=1e-3)
 
 
 @pytest.mark.parametrize("bad_share", [0.1, 0.3, 0.45])
@@ -36,7 +44,7 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float) -> N
     loss = rng.normal(1.0, 0.05, n)
     bad = rng.permutation(n)[: int(bad_share * n)]
     loss[bad] += rng.uniform(5, 50, len(bad))
-    weight = slice_weights(loss)
+    weight = weights(loss)
     assert (weight < DROPPED_WEIGHT).sum() <= MAX_DROPPED_SHARE * n
     assert (weight < DROPPED_WEIGHT).sum() == min(len(bad), int(MAX_DROPPED_SHARE * n))
     assert weight.min() > 0
@@ -44,6 +52,21 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float) -> N
     dropped = np.flatnonzero(weight < DROPPED_WEIGHT)
     assert loss[dropped].min() > np.median(loss) + 4
     assert weight[bad].max() < np.delete(weight, bad).min()
+
+
+def test_a_slice_without_signal_counts_for_nothing() -> None:
+    """Explained by a gain near zero whatever the volume, it has the least residual of all."""
+    loss, gain = np.full(9, 1.0), np.full(9, 1.2)
+    loss[4], gain[4] = 0.0, 0.03
+    weight = slice_weights(loss, gain)
+    assert weight[4] < 0.01
+    assert (np.delete(weight, 4) == 1).all()
+    steps = np.geomspace(1e-6, 1.0, 200)
+    falling = [slice_weights(np.ones(9), np.append(np.ones(8), one))[-1] for one in steps]
+    assert min(falling) > 0
+    assert (np.diff(falling) >= 0).all()
+    assert slice_weights(np.ones(9), np.append(np.ones(8), DARK))[-1] == 1.0
+    np.testing.assert_allclose(slice_weights(loss, 1e3 * gain), weight)  # gains have no unit
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 2.0, 3.0])
