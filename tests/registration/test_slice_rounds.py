@@ -1,5 +1,7 @@
 """Rounds of volume and slices: what is in place stays there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
@@ -17,6 +19,16 @@ def test_slices_in_place_stay_there(still: list[SimulatedStack]) -> None:
     found = refine_slices(slices, RegistrationSettings(n_rounds=7, finest_voxel_mm=1.8)).slices
     # 0.67 mm where the volume ends at the masks and most rounds are coarse
     assert np.median(pixel_errors_mm(found, truth)) < 0.45
+
+
+def test_a_slice_without_signal_counts_for_nothing(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(still)
+    black = int(np.flatnonzero(slices.stack_id == 1)[np.count_nonzero(slices.stack_id == 1) // 2])
+    value = np.where(slices.planes.plane_id() == black, 0, slices.value).astype(np.float32)
+    found = refine_slices(replace(slices, value=value), RegistrationSettings(n_rounds=3, finest_voxel_mm=1.8))
+    assert found.gain[black] < 0.3 * np.median(found.gain)
+    assert found.weight[black] < 0.2  # the gain falls from 1, round by round
+    assert np.median(np.delete(found.weight, black)) == 1.0
 
 
 @pytest.mark.parametrize("value", [1.0, -3.0, 0.0])
