@@ -150,7 +150,7 @@ class RunRecord:
         inputs, command, memory, header_text: what the command adds; None from Python.
         prior, pose_network: the networks' own records; None where one was not used.
         registration: None where the file is only a configuration.
-        stack_fields: coefficients of each stack's bias field that was divided out before; empty for a single stack.
+        stack_fields: coefficients of each stack's bias field that was divided out before; empty for one or two stacks.
         bias_field: those that the fit added; empty where it was not estimated.
         common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
         pose_rounds: what rounds of poses and volume did; None where there was none.

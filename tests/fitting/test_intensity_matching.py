@@ -97,10 +97,11 @@ def test_slices_without_weight_keep_their_gains_and_disturb_no_others(plain: Sli
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-def test_a_single_stack_and_slices_without_weight_stay_as_they_are(plain: Slices) -> None:
+def test_one_or_two_stacks_and_slices_without_weight_stay_as_they_are(plain: Slices) -> None:
     gain = np.linspace(0.9, 1.1, len(plain))
     alone = plain.take(plain.stack_id == plain.stack_id[0])
-    for slices, weight in ((alone, np.ones(len(alone))), (plain, np.zeros(len(plain)))):
+    two = plain.take(plain.stack_id != plain.stack_id[-1])
+    for slices, weight in ((alone, np.ones(len(alone))), (two, np.ones(len(two))), (plain, np.zeros(len(plain)))):
         found = match_intensities(slices, gain[: len(slices)], weight)
         assert found.slices is slices
         np.testing.assert_array_equal(found.gain, gain[: len(slices)])
