@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.bias_basis import N_TERMS
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.intensity_matching import match_intensities
+from g3r.geometry import VolumeGrid
 from tests.registration.moving_heads import as_slices, simulated
 
 
@@ -59,7 +61,7 @@ def test_fields_in_plane_that_no_volume_shares_are_found(plain: Slices) -> None:
     gain, found = matched(shown(plain, np.zeros(len(plain)), coefficients))
     before = differences(shown(plain, np.zeros(len(plain)), coefficients), np.zeros(len(plain)), plain)
     left = differences(found, gain - start_gain, start)
-    assert left.std() < 0.25 * before.std()
+    assert left.std() < 0.3 * before.std()
 
 
 def test_what_a_volume_shares_is_left_in_the_slices(plain: Slices) -> None:
@@ -115,3 +117,19 @@ def test_dark_and_extreme_slices_give_finite_gains(plain: Slices) -> None:
     found = match_intensities(replace(plain, value=value), np.ones(len(plain)), np.ones(len(plain)))
     assert np.isfinite(found.gain).all()
     assert np.isfinite(found.slices.value).all()
+
+
+def test_a_rim_of_skull_and_fluid_in_the_masks_hardly_disturbs_the_brain() -> None:
+    """Thin shells of strong contrast, as people's masks have them, around slices without gains or fields."""
+    head = fetal_brain_phantom(24, 1.2)
+    outside_mm = distance_transform_edt(~head.mask, sampling=1.2)
+    bright = float(head.t2.max())
+    shells = np.select([head.mask, outside_mm < 2.5], [head.t2, 1.5 * bright], 0.05 * bright).astype(np.float32)
+    slices, _ = as_slices(simulated(replace(head, t2=shells, mask=outside_mm < 5.0)))
+    index = slices.pixel_index
+    place = VolumeGrid(head.mask.shape, head.affine).index(slices.planes.pixel_world_mm(index))
+    brain = index[map_coordinates(head.mask.astype(np.float32), place.T, order=1) > 0.5]
+    gain, found = matched(slices)
+    factor = gain[slices.planes.plane_id()[brain]] + np.log(slices.value[brain] / found.value[brain])
+    assert len(brain) < 0.8 * len(index)
+    assert factor.std() < 0.03
