@@ -52,18 +52,23 @@ def surrounded(case: SimulatedCase, seed: int) -> list[Stack]:
     mean, texture = draw_intensities(rng)
     shells = _without_brain(head, truth, mean, texture)
     behind = _intensities(around.labels, around.texture, mean, texture)
-    return [_in_scene(case, n, middle_mm, head, shells, around, behind) for n in range(len(case.stacks))]
+    own = np.zeros_like(shells)
+    own[_box(head, truth)] = np.stack([truth.data * truth.mask, truth.mask, truth.mask], -1)
+    return [_in_scene(case, n, middle_mm, head, (shells, own), around, behind) for n in range(len(case.stacks))]
+
+
+def _box(head: SceneHead, truth: TruthVolume) -> tuple[slice, ...]:
+    """Where the truth lies on the grid of the head."""
+    offset = np.rint(VolumeGrid(head.labels.shape, head.affine).index(truth.affine[:3, 3])).astype(int)
+    return tuple(slice(o, o + n) for o, n in zip(offset, truth.mask.shape, strict=True))
 
 
 def _without_brain(
     head: SceneHead, truth: TruthVolume, mean: NDArray[np.float32], texture: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """The head's channels (see `image_slices`), black where the case itself shows the brain."""
-    grid = VolumeGrid(head.labels.shape, head.affine)
-    offset = np.rint(VolumeGrid(truth.mask.shape, truth.affine).index(grid.world([0, 0, 0]))).astype(int)
     brain = np.zeros(head.labels.shape, bool)
-    box = tuple(slice(-o, -o + n) for o, n in zip(offset, truth.mask.shape, strict=True))
-    brain[box] = truth.mask
+    brain[_box(head, truth)] = truth.mask
     shells = np.zeros((*head.labels.shape, 3), np.float32)
     fluid = np.where(head.labels == Tissue.BRAIN, Tissue.CSF, head.labels)  # clefts of the truth's mask
     shells[..., 0] = np.where(brain, 0, _intensities(fluid, head.texture, mean, texture))
@@ -77,20 +82,21 @@ def _in_scene(
     number: int,
     middle_mm: NDArray[np.float64],
     head: SceneHead,
-    shells: NDArray[np.float32],
+    channels: tuple[NDArray[np.float32], NDArray[np.float32]],
     around: Surroundings,
     behind: NDArray[np.float32],
 ) -> Stack:
-    """One stack: the case's own pixels where they show brain, the scene around them.
+    """One stack: the case's own pixels where they show brain, the scene around them, as bright as the slice is.
 
-    Slices beyond those of the case that would show brain are black: nothing is known of what they would show.
+    Where a slice of the case ends within the brain, the truth goes on. Slices beyond those of the case that would show
+    brain are black: nothing is known of what they would show.
 
     Args:
         case: that it belongs to.
         number: of the stack.
         middle_mm: [3] of the brain in the truth's frame, the origin of the scene.
         head: gives the grid of the shells.
-        shells: [I, J, K, 3] of the head without brain.
+        channels: [I, J, K, 3] of the head without brain, and of the brain alone.
         around: gives the grid of the surroundings.
         behind: [N, N, N] their intensities.
     """
@@ -106,23 +112,47 @@ def _in_scene(
     scan_pose = origin @ moved.take(np.full(n_slices, n_slices // 2)) @ header
     pixel_mm = float(stack.spacing_mm[0])
     first = -(np.array(stack.image.shape[:2]) - 1) / 2 * pixel_mm
-    outside, brain = image_slices(
-        shells,
-        np.linalg.inv(head.affine),
-        head_pose,
-        behind,
-        np.linalg.inv(around.affine),
-        scan_pose,
-        first_mm=(float(first[0]), float(first[1])),
-        pixel_mm=pixel_mm,
-        shape=(stack.image.shape[0], stack.image.shape[1]),
-        thickness_mm=stack.thickness_mm,
-        n_through=N_THROUGH,
-    )
+
+    def imaged(shown: NDArray[np.float32], scene: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        return image_slices(
+            shown,
+            np.linalg.inv(head.affine),
+            head_pose,
+            scene,
+            np.linalg.inv(around.affine),
+            scan_pose,
+            first_mm=(float(first[0]), float(first[1])),
+            pixel_mm=pixel_mm,
+            shape=(stack.image.shape[0], stack.image.shape[1]),
+            thickness_mm=stack.thickness_mm,
+            n_through=N_THROUGH,
+        )
+
+    outside, brain = imaged(channels[0], behind)
     unseen = (brain.sum((0, 1)) * pixel_mm**2 > MAX_UNSEEN_MM2) & ~stack.mask.any((0, 1))
     outside[:, :, unseen] = 0
-    bright = float(np.percentile(stack.image[stack.mask], 99.5))
-    return replace(stack, image=stack.image + np.float32(bright) * outside)
+    truth, _ = imaged(channels[1], np.zeros_like(behind))
+    gain = _gain(stack, truth)
+    truth *= _beyond(case.stacks[number], stack)
+    mask = stack.mask | ((truth > 0) & (brain > 0.5))
+    return replace(stack, image=stack.image + gain * (truth + outside), mask=mask)
+
+
+def _beyond(stack: Stack, widened: Stack) -> NDArray[np.bool_]:
+    """Pixels of a widened stack that the stack does not have."""
+    beyond = np.ones(widened.image.shape, bool)
+    before = [(n - m) // 2 for n, m in zip(widened.image.shape, stack.image.shape, strict=True)]
+    beyond[tuple(slice(b, b + n) for b, n in zip(before, stack.image.shape, strict=True))] = False
+    return beyond
+
+
+def _gain(stack: Stack, truth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Brightness [S] of the slices over that of the truth; the usual one where a slice shows no brain."""
+    own, square = ((one * stack.mask).sum((0, 1)) for one in (stack.image * truth, truth**2))
+    shows = square > 0
+    gain = np.full(len(own), np.median(own[shows] / square[shows]))
+    gain[shows] = own[shows] / square[shows]
+    return gain.astype(np.float32)
 
 
 def _widened(stack: Stack) -> Stack:

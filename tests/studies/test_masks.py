@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from g3r.acquisition.slicing import by_headers, slices_from_stacks
 from g3r.errors import InputError
@@ -92,6 +93,26 @@ def test_stacks_in_surroundings_keep_their_brain_in_its_place(subject: Path) -> 
     still, before = case.pose_error(moved), case.header_error()
     assert still.median_mm == pytest.approx(before.median_mm, abs=0.05)
     assert max(still.per_slice_mm.values()) == pytest.approx(max(before.per_slice_mm.values()), abs=0.1)
+
+
+def test_where_a_slice_ends_within_the_brain_the_brain_goes_on_as_bright_as_the_slice(subject: Path) -> None:
+    case = load_case(subject)
+    stack = case.stacks[0]
+    image, n = stack.image.copy(), stack.image.shape[2] // 2
+    image[:, :, n] *= 0.5
+    dim = replace(stack, image=image)
+    side = int(np.argwhere(stack.mask).mean(0)[0])
+    affine = stack.affine.copy()
+    affine[:3, 3] += affine[:3, 0] * side
+    half = replace(dim, image=image[side:], mask=stack.mask[side:], affine=affine)
+    whole, cut = (surrounded(replace(case, stacks=(one, *case.stacks[1:])), seed=1)[0] for one in (dim, half))
+    for k in (n, n - 1):
+        inside = np.argwhere(cut.mask[:, :, [k + SLICES_BEYOND]]) + [0, 0, k + SLICES_BEYOND]
+        assert len(inside) > 1.5 * np.count_nonzero(half.mask[:, :, k])
+        place = whole.grid.index(cut.grid.world(inside)).T
+        shown, true = (map_coordinates(one.image, at, order=1) for one, at in ((cut, inside.T), (whole, place)))
+        assert np.corrcoef(shown, true)[0, 1] > 0.95
+        assert shown.mean() == pytest.approx(true.mean(), rel=0.05)
 
 
 def test_beyond_a_stack_that_ends_within_the_brain_there_is_no_hollow_skull(subject: Path) -> None:
