@@ -107,7 +107,7 @@ def test_where_a_slice_ends_within_the_brain_the_brain_goes_on_as_bright_as_the_
     half = replace(dim, image=image[side:], mask=stack.mask[side:], affine=affine)
     whole, cut = (surrounded(replace(case, stacks=(one, *case.stacks[1:])), seed=1)[0] for one in (dim, half))
     for k in (n, n - 1):
-        inside = np.argwhere(cut.mask[:, :, [k + SLICES_BEYOND]]) + [0, 0, k + SLICES_BEYOND]
+        inside = np.argwhere(cut.mask[:, :, [k + SLICES_BEYOND]]) + np.array([0, 0, k + SLICES_BEYOND])
         assert len(inside) > 1.5 * np.count_nonzero(half.mask[:, :, k])
         place = whole.grid.index(cut.grid.world(inside)).T
         shown, true = (map_coordinates(one.image, at, order=1) for one, at in ((cut, inside.T), (whole, place)))
