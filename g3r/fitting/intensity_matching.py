@@ -25,6 +25,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
+from g3r.fitting.neighbour_gains import neighbour_gains
 
 Array = NDArray[np.float64]
 
@@ -73,11 +74,13 @@ def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating])
     """Gains and fields from slices in place.
 
     Args:
-        slices: K slices; fewer than `MIN_STACKS` stacks stay as they are.
+        slices: K slices; two stacks stay as they are, and one has its gains from `neighbour_gains`.
         gain: [K] intensity factors to start with; slices without weight keep them.
         weight: [K] slice weights.
     """
     counts = weight[slices.pixel_plane] > 0
+    if slices.n_stacks == 1:
+        return MatchedIntensities(slices=slices, gain=neighbour_gains(slices), coefficients=[])
     if slices.n_stacks < MIN_STACKS or not counts.any():
         return MatchedIntensities(slices=slices, gain=gain, coefficients=[])
     index = slices.pixel_index[counts]

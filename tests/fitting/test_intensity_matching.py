@@ -14,6 +14,7 @@ from g3r.acquisition.bias_basis import N_TERMS
 from g3r.acquisition.planes import Slices
 from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.intensity_matching import match_intensities
+from g3r.fitting.neighbour_gains import neighbour_gains
 from g3r.geometry import VolumeGrid
 from tests.registration.moving_heads import as_slices, simulated
 
@@ -99,15 +100,22 @@ def test_slices_without_weight_keep_their_gains_and_disturb_no_others(plain: Sli
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-def test_one_or_two_stacks_and_slices_without_weight_stay_as_they_are(plain: Slices) -> None:
+def test_two_stacks_and_slices_without_weight_stay_as_they_are(plain: Slices) -> None:
     gain = np.linspace(0.9, 1.1, len(plain))
-    alone = plain.take(plain.stack_id == plain.stack_id[0])
     two = plain.take(plain.stack_id != plain.stack_id[-1])
-    for slices, weight in ((alone, np.ones(len(alone))), (two, np.ones(len(two))), (plain, np.zeros(len(plain)))):
+    for slices, weight in ((two, np.ones(len(two))), (plain, np.zeros(len(plain)))):
         found = match_intensities(slices, gain[: len(slices)], weight)
         assert found.slices is slices
         np.testing.assert_array_equal(found.gain, gain[: len(slices)])
         assert found.coefficients == []
+
+
+def test_one_stack_has_its_gains_from_neighbours(plain: Slices) -> None:
+    alone = plain.take(plain.stack_id == plain.stack_id[0])
+    found = match_intensities(alone, np.ones(len(alone)), np.ones(len(alone)))
+    assert found.slices is alone
+    np.testing.assert_array_equal(found.gain, neighbour_gains(alone))
+    assert found.coefficients == []
 
 
 def test_dark_and_extreme_slices_give_finite_gains(plain: Slices) -> None:

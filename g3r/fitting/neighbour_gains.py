@@ -1,0 +1,85 @@
+"""Gains of the slices of a single stack, from what neighbours show at the same place in their plane.
+
+No slice of another stack crosses these. But most of what a slice shows goes on in the next one, so the logarithm of
+their intensities differs by the same everywhere: by the gains. Only changes over a few slices can be found like this:
+over many, gains and slow changes of the anatomy look alike, and gains are held at 1.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve
+
+from g3r.acquisition.bias_basis import stacks_by_header
+from g3r.acquisition.planes import Slices
+
+Array = NDArray[np.float64]
+
+MIN_PIXELS = 50
+"""That two neighbours share, to compare them."""
+
+SCALE = 0.1
+"""Of log-intensities: where neighbours differ by more than the usual difference and this, they show other tissue."""
+
+DEVIATION, MIN_GAIN_DEVIATION = 0.02, 0.05
+"""Expected of a step between neighbours that anatomy makes up, and at least of log-gains."""
+
+MIN_INTENSITY = 0.1
+"""Darker pixels count with this share of the mean intensity, for the sake of the logarithm."""
+
+MAX_ROUNDS = 20
+
+
+def neighbour_gains(slices: Slices) -> Array:
+    """Intensity factors [K] of slices of one stack, with a geometric mean of 1.
+
+    Args:
+        slices: K slices of one stack, as their header places them; poses do not matter.
+
+    Raises:
+        ValueError: slices of several stacks.
+    """
+    if slices.n_stacks != 1:
+        raise ValueError(f"slices are of {slices.n_stacks} stacks; expected one")
+    order = np.argsort(slices.slice_index, kind="stable")
+    shown = _by_place(slices)
+    rows, step, distance = [], [], []
+    for one, other in pairwise(order):
+        _, here, there = np.intersect1d(shown[one][0], shown[other][0], assume_unique=True, return_indices=True)
+        if len(here) >= MIN_PIXELS:
+            rows.append((np.arange(len(slices)) == one).astype(np.float64) - (np.arange(len(slices)) == other))
+            step.append(_usual(shown[one][1][here] - shown[other][1][there]))
+            distance.append(int(slices.slice_index[other] - slices.slice_index[one]))
+    if not step:
+        return np.ones(len(slices))
+    difference = np.stack(rows)
+    deviation = max(MIN_GAIN_DEVIATION, float(np.median(np.abs(step))))
+    weight = (deviation / DEVIATION) ** 2 / np.maximum(distance, 1.0)
+    normal = difference.T @ (weight[:, None] * difference) + np.eye(len(slices))
+    log_gain = solve(normal, difference.T @ (weight * np.array(step)), assume_a="pos")
+    return np.asarray(np.exp(log_gain - log_gain.mean()))
+
+
+def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
+    """Of each slice the places of its masked pixels in the plane of the stack, as numbers, and their log-intensities."""
+    ((_, inside, world_mm, axes),) = stacks_by_header(slices)
+    index = np.flatnonzero(inside)
+    plane = slices.planes.plane_id()[index]
+    place = world_mm[index] @ axes / slices.planes.spacing_mm[plane]
+    column, row = np.rint(place - place.min(0)).astype(np.int64).T
+    value = slices.value[index].astype(np.float64)
+    value = np.log(np.maximum(value, MIN_INTENSITY * value.mean()))
+    number = column * (int(row.max()) + 1) + row
+    return [(number[plane == k], value[plane == k]) for k in range(len(slices))]
+
+
+def _usual(difference: Array) -> float:
+    """Where most of the differences lie: the centre of a Cauchy distribution of width `SCALE`."""
+    centre = float(np.median(difference))
+    for _ in range(MAX_ROUNDS):
+        weight = 1 / (1 + ((difference - centre) / SCALE) ** 2)
+        centre = float((weight * difference).sum() / weight.sum())
+    return centre
