@@ -25,7 +25,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.fitting.bias_field import StackBiasField
-from g3r.fitting.neighbour_gains import neighbour_gains
+from g3r.fitting.neighbour_gains import MIN_INTENSITY, neighbour_gains
 
 Array = NDArray[np.float64]
 
@@ -41,9 +41,6 @@ the mean, and real stacks were predicted 0.1 to 0.2 dB worse by two others."""
 
 N_ROUNDS = 6
 """Of volume, gains and fields. What crossing slices determine least comes slowly."""
-
-MIN_INTENSITY = 0.1
-"""Darker pixels count with this share of the mean intensity, for the sake of the logarithm."""
 
 SHARED = 0.3
 """Share of a quadratic shading that gains and fields cannot show, below which slices hardly determine it."""

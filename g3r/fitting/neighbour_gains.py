@@ -64,7 +64,7 @@ def neighbour_gains(slices: Slices) -> Array:
 
 
 def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
-    """Of each slice the places of its masked pixels in the plane of the stack, as numbers, and their log-intensities."""
+    """Of each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities."""
     ((_, inside, world_mm, axes),) = stacks_by_header(slices)
     index = np.flatnonzero(inside)
     plane = slices.planes.plane_id()[index]
