@@ -71,8 +71,8 @@ def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating])
     """Gains and fields from slices in place.
 
     Args:
-        slices: K slices; two stacks stay as they are, and one has its gains from `neighbour_gains`.
-        gain: [K] intensity factors to start with; slices without weight keep them.
+        slices: K slices; two stacks stay as they are, and one has its gains from `neighbour_gains` alone.
+        gain: [K] intensity factors to start with; of three stacks or more, slices without weight keep them.
         weight: [K] slice weights.
     """
     counts = weight[slices.pixel_plane] > 0

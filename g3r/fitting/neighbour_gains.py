@@ -48,9 +48,9 @@ def neighbour_gains(slices: Slices) -> Array:
     shown = _by_place(slices)
     rows, step, distance = [], [], []
     for one, other in pairwise(order):
-        _, here, there = np.intersect1d(shown[one][0], shown[other][0], assume_unique=True, return_indices=True)
+        _, here, there = np.intersect1d(shown[one][0], shown[other][0], return_indices=True)
         if len(here) >= MIN_PIXELS:
-            rows.append((np.arange(len(slices)) == one).astype(np.float64) - (np.arange(len(slices)) == other))
+            rows.append(np.eye(len(slices))[one] - np.eye(len(slices))[other])
             step.append(_usual(shown[one][1][here] - shown[other][1][there]))
             distance.append(int(slices.slice_index[other] - slices.slice_index[one]))
     if not step:
@@ -64,12 +64,15 @@ def neighbour_gains(slices: Slices) -> Array:
 
 
 def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
-    """Of each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities."""
+    """Of each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities.
+
+    Slices of one file share a lattice of pixels. Others may lie half a pixel apart: neither is near the edge of a cell.
+    """
     ((_, inside, world_mm, axes),) = stacks_by_header(slices)
     index = np.flatnonzero(inside)
     plane = slices.planes.plane_id()[index]
     place = world_mm[index] @ axes / slices.planes.spacing_mm[plane]
-    column, row = np.rint(place - place.min(0)).astype(np.int64).T
+    column, row = np.floor(place - place.min(0) + 0.25).astype(np.int64).T
     value = slices.value[index].astype(np.float64)
     value = np.log(np.maximum(value, MIN_INTENSITY * value.mean()))
     number = column * (int(row.max()) + 1) + row

@@ -10,6 +10,7 @@ import pytest
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.planes import Slices
 from g3r.fitting.neighbour_gains import MIN_PIXELS, neighbour_gains
+from g3r.geometry import RigidPose
 from tests.registration.moving_heads import as_slices, simulated
 
 
@@ -50,6 +51,16 @@ def test_a_missing_slice_does_not_cut_the_stack(alone: Slices, rng: np.random.Ge
     kept = np.delete(np.arange(len(alone)), len(alone) // 2)
     whole, gap = neighbour_gains(shown(alone, log_gain))[kept], neighbour_gains(shown(alone, log_gain).take(kept))
     np.testing.assert_allclose(np.log(gap / gap.mean()), np.log(whole / whole.mean()), atol=0.04)
+
+
+def test_slices_that_lie_half_a_pixel_apart_are_compared_all_the_same(alone: Slices, rng: np.random.Generator) -> None:
+    log_gain = rng.normal(0, 0.08, len(alone))
+    header = alone.header_pose
+    aside = 0.5 * alone.planes.spacing_mm[0, 0] * (np.arange(len(alone)) % 2)
+    moved = header.translation_mm + aside[:, None] * header.rotation[:, :, 0]
+    slices = replace(shown(alone, log_gain), header_pose=RigidPose(header.rotation, moved))
+    found, expected = neighbour_gains(slices), neighbour_gains(shown(alone, log_gain))
+    np.testing.assert_allclose(np.log(found), np.log(expected), atol=0.05)
 
 
 def test_black_and_bright_slices_give_finite_gains(alone: Slices) -> None:
