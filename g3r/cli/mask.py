@@ -7,7 +7,8 @@ import argparse
 import json
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,13 +50,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_masker_options(parser, options)
     let_threads_sleep()
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
-    logging.getLogger("g3r.acquisition.slice_profile").setLevel(logging.ERROR)  # the thickness decides nothing here
     try:
-        return _run(options)
+        with _silent("g3r.acquisition.slice_profile"):  # the thickness decides nothing here
+            return _run(options)
     except KeyboardInterrupt:
         return _said("interrupted; masks that were printed are whole", 130)
     except EXPECTED as error:
         return _said(*line_and_code(error))
+
+
+@contextmanager
+def _silent(name: str) -> Iterator[None]:
+    """A logger that says nothing but errors for a while, and is then as it was."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import sys
 from pathlib import Path
@@ -61,6 +62,13 @@ def test_every_stack_gets_a_mask_and_one_that_fails_stops_no_other(
         assert record["Sources"] == [stack.name]
         assert record["MaskSource"] == "command"
         assert f"{name}.nii.gz: {record['VolumeMl']:.0f} ml" in said
+
+
+def test_loggers_are_left_as_they_were(stacks: list[Path], masker: str, tmp_path: Path) -> None:
+    logger = logging.getLogger("g3r.acquisition.slice_profile")
+    level = logger.level
+    assert main([str(stacks[0]), "--output", str(tmp_path / "masks"), "--mask-command", masker]) == 0
+    assert logger.level == level
 
 
 def test_masks_are_replaced_only_when_told(
