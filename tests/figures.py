@@ -23,7 +23,7 @@ WHAT = {
     "`preview`": "least squares alone, without networks, fit and maps",
     "`fast`": "a shorter registration, one fit",
     "`balanced`": "measured slice profiles; two rounds of poses and volume for two stacks",
-    "`accurate`": "the mean of six fits; a round of poses and volume, up to four for two stacks",
+    "`accurate`": "the mean of six fits; a round of poses and volume, two for two stacks",
 }
 """What the presets do, in the order of the table."""
 
