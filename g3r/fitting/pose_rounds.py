@@ -35,10 +35,6 @@ MAX_PIXELS = 200_000
 MAX_LOSS = 0.002
 """A round whose mean held-out correlation is lower than before by more than this is undone."""
 
-MIN_GAIN = 0.0015
-"""A round that raises it by less is the last one. Two stacks leave a shear of the head open: along it slices drift as
-rounds go on, and predict each other better and better."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class PoseRoundSettings:
@@ -147,7 +143,7 @@ def refine_in_rounds(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
 ) -> RefinedPoses:
-    """Poses and prior volume after up to `n_rounds` rounds; ends at the first one that hardly helps.
+    """Poses and prior volume after up to `n_rounds` rounds; ends at the first one that does not help.
 
     Args:
         registration: poses from the slices alone.
@@ -173,11 +169,8 @@ def refine_in_rounds(
             if held_out[-1] < held_out[-2] - MAX_LOSS:
                 prior = prior_of(registration, True)
                 break
-        last = number == n_rounds - 1 or (checked and held_out[-1] < held_out[-2] + MIN_GAIN)
-        registration, prior = moved, prior_of(moved, last)
+        registration, prior = moved, prior_of(moved, number == n_rounds - 1)
         n_kept += 1
-        if last:
-            break
     progress(n_rounds, n_rounds)
     held_out = [round(value, 4) for value in held_out]
     record = PoseRounds(n_kept=n_kept, held_out=held_out, n_moved=n_moved)

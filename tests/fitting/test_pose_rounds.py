@@ -109,22 +109,6 @@ def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: p
     assert maker.last == [True]  # the first V_prior was a quick one
 
 
-@pytest.mark.parametrize(
-    ("gains", "n_kept"), [((5.0, 5.0, 5.0, 5.0), 4), ((5.0, 0.5, 5.0, 5.0), 2), ((0.5, 5.0, 5.0, 5.0), 1)]
-)
-def test_a_round_that_hardly_helps_is_kept_and_is_the_last(
-    gains: tuple[float, ...], n_kept: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    held_out = iter(0.8 + pose_rounds.MIN_GAIN * np.cumsum((0.0, *gains)))
-    monkeypatch.setattr(pose_rounds, "fine_held_out_correlations", lambda slices, gain: [next(held_out)])
-    start = registration_of(moved_away(make_slices()))
-    monkeypatch.setattr(pose_rounds, "_registered_to_fit", lambda registration, *_: (replace(registration), 0))
-    found, maker = run(start, 4)
-    assert found.record.n_kept == n_kept
-    assert maker.last == [False] * (n_kept - 1) + [True]
-    assert found.registration is not start
-
-
 def test_rounds_follow_the_number_of_stacks_and_a_single_one_has_them_only_where_the_prior_holds_it() -> None:
     rounds = PoseRoundSettings(single_stack=1, two_stacks=2, more_stacks=3)
     assert [rounds.n_rounds(n) for n in (1, 2, 3, 12)] == [1, 2, 3, 3]
