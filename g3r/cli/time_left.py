@@ -51,7 +51,7 @@ EXPECTED_S = {
 }
 """The same of each preset, with all programs compiled, by stage in their order; of poses in rounds one round."""
 
-POSE_ROUNDS = {"preview": (0, 0, 0), "fast": (1, 1, 0), "balanced": (1, 2, 0), "accurate": (1, 4, 1)}
+POSE_ROUNDS = {"preview": (0, 0, 0), "fast": (1, 1, 0), "balanced": (1, 2, 0), "accurate": (1, 2, 1)}
 """Rounds of poses and volume with one stack, two, and more. A test holds them equal to those of the presets, which
 load too slowly to be asked here."""
 

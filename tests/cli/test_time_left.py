@@ -128,7 +128,7 @@ def test_each_round_is_expected() -> None:
 
     one = rounds_s(3, "accurate")
     assert one > 0
-    assert rounds_s(2, "accurate") == pytest.approx(4 * one)
+    assert rounds_s(2, "accurate") == pytest.approx(2 * one)
     assert rounds_s(2, "fast") > rounds_s(3, "fast") == 0
 
 
