@@ -25,20 +25,15 @@ from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from studies.harness import FITS, Record, Row, Study, Task
+from studies.masks.cases import EDGE_MM, SEED
 from studies.masks.surrounded import SLICES_BEYOND, surrounded
 from studies.subjects import THICKNESS_MM, data_folder
 from studies.tables import Cell, table
 
 CASES = ("sta24-severe", "sb28-mild-gap", "sb32-moderate", "sta30-moderate", "sta30-none", "sta34-single")
 
-SEED = 81_000
-"""Of the surroundings: those of `studies.masks.cases`."""
-
 DEEP_MM = 4.0
 """Depth in the brain from which pixels count: nearer to its edge the slices' own profile decides."""
-
-EDGE_MM = 2.0
-"""Depth below which voxels of a volume do not count."""
 
 MIN_PIXELS = 30
 """Of a slice, for an error of its own."""

@@ -1,12 +1,15 @@
 """The study of gains and fields against the truth: what it calls an error, and its table."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.bench.record import machine
+from g3r.evaluation.case import load_case
 from studies.tradeoff import intensities
 from studies.tradeoff.intensities import ExpectedPixels
 
@@ -49,6 +52,17 @@ def test_noise_is_no_error_of_gains() -> None:
         gain[expected.plane] * expected.value * np.exp(np.random.default_rng(2).normal(0, 0.05, len(expected.plane)))
     )
     assert expected.error(_poses(noisy, gain)) < 0.006
+
+
+def test_expected_pixels_are_those_of_the_true_poses(subject: Path) -> None:
+    case = load_case(subject, 4.0)
+    slices = slices_from_stacks(case.stacks)
+    expected = ExpectedPixels.of(case, slices, 0)
+    right = np.corrcoef(expected.value, slices.value[expected.index])[0, 1]
+    assert right > 0.88
+    np.testing.assert_array_equal(slices.planes.plane_id()[expected.index], expected.plane)
+    moved = ExpectedPixels.of(case, slices, 2)
+    assert np.corrcoef(moved.value, slices.value[moved.index])[0, 1] < right - 0.1
 
 
 def test_the_table_has_both_errors_and_both_volumes() -> None:
