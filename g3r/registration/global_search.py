@@ -17,7 +17,7 @@ from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refin
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
-from g3r.registration.thresholds import MIN_COST_GAIN, MIN_COST_GAIN_SINGLE, RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MIN_COST_GAIN, MIN_SINGLE_CORRELATION, MIN_SINGLE_GAIN, RETRY_BELOW_CORRELATION
 from g3r.registration.unseen import TemplateFill, with_header_spans
 from g3r.run.deadline import Deadline
 
@@ -144,6 +144,13 @@ def search_single(
     if sample.profile.has_missing:
         segments = with_header_spans(slices.take(sample.rows).header_pose, segments, sample.slice_index)
     motion, is_rigid = rigid_or_segments(
-        slices, sample, segments, placement.segments.interleave, head.volume, head.grid, MIN_COST_GAIN_SINGLE
+        slices,
+        sample,
+        segments,
+        placement.segments.interleave,
+        head.volume,
+        head.grid,
+        min_cost_gain=MIN_SINGLE_GAIN * sample.pixels.n_samples,
+        min_correlation=MIN_SINGLE_CORRELATION,
     )
     return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

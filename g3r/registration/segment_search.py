@@ -188,7 +188,9 @@ def rigid_or_segments(
     interleave: int,
     volume: NDArray[np.float32],
     grid: VolumeGrid,
+    *,
     min_cost_gain: float = MIN_COST_GAIN,
+    min_correlation: float = -1.0,
 ) -> tuple[RigidPose, bool]:
     """One motion for all slices of a stack where a volume predicts them as well by it; else its segments.
 
@@ -200,6 +202,7 @@ def rigid_or_segments(
         volume: [I, J, K] made without the stack.
         grid: its grid.
         min_cost_gain: by how much segments have to be cheaper.
+        min_correlation: of segments with the volume.
 
     Returns:
         Motions [K], and whether they are all the same.
@@ -207,7 +210,7 @@ def rigid_or_segments(
     rigid = _rigid_motion(slices.take(sample.rows), motion, volume, grid)
     in_segments = predict(sample, motion, volume, grid, interleave)
     in_one = predict(sample, rigid, volume, grid, interleave)
-    is_rigid = in_one.cost <= in_segments.cost + min_cost_gain
+    is_rigid = in_one.cost <= in_segments.cost + min_cost_gain or in_segments.correlation < min_correlation
     logger.debug("stack %d: cost %.0f as one, %.0f in segments", sample.stack, in_one.cost, in_segments.cost)
     return (rigid, True) if is_rigid else (motion, False)
 

@@ -67,6 +67,11 @@ class SearchPixels:
     def __len__(self) -> int:
         return len(self.start) - 1
 
+    @property
+    def n_samples(self) -> float:
+        """Independent samples in all slices."""
+        return float(self.area_mm2.sum()) / CORRELATION_AREA_MM2
+
     def moments(self, volume: NDArray[np.float32], grid: VolumeGrid, motion: RigidPose) -> NDArray[np.float64]:
         """Sums n, y, m, yy, mm, ym [J, K, 6] of slices k in a volume under world motions j.
 

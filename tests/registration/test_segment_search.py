@@ -6,10 +6,10 @@ from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
-from g3r.registration.held_out import held_out_score, volume_without
+from g3r.registration.held_out import held_out_score, predict, volume_without
 from g3r.registration.motion_segments import head_distance_mm
 from g3r.registration.placement import refine_placement
-from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments
+from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments, rigid_or_segments
 from g3r.registration.similarity import StackSamples
 from tests.registration.moving_heads import (
     STILL,
@@ -108,6 +108,26 @@ def test_a_rigid_stack_gets_one_motion_and_one_with_a_jerk_keeps_two(head: Phant
         np.testing.assert_allclose(own.rotation, own.rotation[:1].repeat(len(own), 0), atol=1e-9)
         np.testing.assert_allclose(own.translation_mm, own.translation_mm[:1].repeat(len(own), 0), atol=1e-6)
     assert np.median(pixel_errors_mm(slices.with_motion(found), truth)) < 0.5
+
+
+def test_segments_need_a_gain_and_a_volume_that_shows_the_head(head: Phantom) -> None:
+    jerk = MotionLevel(n_jerks=1, jerk_deg=10.0, jerk_mm=6.0)
+    slices, truth = as_slices(simulated(head, [STILL, jerk, STILL], seed=2))
+    sample = StackSamples.of_all(slices)[1]
+    own = truth.take(sample.rows)
+    volume, grid = volume_without(slices.with_motion(truth), sample.stack, 2.4)
+    in_segments = predict(sample, own, volume, grid, 2)
+    one, is_rigid = rigid_or_segments(slices, sample, own, 2, volume, grid, min_cost_gain=np.inf)
+    gain = predict(sample, one, volume, grid, 2).cost - in_segments.cost
+    assert is_rigid
+    assert gain > 0.165 * sample.pixels.n_samples  # far more than a single stack needs
+    for limits, expected in (
+        ({"min_cost_gain": 0.9 * gain}, False),
+        ({"min_cost_gain": 1.1 * gain}, True),
+        ({"min_correlation": in_segments.correlation - 0.01}, False),
+        ({"min_correlation": in_segments.correlation + 0.01}, True),
+    ):
+        assert rigid_or_segments(slices, sample, own, 2, volume, grid, **limits)[1] is expected, limits
 
 
 def test_segments_that_fit_noise_collapse_to_one_motion(
