@@ -119,7 +119,7 @@ def over_prior(n_stacks: int, at_least: float) -> Claim:
     return Claim(
         text=f"The volume is above V_prior on every subject, {words}",
         asked=f"{at_least:g} dB or more on each, asked for",
-        block="fewer-stacks",
+        block="single-stack" if n_stacks == 1 else "fewer-stacks",
         find=find,
         yes=f"From {words} `balanced` is above V_prior on every subject: {{figure}}.",
         no=f"From {words} `balanced` is not as far above V_prior on every subject as was asked for: {{figure}}.",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatch
 from itertools import pairwise
 from statistics import mean
 from typing import Any
@@ -50,6 +51,13 @@ FEWER_STACKS = "balanced"
 
 
 def tasks(options: argparse.Namespace) -> Iterator[Task]:
+    """Those of all reconstructions whose key has a part that matches --cases."""
+    for task in all_tasks(options):
+        if any(fnmatch(task.key, f"*{pattern}*") for pattern in options.cases):
+            yield task
+
+
+def all_tasks(options: argparse.Namespace) -> Iterator[Task]:
     """A reconstruction each: quick presets of all subjects first."""
     quick, careful = TRADE[:-1], TRADE[-1]
     wanted = (*((preset, 3) for preset in quick), (FEWER_STACKS, 2), (careful, 3), (FEWER_STACKS, 1), (careful, 2))
@@ -147,10 +155,15 @@ def _gains(found: Mapping[str, Mapping[str, Row]]) -> dict[str, str]:
     return gains
 
 
-def fewer_table(rows: Mapping[str, Row]) -> str:
-    """Two stacks and one: the volume beside V_prior and V_coarse."""
+def fewer_table(rows: Mapping[str, Row], wanted: Sequence[tuple[str, int]]) -> str:
+    """Two stacks or one: the volume beside V_prior and V_coarse.
+
+    Args:
+        rows: of the record.
+        wanted: presets and numbers of stacks.
+    """
     lines = []
-    for preset, n_stacks in ((FEWER_STACKS, 2), (TRADE[-1], 2), (FEWER_STACKS, 1)):
+    for preset, n_stacks in wanted:
         found = by_subject(rows, preset, n_stacks)
         for row in found.values():
             volume, prior, coarse = (psnr_db(row, name) for name in ("volume", "V_prior", "V_coarse"))
@@ -171,11 +184,12 @@ def fewer_table(rows: Mapping[str, Row]) -> str:
 
 
 def tables(record: Record) -> dict[str, str]:
-    """Both tables, and what they were measured on."""
+    """The tables, and what they were measured on."""
     made = f"Weights {record['weights']}; CPU seconds of the reconstruction without start and files."
     return {
         "presets": f"{made}\n\n{trade_table(record['rows'])}",
-        "fewer-stacks": f"dB.\n\n{fewer_table(record['rows'])}",
+        "fewer-stacks": f"dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 2), (TRADE[-1], 2)))}",
+        "single-stack": f"dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 1),))}",
     }
 
 
@@ -183,7 +197,7 @@ STUDY = Study(
     name="tradeoff.presets",
     about="Eight simulated heads of several sizes, pixels and slices, that no setting was chosen on: every preset with "
     "three stacks; two stacks and one.",
-    shared=("--ckpt", "--threads", "--jobs", "--cache"),
+    shared=("--ckpt", "--threads", "--jobs", "--cache", "--cases"),
     tasks=tasks,
     tables=tables,
     document="tradeoff.md",

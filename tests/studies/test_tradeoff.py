@@ -131,7 +131,10 @@ def test_presets_are_compared_on_the_same_subjects_alone(tmp_path: Path) -> None
     rows = {f"{name}, 3, {preset}": preset_row(name, 3, preset, db) for name, preset, db in given}
     rows["two"] = preset_row(first, 2, "balanced", 28.0)
     rows["two, longer"] = preset_row(first, 2, "accurate", 28.5)
+    rows["one"] = preset_row(first, 1, "balanced", 20.0)
     found = presets.tables({"weights": "w", "rows": rows})
+    assert f"| {first} | 1 | `balanced` | 10 | 20.00 | 19.00 | 18.00 | +1.00 | 0.10 | 1 |" in found["single-stack"]
+    assert "| 1 | `balanced` | 10 | 20.00" not in found["fewer-stacks"]
     gains = "+9.00 (least +8.00) |  | +0.25 (least -0.50) |  | +0.50 (least +0.50)"
     assert f"| mean gain over the quicker one |  |  |  | {gains} |" in found["presets"]
     for preset, values in (("balanced", "28.00 | 27.00 | 26.00"), ("accurate", "28.50 | 27.50 | 26.50")):
@@ -150,6 +153,8 @@ def test_subjects_of_the_presets_differ_in_size_and_are_not_those_that_were_trai
     for stack in first.acquisition(3):
         assert (stack.resolution_mm, stack.thickness_mm, stack.gap_mm) == (0.7, 3.0, 0.0)
     assert len([task.key for task in presets.tasks(presets.STUDY.parser().parse_args([]))]) == 56
+    one = [task.key for task in presets.tasks(presets.STUDY.parser().parse_args(["--cases", ", 1, balanced"]))]
+    assert one == [f"{spec.name}, 1, balanced" for spec in presets.SUBJECTS]
 
 
 def test_rounds_are_shown_side_by_side() -> None:
