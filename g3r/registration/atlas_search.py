@@ -22,7 +22,7 @@ from g3r.registration.held_out import predict
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
 from g3r.registration.similarity import StackSamples, correlation, own_moments
-from g3r.registration.so3_search import N_ORIENTATIONS, best_orientations, best_placements, stack_orientations
+from g3r.registration.so3_search import N_ORIENTATIONS, best_orientations, place_around, stack_orientations
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,9 @@ REFINEMENT = ((12.0, 5.0), (8.0, 4.0), (8.0, 4.0), (5.0, 3.0), (5.0, 3.0))
 
 SAME_DEG = 30.0
 """Orientations nearer to each other than this are searched together."""
+
+N_PLACEMENTS = 4
+"""Placements of each stack that are refined."""
 
 HEADER_PENALTY, HEADER_DEG = 8.0, 25.0
 """Penalty of two stacks at another angle than by their headers: the first times log(1 + (angle / second)^2)."""
@@ -196,8 +199,13 @@ def _stack_placements(
     if by_stack:
         own = stack_orientations(sample, fitted.center_mm, fitted.volume, fitted.grid)
         bases = bases + [base for base in own if min(angle_deg(base, other) for other in bases) > SAME_DEG]
+    found = []
+    for base in bases:
+        one = place_around(sample, base, fitted.center_mm, fitted.volume, fitted.grid)
+        found.append((_cost(sample, one, fitted), one))
+    found.sort(key=lambda candidate: candidate[0])
     refined = []
-    for _, one in best_placements(sample, bases, fitted.center_mm, fitted.volume, fitted.grid):
+    for _, one in found[:N_PLACEMENTS]:
         for rotation_deg, translation_mm in REFINEMENT[:2]:
             one = _refined(sample, one, fitted, rotation_deg, translation_mm, rng)
         refined.append((_cost(sample, one, fitted), one))

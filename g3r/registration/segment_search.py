@@ -21,7 +21,7 @@ from g3r.registration.held_out import (
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.similarity import StackSamples
-from g3r.registration.so3_search import best_placements, stack_orientations
+from g3r.registration.so3_search import place_around, stack_orientations
 from g3r.registration.stack_registration import refine_stack
 from g3r.registration.thresholds import IN_PLACE_CORRELATION, MIN_COST_GAIN
 from g3r.registration.unseen import TemplateFill
@@ -141,7 +141,8 @@ def _search_orientations(
     if present.correlation > IN_PLACE_CORRELATION:
         return None
     best, cost = None, present.cost
-    for _, found in best_placements(sample, stack_orientations(sample, target, volume, grid), target, volume, grid):
+    for base in stack_orientations(sample, target, volume, grid):
+        found = place_around(sample, base, target, volume, grid)
         for rotation_deg, translation_mm in WIDE_REFINEMENT:
             found = refine_placement(
                 sample, found.motion, volume, grid, rotation_deg=rotation_deg, translation_mm=translation_mm, rng=rng

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.geometry import VolumeGrid
-from g3r.registration.held_out import predict
 from g3r.registration.motion_segments import best_segments
 from g3r.registration.placement import Placement
 from g3r.registration.pose_sampling import angle_deg, rotations_about, rotations_within, uniform_rotations
@@ -26,11 +25,6 @@ best by more than this. One stack alone is more ambiguous than the whole head.""
 SEGMENT_REACH_DEG = 70.0
 SEGMENT_TRANSLATION_MM = 7.0
 """How far a motion segment may be from its stack's orientation, and the lattice of translations tried."""
-
-N_PLACEMENTS, N_COARSE_ORIENTATIONS = 4, 500
-"""Orientations around which segments of a stack are placed with the whole lattice, where there are more: those with the
-lowest costs with so few orientations of the lattice. In three flat phantoms, with 7 to 14 orientations for each stack,
-the one that was cheapest after refinement was among the first five of both orders (by hand)."""
 
 
 def best_orientations(
@@ -79,7 +73,6 @@ def place_around(
     target_mm: NDArray[np.float64],
     volume: NDArray[np.float32],
     grid: VolumeGrid,
-    n_orientations: int = N_ORIENTATIONS,
 ) -> Placement:
     """Motion segments of a stack, chosen from a lattice of motions around one orientation.
 
@@ -89,9 +82,8 @@ def place_around(
         target_mm: [3] where the stack's centre is taken, up to a translation of the lattice.
         volume: [I, J, K].
         grid: its grid.
-        n_orientations: of the lattice.
     """
-    rotation = rotations_within(n_orientations, SEGMENT_REACH_DEG) @ base
+    rotation = rotations_within(N_ORIENTATIONS, SEGMENT_REACH_DEG) @ base
     lattice = np.array(list(itertools.product((-SEGMENT_TRANSLATION_MM, 0.0, SEGMENT_TRANSLATION_MM), repeat=3)))
     candidate = rotations_about(
         np.repeat(rotation, len(lattice), axis=0),
@@ -101,30 +93,3 @@ def place_around(
     cost = slice_costs(sample.pixels, volume, grid, candidate)
     segments = best_segments(cost, candidate, sample.slice_index, sample.pixels.center_mm)
     return Placement(candidate.take(segments.choice), segments)
-
-
-def best_placements(
-    sample: StackSamples,
-    bases: list[NDArray[np.float64]],
-    target_mm: NDArray[np.float64],
-    volume: NDArray[np.float32],
-    grid: VolumeGrid,
-) -> list[tuple[float, Placement]]:
-    """Motion segments of a stack around the best few of some orientations, with their costs, cheapest first.
-
-    Args:
-        sample: the stack.
-        bases: orientations [3, 3].
-        target_mm: [3] where the stack's centre is taken.
-        volume: [I, J, K].
-        grid: its grid.
-    """
-
-    def placed(base: NDArray[np.float64], n_orientations: int) -> tuple[float, Placement]:
-        one = place_around(sample, base, target_mm, volume, grid, n_orientations)
-        return predict(sample, one.motion, volume, grid, one.segments.interleave).cost, one
-
-    if len(bases) > N_PLACEMENTS:
-        coarse = [placed(base, N_COARSE_ORIENTATIONS)[0] for base in bases]
-        bases = [bases[n] for n in np.argsort(coarse)[:N_PLACEMENTS]]
-    return sorted((placed(base, N_ORIENTATIONS) for base in bases), key=lambda found: found[0])
