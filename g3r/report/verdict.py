@@ -73,7 +73,7 @@ MESSAGES = {
     ),
     "single stack": Message(
         CHECK,
-        "there is a single stack: nothing checks where its slices were put",
+        "there is a single stack: nothing checks where its slices were put, nor which way the head lies",
         "Compare the volume with the stack; two more stacks in other planes make it far safer.",
     ),
     "masks found": Message(
