@@ -17,7 +17,13 @@ from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refin
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
-from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_COST_GAIN, MIN_SINGLE_GAIN, RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import (
+    MIN_ATLAS_CORRELATION,
+    MIN_COST_GAIN,
+    MIN_SINGLE_GAIN,
+    MIN_SINGLE_GAIN_PER_SAMPLE,
+    RETRY_BELOW_CORRELATION,
+)
 from g3r.registration.unseen import TemplateFill, with_header_spans
 from g3r.run.deadline import Deadline
 
@@ -150,7 +156,7 @@ def search_single(
         placement.segments.interleave,
         head.volume,
         head.grid,
-        min_cost_gain=MIN_SINGLE_GAIN * sample.pixels.n_samples,
+        min_cost_gain=max(MIN_SINGLE_GAIN, MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples),
         min_correlation=MIN_ATLAS_CORRELATION,
     )
     return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

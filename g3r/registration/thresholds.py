@@ -17,12 +17,13 @@ MIN_COST_GAIN = 100.0
 """A stack gets several motion segments, or leaves its initialisation, only for a cost (log odds) lower by at
 least this: segments that fit noise gain 10 to 30, a single true jerk several hundred."""
 
-MIN_SINGLE_GAIN = 0.165
-"""The same for a single stack, which only the atlas template holds together, per independent sample
-(`CORRELATION_AREA_MM2`), since a large head gains more by noise than a small one. First stacks of 50 development heads:
-with mild motion gains reach 0.06, and one motion for all slices is nearer to the truth in all of 19 (0.7 mm instead of
-1.3, means over all slices). With moderate motion segments are nearer in 10 of 11 heads above the limit (2.3 mm instead
-of 3.8) and in 3 of 6 below; with jerks in 9 of 12 above (by hand)."""
+MIN_SINGLE_GAIN, MIN_SINGLE_GAIN_PER_SAMPLE = 200.0, 0.165
+"""The same for a single stack, which only the atlas template holds together, in all and per independent sample
+(`CORRELATION_AREA_MM2`): noise gains more in a large head, and in a small one the search still chooses among as many
+motions (74, 0.2 per sample, in a still stack of 14 slices). First stacks of 50 development heads: with mild motion
+gains reach 126, 0.06 per sample, and one motion for all slices is nearer to the truth in all of 19 (0.7 mm instead of
+1.3, means over all slices). With moderate motion segments are nearer in 10 of 11 heads above both limits (2.3 mm
+instead of 3.8; gains from 218 on) and in 3 of 6 below; with jerks in 9 of 11 above (by hand)."""
 
 MAX_HELD_OUT_LOSS = 0.02
 """A rigid stack whose held-out correlation falls by more than this as its slices move becomes rigid again."""
@@ -34,10 +35,10 @@ where nothing moved, which is noise, 0.02 to 0.05 with mild motion."""
 MIN_ATLAS_CORRELATION = 0.6
 """Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for
 simulated heads of 24 to 34 weeks, 0.4 for wrongly oriented heads; but 0.68 for a real stack that came out, alone, in a
-wrong orientation. Nor are motion segments of a single stack believed
-below it: with jerks the three heads of `MIN_SINGLE_GAIN` that segments had brought further away had 0.50 to 0.58, the
-other nine 0.60 to 0.82. Segments in phantoms, which no template shows, have 0.33 to 0.65: of 24 eleven gained enough,
-and slices of one of these ended 13 mm off (by hand)."""
+wrong orientation. Nor are motion segments of a single stack believed below it: with jerks the two heads of
+`MIN_SINGLE_GAIN` that segments had brought further away had 0.50 and 0.57, the other nine 0.60 to 0.82. Segments in
+phantoms, which no template shows, have 0.33 to 0.65: of 24 eleven gained enough, and slices of one of these ended 13 mm
+off (by hand)."""
 
 MIN_PRIOR_LOSS_REMOVED = 0.22
 """Share of the robust loss that registering a single stack to the prior must remove to be accepted: 0.10 to

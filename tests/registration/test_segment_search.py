@@ -11,7 +11,7 @@ from g3r.registration.motion_segments import head_distance_mm
 from g3r.registration.placement import refine_placement
 from g3r.registration.segment_search import aligned_to, collapse_to_rigid, refine_segments, rigid_or_segments
 from g3r.registration.similarity import StackSamples
-from g3r.registration.thresholds import MIN_SINGLE_GAIN
+from g3r.registration.thresholds import MIN_SINGLE_GAIN_PER_SAMPLE
 from tests.registration.moving_heads import (
     STILL,
     Moving,
@@ -121,7 +121,7 @@ def test_segments_need_a_gain_and_a_volume_that_shows_the_head(head: Phantom) ->
     one, is_rigid = rigid_or_segments(slices, sample, own, 2, volume, grid, min_cost_gain=np.inf)
     gain = predict(sample, one, volume, grid, 2).cost - in_segments.cost
     assert is_rigid
-    assert gain > MIN_SINGLE_GAIN * sample.pixels.n_samples  # far more than a single stack needs
+    assert gain > MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples  # far more than a single stack needs
     for limits, expected in (
         ({"min_cost_gain": 0.9 * gain}, False),
         ({"min_cost_gain": 1.1 * gain}, True),
