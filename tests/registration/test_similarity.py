@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Planes, Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.pose_sampling import perturbed
-from g3r.registration.similarity import GAIN_RANGE, SearchPixels, mean_square_residual, own_moments
+from g3r.registration.similarity import GAIN_RANGE, SearchPixels, halved_voxels, mean_square_residual, own_moments
 from tests.registration.moving_heads import slices_disturbed
 
 CENTER_MM = np.array([10.0, -20.0, 30.0])
@@ -86,14 +86,16 @@ def test_a_slice_of_one_row_and_a_slice_without_mask_have_pixels_too() -> None:
     assert np.isfinite(pixels.center_mm).all()
 
 
-def plain_moments(pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose) -> np.ndarray:
-    """The six sums by scipy; outside of the voxels' centres the volume is 0."""
+def plain_moments(
+    pixels: SearchPixels, volume: np.ndarray, grid: VolumeGrid, motion: RigidPose, order: int = 1
+) -> np.ndarray:
+    """The six sums by scipy, trilinear or from the nearest voxel; outside of the voxels' centres the volume is 0."""
     out = np.zeros((len(motion), len(pixels), 6))
     for j in range(len(motion)):
         moved = pixels.point_mm @ motion.rotation[j].T + motion.translation_mm[j]
         index = grid.index(moved)
         inside = ((index >= 0) & (index < np.array(grid.shape) - 1)).all(1)
-        model = np.where(inside, map_coordinates(volume.astype(float), index.T, order=1), 0)
+        model = np.where(inside, map_coordinates(volume.astype(float), index.T, order=order), 0)
         for k in range(len(pixels)):
             rows = slice(pixels.start[k], pixels.start[k + 1])
             y, m = pixels.value[rows].astype(float), model[rows]
@@ -109,12 +111,13 @@ def oblique_volume(rng: np.random.Generator) -> tuple[np.ndarray, VolumeGrid]:
     return rng.random(grid.shape).astype(np.float32), VolumeGrid(grid.shape, affine)
 
 
-def test_moments_are_those_of_plain_trilinear_reading(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("nearest", [False, True])
+def test_moments_are_those_of_plain_reading(nearest: bool, rng: np.random.Generator) -> None:
     pixels = SearchPixels.of(few_slices())
     volume, grid = oblique_volume(rng)
     motion = perturbed(RigidPose.identity(1), CENTER_MM, 5, 30.0, 6.0, rng)
-    expected = plain_moments(pixels, volume, grid, motion)
-    found = pixels.moments(volume, grid, motion)
+    expected = plain_moments(pixels, volume, grid, motion, order=0 if nearest else 1)
+    found = pixels.moments(volume, grid, motion, nearest=nearest)
     assert (expected[..., 4] > 0).any()  # some pixels fall inside, some outside
     assert (expected[..., 2] < 0.4 * expected[..., 0]).any()
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
@@ -127,6 +130,30 @@ def test_outside_of_the_volume_there_is_nothing(rng: np.random.Generator) -> Non
     found = pixels.moments(volume, grid, far)
     assert (found[..., [2, 4, 5]] == 0).all()
     assert (found[..., 3] > 0).all()
+
+
+def test_between_halved_voxels_a_volume_is_read_as_between_whole_ones(rng: np.random.Generator) -> None:
+    volume, grid = oblique_volume(rng)
+    fine, fine_grid = halved_voxels(volume, grid)
+    assert fine.shape == fine_grid.shape == (27, 33, 23)
+    np.testing.assert_allclose(fine_grid.spacing_mm, grid.spacing_mm / 2)
+    index = rng.uniform(0, 1, (500, 3)) * (np.array(grid.shape) - 1)
+    expected = map_coordinates(volume, index.T, order=1)
+    found = map_coordinates(fine, fine_grid.index(grid.world(index)).T, order=1)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_costs_of_the_search_are_near_those_of_trilinear_reading(rng: np.random.Generator) -> None:
+    pixels = SearchPixels.of(few_slices())
+    noise, grid = oblique_volume(rng)
+    volume = gaussian_filter(noise, 1.2)
+    motion = perturbed(RigidPose.identity(1), CENTER_MM, 200, 10.0, 3.0, rng)
+    trilinear = mean_square_residual(pixels.moments(volume, grid, motion))
+    fine = mean_square_residual(pixels.moments(*halved_voxels(volume, grid), motion, nearest=True))
+    coarse = mean_square_residual(pixels.moments(volume, grid, motion, nearest=True))
+    spread = trilinear.std(0)
+    assert (np.abs(fine - trilinear).mean(0) < 0.1 * spread).all()
+    assert (np.abs(fine - trilinear).mean(0) < np.abs(coarse - trilinear).mean(0)).mean() > 0.8
 
 
 def test_each_slice_under_its_own_motion_is_the_diagonal(rng: np.random.Generator) -> None:
