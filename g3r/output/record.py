@@ -46,6 +46,9 @@ class RegistrationRecord:
         held_out_correlation: of each initialisation, stack by stack.
         space: "standard" or "scanner".
         correlation_with_template: of the head with the atlas template; None in scanner space.
+        correlation_of_rival: the same in the best of all other orientations; None where none comes near, in scanner
+            space, and with several stacks.
+        orientation_doubtful: whether the two are about the same.
         standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
             robust mean, and near the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.
@@ -59,6 +62,8 @@ class RegistrationRecord:
     correlation_with_template: float | None
     standard_from_scanner: list[list[float]] | None
     rounds: list[dict[str, float]]
+    correlation_of_rival: float | None = None
+    orientation_doubtful: bool = False
 
     @classmethod
     def of(cls, registration: Registration, qualities: Sequence[StackQuality], slices: Slices) -> RegistrationRecord:
@@ -79,6 +84,8 @@ class RegistrationRecord:
             correlation_with_template=None if orientation is None else orientation.correlation,
             standard_from_scanner=None if orientation is None else mean_motion(slices),
             rounds=registration.history,
+            correlation_of_rival=None if orientation is None else orientation.rival,
+            orientation_doubtful=orientation is not None and orientation.is_doubtful,
         )
 
 

@@ -12,10 +12,11 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration.atlas_search import FittedTemplate
-from g3r.registration.pose_sampling import perturbed
+from g3r.registration.pose_sampling import angle_deg, perturbed, rotations_about, uniform_rotations
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.similarity import SearchPixels, correlation
-from g3r.registration.thresholds import MIN_ATLAS_CORRELATION
+from g3r.registration.so3_search import N_FOLLOWED_OF_STACK, N_ORIENTATIONS, STACK_DISTANCE_DEG, best_orientations
+from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_RIVAL_MARGIN
 
 logger = logging.getLogger(__name__)
 
@@ -25,6 +26,9 @@ HEADER_REACH_MM = 2.0
 ROUNDS = ((10.0, 4.0), (5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 """Random rotations (degrees) and translations (mm) of the whole head, round by round."""
 N_CANDIDATES = 1000
+
+RIVAL_DEG = 30.0
+"""An orientation at least this far from the one that was taken is another one."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +40,29 @@ class Orientation:
         correlation: with the atlas template, outline included.
         weeks: age of the template.
         scale: by which it was enlarged to fit.
+        rival: correlation in the best of all orientations at least `RIVAL_DEG` away; None where none comes near, and
+            with several stacks, for which none is looked for: their headers hold them together.
     """
 
     pose: RigidPose
     correlation: float
     weeks: float
     scale: float
+    rival: float | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the head fits the template about as well in another orientation."""
+        return self.rival is not None and self.correlation - self.rival < MIN_RIVAL_MARGIN
 
 
 def standard_orientation(
     slices: Slices, templates: Sequence[FittedTemplate], start: RigidPose, rng: np.random.Generator
 ) -> Orientation | None:
     """Move all slices together so that the head is oriented as an atlas template.
+
+    A single stack is a few parallel slices, which may fit elsewhere as well. So all orientations are tried once more
+    with its slices where they are now.
 
     Args:
         slices: at their final poses, in any frame.
@@ -61,13 +76,25 @@ def standard_orientation(
     present = slices.world_from_header()
     common = aligned_to(slices, start, present) @ present.inverse()
     pixels = SearchPixels.of(slices)
-    found = [(*_moved_to(template, pixels, common.take([0]), ROUNDS[:1], rng), template) for template in templates]
-    _, motion, template = max(found, key=lambda one: one[0])
-    best, motion = _moved_to(template, pixels, motion, ROUNDS[1:], rng)
-    logger.info("standard orientation: correlation %.2f with the atlas template of %.0f weeks", best, template.weeks)
-    if best < MIN_ATLAS_CORRELATION:
+    found = [_moved_to(template, pixels, common.take([0]), ROUNDS[:1], rng) for template in templates]
+    first = max(found, key=lambda one: one.correlation)
+    found = [_moved_to(first.template, pixels, first.motion, ROUNDS[1:], rng)]
+    if len(np.unique(slices.stack_id)) == 1:
+        found += _in_all_orientations(templates, pixels, rng)
+    best = max(found, key=lambda one: one.correlation)
+    far = [one for one in found if angle_deg(one.motion.rotation[0], best.motion.rotation[0]) > RIVAL_DEG]
+    rival = max((one.correlation for one in far), default=None)
+    weeks = best.template.weeks
+    logger.info(
+        "standard orientation: correlation %.2f with the atlas template of %.0f weeks%s",
+        best.correlation,
+        weeks,
+        "" if rival is None else f", {rival:.2f} in another orientation",
+    )
+    if best.correlation < MIN_ATLAS_CORRELATION:
         return None
-    return Orientation(motion @ slices.planes.pose, best, template.weeks, template.scale)
+    pose = best.motion @ slices.planes.pose
+    return Orientation(pose, best.correlation, weeks, best.template.scale, rival)
 
 
 def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> Orientation:
@@ -83,20 +110,44 @@ def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> 
     return Orientation(slices.planes.pose, best, template.weeks, template.scale)
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """All slices moved to a template: their correlation with it, and the motion [1]."""
+
+    correlation: float
+    motion: RigidPose
+    template: FittedTemplate
+
+
+def _in_all_orientations(
+    templates: Sequence[FittedTemplate], pixels: SearchPixels, rng: np.random.Generator
+) -> list[_Fit]:
+    """The orientations in which the slices fit best, to each template."""
+    rotation = uniform_rotations(N_ORIENTATIONS)
+    found = []
+    for template in templates:
+        motion = rotations_about(rotation, pixels.center_mm, template.center_mm)
+        agreement = correlation(pixels.moments(template.volume, template.grid, motion, nearest=True).sum(1))
+        for base in best_orientations(rotation, agreement, N_FOLLOWED_OF_STACK, STACK_DISTANCE_DEG):
+            start = rotations_about(base[None], pixels.center_mm, template.center_mm)
+            found.append(_moved_to(template, pixels, start, ROUNDS, rng))
+    return found
+
+
 def _moved_to(
     template: FittedTemplate,
     pixels: SearchPixels,
     motion: RigidPose,
     rounds: Sequence[tuple[float, float]],
     rng: np.random.Generator,
-) -> tuple[float, RigidPose]:
-    """Best correlation of all slices with a template, and the motion that gives it, after some of `ROUNDS`."""
+) -> _Fit:
+    """The best of all slices with a template, after some of `ROUNDS`."""
     agreement = np.zeros(1)
     for rotation_deg, translation_mm in rounds:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
         agreement = correlation(pixels.moments(template.volume, template.grid, candidate).sum(1))
         motion = candidate.take([int(agreement.argmax())])
-    return float(agreement.max()), motion
+    return _Fit(float(agreement.max()), motion, template)
 
 
 def centred_on_headers(slices: Slices) -> Slices:

@@ -143,7 +143,7 @@ def _orientation(
     found = standard_orientation(as_headers, placed.templates, placed.motion(len(posed), samples), rng)
     logger.info("given poses: correlation %.3f with the template where they are", here.correlation)
     if found is not None and here.correlation >= found.correlation - SAME_CORRELATION:
-        return placed, here
+        return placed, replace(here, rival=found.rival)
     return placed, found
 
 

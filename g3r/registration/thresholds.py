@@ -33,12 +33,17 @@ MIN_NCC_GAIN = 0.015
 where nothing moved, which is noise, 0.02 to 0.05 with mild motion."""
 
 MIN_ATLAS_CORRELATION = 0.6
-"""Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for
-simulated heads of 24 to 34 weeks, 0.4 for wrongly oriented heads; but 0.68 for a real stack that came out, alone, in a
-wrong orientation. Nor are motion segments of a single stack believed below it: with jerks the two heads of
-`MIN_SINGLE_GAIN` that segments had brought further away had 0.50 and 0.57, the other nine 0.60 to 0.82. Segments in
-phantoms, which no template shows, have 0.33 to 0.65: of 24 eleven gained enough, and slices of one of these ended 13 mm
-off (by hand)."""
+"""Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for simulated heads
+of 24 to 34 weeks, 0.4 for wrongly oriented heads; but see `MIN_RIVAL_MARGIN`. Nor are motion segments of a single stack
+believed below it: with jerks the two heads of `MIN_SINGLE_GAIN` that segments had brought further away had 0.50 and
+0.57, the other nine 0.60 to 0.82. Segments in phantoms, which no template shows, have 0.33 to 0.65: of 24 eleven gained
+enough, and slices of one of these ended 13 mm off (by hand)."""
+
+MIN_RIVAL_MARGIN = 0.04
+"""The orientation of a single stack is doubtful where it correlates with the template in another one by no less than
+this below the best: 0.05 or more in 44 simulated development heads that were oriented rightly. The three stacks of a
+real subject have 0.05 (rightly oriented), 0.03 (rightly) and 0.02 (wrongly); two or three of them together have 0.04 to
+0.05, rightly (by hand)."""
 
 MIN_PRIOR_LOSS_REMOVED = 0.22
 """Share of the robust loss that registering a single stack to the prior must remove to be accepted: 0.10 to

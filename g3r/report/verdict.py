@@ -76,6 +76,11 @@ MESSAGES = {
         "there is a single stack: nothing checks where its slices were put, nor which way the head lies",
         "Compare the volume with the stack; two more stacks in other planes make it far safer.",
     ),
+    "orientation doubtful": Message(
+        CHECK,
+        "the head fits the atlas template about as well in another orientation (correlation {best}, {rival})",
+        "What is shown as left, front or top may be something else: compare the volume with the stack.",
+    ),
     "masks found": Message(
         CHECK,
         "the brain {masks} of {stacks} {were} found automatically",
@@ -185,9 +190,13 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
         yield "rollbacks", {"n": record.n_rollbacks}
     if len(record.stacks) == 1:
         yield "single stack", {}
-    if found := [stack.name for stack in record.stacks if stack.mask_from in ("automatic", "command")]:
-        masks, were = ("mask", "was") if len(found) == 1 else ("masks", "were")
-        facts: dict[str, object] = {"masks": masks, "were": were, "stacks": _listed(found)}
+    found = record.registration
+    if found and found.orientation_doubtful:
+        best, rival = found.correlation_with_template, found.correlation_of_rival
+        yield "orientation doubtful", {"best": f"{best:.2f}", "rival": f"{rival:.2f}"}
+    if by_itself := [stack.name for stack in record.stacks if stack.mask_from in ("automatic", "command")]:
+        masks, were = ("mask", "was") if len(by_itself) == 1 else ("masks", "were")
+        facts: dict[str, object] = {"masks": masks, "were": were, "stacks": _listed(by_itself)}
         yield "masks found", facts
     if whole := [stack.name for stack in record.stacks if stack.mask_from in ("whole image", "empty background")]:
         yield "whole image", {"stacks": _listed(whole)}

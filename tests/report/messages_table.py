@@ -23,6 +23,7 @@ FILLED_IN = {
     "share": "N %",
     "ncc": "N",
     "best": "N",
+    "rival": "N",
     "what": "brain",
     "shortfalls": "what is bad of it, and what is good",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -30,6 +31,20 @@ def stacks_with(one: Any) -> RunRecord:
     return record(stack("a.nii"), stack("b.nii"), one)
 
 
+def oriented(best: float, rival: float) -> RunRecord:
+    """A single stack that fits the template in two orientations."""
+    found = record(stack("a.nii", quality(None, None)))
+    assert found.registration is not None
+    registration = replace(
+        found.registration,
+        space="standard",
+        correlation_with_template=best,
+        correlation_of_rival=rival,
+        orientation_doubtful=True,
+    )
+    return replace(found, registration=registration)
+
+
 CASES: dict[str, tuple[RunRecord, str, str]] = {
     "failed": (
         stacks_with(stack("c.nii", quality(False, 0.31))),
@@ -44,6 +59,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
     ),
     "single": (record(stack("a.nii", quality(None, None))), CHECK, "single stack"),
+    "orientation": (
+        oriented(0.682, 0.666),
+        CHECK,
+        "the head fits the atlas template about as well in another orientation (correlation 0.68, 0.67)",
+    ),
     "unseen": (record(unseen=unseen(0.1)), CHECK, "10 % of the brain was not seen"),
     "unseen too much": (
         record(unseen=unseen(DO_NOT_USE_ABOVE + 0.01, usable=False)),
