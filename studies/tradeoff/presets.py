@@ -188,8 +188,8 @@ def tables(record: Record) -> dict[str, str]:
     made = f"Weights {record['weights']}; CPU seconds of the reconstruction without start and files."
     return {
         "presets": f"{made}\n\n{trade_table(record['rows'])}",
-        "fewer-stacks": f"dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 2), (TRADE[-1], 2)))}",
-        "single-stack": f"dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 1),))}",
+        "fewer-stacks": f"PSNR in dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 2), (TRADE[-1], 2)))}",
+        "single-stack": f"PSNR in dB.\n\n{fewer_table(record['rows'], ((FEWER_STACKS, 1),))}",
     }
 
 
