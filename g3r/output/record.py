@@ -48,7 +48,7 @@ class RegistrationRecord:
         correlation_with_template: of the head with the atlas template; None in scanner space.
         correlation_of_rival: the same in the best of all other orientations; None where none comes near, in scanner
             space, and with several stacks.
-        orientation_doubtful: whether the two are about the same.
+        orientation_doubtful: whether that is about as high (`MIN_RIVAL_MARGIN` in `registration/thresholds.py`).
         standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
             robust mean, and near the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.

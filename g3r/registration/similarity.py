@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.area_profile import AreaProfile, area_profiles
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.similarity_kernels import nearest_sums, trilinear_sums
+from g3r.registration.similarity_kernels import model_sums
 
 PIXELS_PER_SLICE = 100
 """Pixels of a slice that take part in a search; at its resolution neighbours are nearly alike."""
@@ -98,8 +98,7 @@ class SearchPixels:
         out[..., 0] = np.diff(self.start)
         out[..., 1] = np.add.reduceat(value, self.start[:-1])
         out[..., 3] = np.add.reduceat(value**2, self.start[:-1])
-        sums = nearest_sums if nearest else trilinear_sums
-        sums(
+        model_sums(
             flat,
             np.array(grid.shape),
             point,
@@ -107,6 +106,7 @@ class SearchPixels:
             self.start,
             linear.astype(np.float32),
             translation.astype(np.float32),
+            None if nearest else True,
             out,
         )
         return out

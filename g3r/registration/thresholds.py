@@ -40,9 +40,9 @@ believed below it: with jerks the two heads of `MIN_SINGLE_GAIN` that segments h
 enough, and slices of one of these ended 13 mm off (by hand)."""
 
 MIN_RIVAL_MARGIN = 0.04
-"""The orientation of a single stack is doubtful where it correlates with the template in another one by no less than
-this below the best: 0.05 or more in 44 simulated development heads that were oriented rightly. The three stacks of a
-real subject have 0.05 (rightly oriented), 0.03 (rightly) and 0.02 (wrongly); two or three of them together have 0.04 to
+"""The orientation of a single stack is doubtful where its correlation with the template in another one is lower by less
+than this: by 0.05 or more in 44 simulated development heads that were oriented rightly. For the three stacks of a real
+subject it is 0.05 (rightly oriented), 0.03 (rightly) and 0.02 (wrongly); for two or three of them together 0.04 to
 0.05, rightly (by hand)."""
 
 MIN_PRIOR_LOSS_REMOVED = 0.22
