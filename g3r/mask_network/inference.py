@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from g3r.acquisition.axis_resampling import along_axes, axis_weights, centred_positions_mm
-from g3r.mask_network.brightness import detail_inside, evened
+from g3r.acquisition.axis_resampling import along_axes, axis_weights
+from g3r.mask_network.brightness import detail_inside
 from g3r.mask_network.mask_shape import (
     as_people_draw,
     cleaned,
@@ -20,10 +18,10 @@ from g3r.mask_network.mask_shape import (
     without_doubtful_ends,
     without_outgrowths,
 )
+from g3r.mask_network.mirrored import FLIPS, Flip, brain_probability
+from g3r.mask_network.places import look_from_afar
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from g3r.mask_network.model import MaskModel
     from g3r.mask_network.network import MaskNetwork
 
@@ -38,24 +36,12 @@ MIN_DETAIL = 0.03
 """Of `detail_inside`: smooth balls in a shell have 0.020 and 0.024, the flattest of 63 simulated heads 0.038."""
 LEAST_PROBABILITY = 0.35
 """Of a pixel of the brain: a lost piece of brain is worse than a piece of what is beside it."""
-N_PLACES = 3
-"""Places at which a brain is outlined; the one that looks most like it from near is taken."""
-PLACE_MM = 12.0
-"""Standard deviation of the smoothing before the most likely places are looked for."""
-APART_MM = 45.0
-"""Distance of places from each other, and how far from a place slices are looked at."""
-MIN_PLACE = 0.02
-"""Smoothed probability below which a place is not looked at."""
 CROP_MM = 150.0
 """Smallest edge of the crop in which the brain is outlined."""
 AROUND_MM = 20.0
 """In the plane on each side of what was found."""
 BESIDE_MM = 14.0
 """Further slices on each side of what was found."""
-FLIPS: tuple[tuple[int, ...], ...] = ((), (2, 3))
-"""Axes of a tensor along which the images are mirrored for further estimates."""
-WIDE_FLIPS = (*FLIPS, (2,), (3,))
-"""The same from afar, where few pixels cost little and a wrong place costs everything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,26 +113,6 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     )
 
 
-def likely_places(probability: Image, spacing_mm: Array) -> list[NDArray[np.int64]]:
-    """Where a brain may be: voxels [3] about which there is most probability, the likeliest first.
-
-    Args:
-        probability: [A, B, C] of brain.
-        spacing_mm: [3] of its voxels.
-    """
-    left = gaussian_filter(probability, PLACE_MM / np.asarray(spacing_mm), mode="constant")
-    position = np.indices(left.shape) * np.reshape(spacing_mm, (3, 1, 1, 1))
-    places = []
-    for _ in range(N_PLACES):
-        place = np.array(np.unravel_index(int(left.argmax()), left.shape))
-        if left[tuple(place)] < MIN_PLACE:
-            break
-        places.append(place)
-        off = ((position - (place * spacing_mm)[:, None, None, None]) ** 2).sum(0)
-        left[off < APART_MM**2] = 0
-    return places
-
-
 def _refusal(image: Image, spacing: Array) -> str:
     """Why an image cannot be looked at; empty where it can."""
     if image.ndim != 3 or min(image.shape) < 1:
@@ -174,7 +140,7 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
 def _candidates(network: MaskNetwork, image: Image, spacing: Array) -> list[NDArray[np.bool_]]:
     """Masks [I, J, K] of what may be a head, the most likely one first."""
     for even in (False, True):  # where a head is dark beside something bright, only the second look shows it
-        coarse, boxes = _boxes(network, image, spacing, even)
+        coarse, boxes = look_from_afar(network, image, spacing, even)
         tried = [one for low, high in boxes if (one := _mask_in(network, image, spacing, low, high))[0].any()]
         if tried:
             break
@@ -186,36 +152,6 @@ def _candidates(network: MaskNetwork, image: Image, spacing: Array) -> list[NDAr
 def _is_even(image: Image, mask: NDArray[np.bool_], spacing: Array) -> bool:
     """Whether a mask is large enough to show folds and shows none."""
     return detail_inside(image, mask, spacing) < MIN_DETAIL  # not so where that is NaN
-
-
-def _boxes(network: MaskNetwork, image: Image, spacing: Array, even: bool) -> tuple[Image, list[tuple[Array, Array]]]:
-    """Probability of brain on the stack's grid from afar, and boxes where a head may be: two positions [3] (mm).
-
-    Args:
-        network: trained.
-        image: [I, J, K] stack.
-        spacing: [3] of it (mm).
-        even: whether brightness is made even first.
-    """
-    step = network.config.wide_mm
-    at = [
-        centred_positions_mm(max(1, round(n * mm / step)), step, n, mm)
-        for n, mm in zip(image.shape[:2], spacing[:2], strict=True)
-    ]
-    same = np.eye(image.shape[2], dtype=np.float32)
-    sizes = list(zip(image.shape[:2], spacing[:2], at, strict=True))
-    wide = along_axes(image, [*(axis_weights(n, mm, a, step) for n, mm, a in sizes), same])
-    if even:
-        wide = evened(wide, np.array([step, step, spacing[2]]))
-    probability = _probability(network, wide, WIDE_FLIPS)
-    back = [axis_weights(len(a), step, np.arange(n) * mm - a[0], mm) for n, mm, a in sizes]
-    # the crop's size in the plane is never less than `CROP_MM`
-    reach = np.array([0.0, 0.0, APART_MM])
-    boxes = []
-    for i, j, k in likely_places(probability, np.array([step, step, spacing[2]])):
-        place = np.array([at[0][i], at[1][j], k * spacing[2]])
-        boxes.append((place - reach, place + reach))
-    return along_axes(probability, [*back, same]), boxes
 
 
 def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
@@ -233,7 +169,7 @@ def _mask_in(
 
 
 def _outlined(
-    network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array, flips: Sequence[tuple[int, ...]]
+    network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array, flips: Sequence[Flip]
 ) -> Image:
     """Probability of brain on the stack's own grid, in a crop about a box.
 
@@ -243,7 +179,7 @@ def _outlined(
         spacing: [3] of it (mm).
         low: [3] where the box begins along each axis (mm from the first voxel).
         high: [3] where it ends.
-        flips: see `FLIPS`.
+        flips: mirror images whose mean counts.
     """
     pixel = network.config.pixel_mm
     crop = []
@@ -256,7 +192,7 @@ def _outlined(
     part = image[:, :, first:last]
     same = np.eye(last - first, dtype=np.float32)
     weights = [axis_weights(image.shape[a], float(spacing[a]), crop[a], pixel) for a in (0, 1)]
-    found = _probability(network, along_axes(part, [*weights, same]), flips)
+    found = np.mean(brain_probability(network, along_axes(part, [*weights, same]), flips), axis=0)
     # back to the stack's pixels: the crop's first pixel is the origin of its positions
     back = [
         axis_weights(len(crop[a]), pixel, np.arange(image.shape[a]) * spacing[a] - crop[a][0], float(spacing[a]))
@@ -265,13 +201,3 @@ def _outlined(
     result = np.zeros(image.shape, np.float32)
     result[:, :, first:last] = along_axes(found, [*back, same])
     return result
-
-
-def _probability(logits_of: Callable[[Tensor], Tensor], image: Image, flips: Sequence[tuple[int, ...]]) -> Image:
-    """Mean probability over mirrored images [I, J, K]."""
-    tensor = torch.from_numpy(np.ascontiguousarray(image))[None, None]
-    total = torch.zeros_like(tensor)
-    with torch.inference_mode():
-        for axes in flips:
-            total += torch.sigmoid(logits_of(tensor.flip(axes))).flip(axes)
-    return (total / len(flips))[0, 0].numpy()

@@ -10,12 +10,15 @@ import pytest
 import torch
 
 from g3r.mask_network.config import MaskNetworkConfig
-from g3r.mask_network.inference import N_PLACES, WIDE_FLIPS, find_brain, likely_places
+from g3r.mask_network.inference import find_brain
 from g3r.mask_network.mask_shape import as_people_draw
+from g3r.mask_network.mirrored import FLIPS, FURTHER_FLIPS
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork
+from g3r.mask_network.places import N_PLACES, is_clear, likely_places
 
 SPACING_MM = (1.1, 1.3, 3.5)
+N_LOOKS = len(FLIPS) + len(FURTHER_FLIPS)
 
 
 class BrightIsBrain(torch.nn.Module):
@@ -30,8 +33,8 @@ def stub() -> Any:
     return SimpleNamespace(network=BrightIsBrain())
 
 
-class BlindAtFirst(BrightIsBrain):
-    """Sees nothing in the first look at the whole stack."""
+class Watched(BrightIsBrain):
+    """Remembers what it saw."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -39,7 +42,15 @@ class BlindAtFirst(BrightIsBrain):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         self.seen.append(image)
-        return super().forward(image) if len(self.seen) > len(WIDE_FLIPS) else torch.full_like(image, -20.0)
+        return super().forward(image)
+
+
+class BlindAtFirst(Watched):
+    """Sees nothing in the first look at the whole stack."""
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        logits = super().forward(image)
+        return logits if len(self.seen) > N_LOOKS else torch.full_like(logits, -20.0)
 
 
 def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
@@ -91,12 +102,33 @@ def test_where_nothing_is_seen_a_second_look_has_even_brightness() -> None:
     network = BlindAtFirst()
     found = find_brain(image, SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
     assert (found.mask & head).sum() > 0.9 * head.sum()
-    first, second = network.seen[0], network.seen[len(WIDE_FLIPS)]
+    first, second = network.seen[0], network.seen[N_LOOKS]
     assert first.shape == second.shape
     middle = [round(mm / 2.4) for mm in (60.0, 60.0)], [round(mm / 2.4) for mm in (170.0, 170.0)]
     (own, other), (own_even, other_even) = ([one[0, 0, i, j, 11] for i, j in middle] for one in (first, second))
     assert other / own > 5
     assert other_even / own_even < 2
+
+
+@pytest.mark.parametrize("rival_mm", [0.0, 9.0, 32.0])
+def test_a_place_without_a_rival_is_looked_at_alone(rival_mm: float) -> None:
+    """One of the same size is a rival, a much smaller one is none; either way the head is found."""
+    head, other = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0), ball((160, 140, 25), (140.0, 140.0, 40.0), rival_mm)
+    network = Watched()
+    found = find_brain(folded(head) + 0.9 * folded(other), SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
+    assert (found.mask & head).sum() > 0.9 * head.sum()
+    wide = [image for image in network.seen if image.shape == network.seen[0].shape]
+    near = len(network.seen) - len(wide) - len(FLIPS) - 1  # outlined once more, and once with mirror images
+    assert (len(wide), near > 1) == ((N_LOOKS, True) if rival_mm == 32.0 else (len(FLIPS), False))
+
+
+@pytest.mark.parametrize("turned_mm", [0.0, 40.0])
+def test_a_place_that_the_turned_image_does_not_show_is_not_clear(turned_mm: float) -> None:
+    head = np.zeros((40, 40, 20), np.float32)
+    head[6:20, 6:20, 6:14] = 1.0
+    turned = np.roll(head, round(turned_mm / 4.0), axis=0)
+    mean: np.ndarray = (head + turned) / 2
+    assert is_clear(likely_places(mean, np.full(3, 4.0)), [head, turned], np.full(3, 4.0)) == (turned_mm == 0)
 
 
 def test_too_little_is_no_head(stub: Any) -> None:
@@ -140,7 +172,8 @@ def test_places_have_most_probability_about_them_and_are_apart() -> None:
     probability[6:14, 6:14, 6:14] = 0.6
     probability[28:34, 28:34, 8:14] = 0.9
     first, second, *others = likely_places(probability, np.full(3, 4.0))
-    assert np.abs(first - [9.5, 9.5, 9.5]).max() <= 1
-    assert np.abs(second - [30.5, 30.5, 10.5]).max() <= 1
+    assert np.abs(first.voxel - [9.5, 9.5, 9.5]).max() <= 1
+    assert np.abs(second.voxel - [30.5, 30.5, 10.5]).max() <= 1
+    assert first.probability > second.probability
     assert len(others) <= N_PLACES - 2
     assert likely_places(np.zeros((3, 3, 3), np.float32), np.full(3, 4.0)) == []
