@@ -27,10 +27,10 @@ APART_MM = 45.0
 """Distance of places from each other, and how far from a place slices are looked at."""
 MIN_PROBABILITY = 0.02
 """Smoothed, below which a place is not looked at."""
-CLEAR_PROBABILITY = 0.3
-"""Smoothed probability of a place that may be the only one."""
+MIN_AGREED_PROBABILITY = 0.3
+"""Smoothed, below which mirror images that agree on a place may be wrong alike."""
 RIVAL_SHARE = 0.5
-"""A place with less of the probability of the likeliest one is no rival of it."""
+"""A place with less of the probability of the likeliest one is not looked at."""
 
 
 class Place(NamedTuple):
@@ -50,8 +50,8 @@ def look_from_afar(
 ) -> tuple[Image, list[tuple[Array, Array]]]:
     """Probability of brain on the stack's grid, and boxes where a head may be: two positions [3] (mm), likeliest first.
 
-    Where the image and the image turned agree on one place, it is the only one. Elsewhere two further mirror images
-    are looked at, too: few pixels cost little, and a wrong place costs everything.
+    Where the image and the image turned do not agree on the likeliest place, two further mirror images are looked at,
+    too: few pixels cost little, and a wrong place costs everything.
 
     Args:
         network: trained.
@@ -73,16 +73,14 @@ def look_from_afar(
     seen = brain_probability(network, wide, FLIPS)
     probability = np.mean(seen, axis=0)
     places = likely_places(probability, wide_spacing)
-    if is_clear(places, seen, wide_spacing):
-        del places[1:]
-    else:
+    if not is_agreed(places, seen, wide_spacing):
         probability = np.mean([*seen, *brain_probability(network, wide, FURTHER_FLIPS)], axis=0)
         places = likely_places(probability, wide_spacing)
     back = [axis_weights(len(a), step, np.arange(n) * mm - a[0], mm) for n, mm, a in sizes]
     # the crop's size in the plane is never less than `inference.CROP_MM`
     reach = np.array([0.0, 0.0, APART_MM])
     boxes = []
-    for (i, j, k), _ in places:
+    for (i, j, k), _ in without_outsiders(places):
         place = np.array([at[0][i], at[1][j], k * spacing[2]])
         boxes.append((place - reach, place + reach))
     return along_axes(probability, [*back, same]), boxes
@@ -109,20 +107,23 @@ def likely_places(probability: Image, spacing_mm: Array) -> list[Place]:
     return places
 
 
-def is_clear(places: Sequence[Place], seen: Sequence[Image], spacing_mm: Array) -> bool:
-    """Whether the likeliest place is the only one, and each mirror image has its likeliest place there.
+def is_agreed(places: Sequence[Place], seen: Sequence[Image], spacing_mm: Array) -> bool:
+    """Whether the likeliest place is the likeliest one of each mirror image, too.
 
     Args:
         places: from the mean of the mirror images.
         seen: probability of each mirror image [A, B, C].
         spacing_mm: [3] of their voxels.
     """
-    if not places or places[0].probability < CLEAR_PROBABILITY:
-        return False
-    if len(places) > 1 and places[1].probability > RIVAL_SHARE * places[0].probability:
+    if not places or places[0].probability < MIN_AGREED_PROBABILITY:
         return False
     for one in seen:
         own = likely_places(one, spacing_mm)
         if not own or np.linalg.norm((own[0].voxel - places[0].voxel) * spacing_mm) > SMOOTHING_MM:
             return False
     return True
+
+
+def without_outsiders(places: Sequence[Place]) -> list[Place]:
+    """The places that have at least a share of the probability of the likeliest one, which comes first."""
+    return [place for place in places if place.probability >= RIVAL_SHARE * places[0].probability]

@@ -15,7 +15,7 @@ from g3r.mask_network.mask_shape import as_people_draw
 from g3r.mask_network.mirrored import FLIPS, FURTHER_FLIPS
 from g3r.mask_network.model import MaskModel
 from g3r.mask_network.network import MaskNetwork
-from g3r.mask_network.places import N_PLACES, is_clear, likely_places
+from g3r.mask_network.places import N_PLACES, is_agreed, likely_places
 
 SPACING_MM = (1.1, 1.3, 3.5)
 N_LOOKS = len(FLIPS) + len(FURTHER_FLIPS)
@@ -51,6 +51,14 @@ class BlindAtFirst(Watched):
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         logits = super().forward(image)
         return logits if len(self.seen) > N_LOOKS else torch.full_like(logits, -20.0)
+
+
+class BlindWhenTurned(Watched):
+    """Sees nothing in its second look."""
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        logits = super().forward(image)
+        return torch.full_like(logits, -20.0) if len(self.seen) == 2 else logits
 
 
 def ball(shape: tuple[int, int, int], centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
@@ -110,25 +118,32 @@ def test_where_nothing_is_seen_a_second_look_has_even_brightness() -> None:
     assert other_even / own_even < 2
 
 
-@pytest.mark.parametrize("rival_mm", [0.0, 9.0, 32.0])
+@pytest.mark.parametrize("rival_mm", [0.0, 9.0, 30.0])
 def test_a_place_without_a_rival_is_looked_at_alone(rival_mm: float) -> None:
-    """One of the same size is a rival, a much smaller one is none; either way the head is found."""
+    """One of nearly the same size is a rival, a much smaller one is none; either way the head is found."""
     head, other = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0), ball((160, 140, 25), (140.0, 140.0, 40.0), rival_mm)
     network = Watched()
     found = find_brain(folded(head) + 0.9 * folded(other), SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
     assert (found.mask & head).sum() > 0.9 * head.sum()
-    wide = [image for image in network.seen if image.shape == network.seen[0].shape]
-    near = len(network.seen) - len(wide) - len(FLIPS) - 1  # outlined once more, and once with mirror images
-    assert (len(wide), near > 1) == ((N_LOOKS, True) if rival_mm == 32.0 else (len(FLIPS), False))
+    n_near = len(network.seen) - len(FLIPS)  # both images from afar agree
+    assert sum(image.shape == network.seen[0].shape for image in network.seen) == len(FLIPS)
+    assert (n_near > 2 + len(FLIPS)) == (rival_mm == 30.0)  # a place, the same once more, and that with mirror images
+
+
+def test_mirror_images_that_disagree_are_not_all() -> None:
+    head = ball((160, 140, 25), (60.0, 60.0, 40.0), 32.0)
+    network = BlindWhenTurned()
+    find_brain(folded(head), SPACING_MM, SimpleNamespace(network=network))  # type: ignore[arg-type]
+    assert sum(image.shape == network.seen[0].shape for image in network.seen) == N_LOOKS
 
 
 @pytest.mark.parametrize("turned_mm", [0.0, 40.0])
-def test_a_place_that_the_turned_image_does_not_show_is_not_clear(turned_mm: float) -> None:
+def test_mirror_images_agree_on_a_place_that_both_show(turned_mm: float) -> None:
     head = np.zeros((40, 40, 20), np.float32)
     head[6:20, 6:20, 6:14] = 1.0
     turned = np.roll(head, round(turned_mm / 4.0), axis=0)
     mean: np.ndarray = (head + turned) / 2
-    assert is_clear(likely_places(mean, np.full(3, 4.0)), [head, turned], np.full(3, 4.0)) == (turned_mm == 0)
+    assert is_agreed(likely_places(mean, np.full(3, 4.0)), [head, turned], np.full(3, 4.0)) == (turned_mm == 0)
 
 
 def test_too_little_is_no_head(stub: Any) -> None:
