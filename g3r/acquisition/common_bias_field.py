@@ -17,7 +17,7 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
 
-WORKING_VOXEL_MM = 2.4
+WORKING_VOXEL_MM = 3.2
 """N4 sees voxels of about this size: a coil's field is smooth."""
 
 CONTROL_POINTS = 4

@@ -184,7 +184,7 @@ def _head_correlation(
     total = np.zeros((len(rotation), 6))
     for sample in samples:
         motion = rotations_about(rotation, sample.pixels.center_mm, fitted.center_mm)
-        total += sample.pixels.moments(fitted.volume, fitted.grid, motion).sum(1)
+        total += sample.pixels.moments(fitted.volume, fitted.grid, motion, nearest=True).sum(1)
     return correlation(total)
 
 

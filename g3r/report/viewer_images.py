@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -125,6 +126,9 @@ class ViewerImages:
 
     def records(self) -> list[dict[str, Any]]:
         """For the script of the page: title, caption, window, and a compressed NIfTI as text (base64)."""
+        layers = shown(self.data)
+        with ThreadPoolExecutor() as pool:  # compression takes one thread, and releases Python's lock
+            packed = pool.map(self._nifti, layers)
         return [
             {
                 "name": one.name,
@@ -133,9 +137,9 @@ class ViewerImages:
                 "kind": one.kind,
                 "low": self.window[one.name][0],
                 "high": self.window[one.name][1],
-                "data": base64.b64encode(self._nifti(one)).decode("ascii"),
+                "data": base64.b64encode(data).decode("ascii"),
             }
-            for one in shown(self.data)
+            for one, data in zip(layers, packed, strict=True)
         ]
 
     def _nifti(self, layer: Layer) -> bytes:
