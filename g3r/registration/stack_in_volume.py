@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
+from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
 from g3r.registration.held_out import HELD_OUT_VOXEL_MM, estimate_interleave, predict
@@ -55,8 +56,10 @@ def place_in_volume(
     motion, correlation = _searched(sample, coarse, coarse_grid, rng)
     slices = slices.with_motion(motion)
     gain = np.ones(len(slices))
+    # against zeros beyond what the volume shows, a slice that it shows in part would move inwards
+    continued = smooth_fill(volume, (volume != 0).astype(np.float32))
     for sigma_mm in BLUR_MM:
-        blurred = gaussian_filter(volume, sigma_mm / grid.spacing_mm) if sigma_mm else volume
+        blurred = gaussian_filter(continued, sigma_mm / grid.spacing_mm) if sigma_mm else continued
         model = SliceModel(slices, blurred, grid)
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         slices, gain, _ = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)

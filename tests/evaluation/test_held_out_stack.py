@@ -78,6 +78,15 @@ def test_only_what_a_volume_shows_counts(truth: Volume, stack: Stack, by_truth: 
     assert predict_stack(truth, stack, eroded_pixels=3).counted_share > by_truth.counted_share
 
 
+def test_a_cut_volume_predicts_what_it_shows_as_well(truth: Volume, stack: Stack, by_truth: StackPrediction) -> None:
+    """What lies beyond the cut is no evidence: taken for zeros, it would draw slices inwards."""
+    cut = truth.data.copy()
+    cut[:, : int(np.quantile(np.argwhere(cut != 0)[:, 1], 0.1))] = 0
+    part = predict_stack(replace(truth, data=cut), stack)
+    assert part.counted_share < 0.95 * by_truth.counted_share
+    assert part.figures()["psnr_db"] == pytest.approx(by_truth.figures()["psnr_db"], abs=0.4)
+
+
 def test_a_volume_that_shows_nothing(truth: Volume, stack: Stack) -> None:
     with pytest.raises(InputError, match="shows nothing"):
         predict_stack(replace(truth, data=truth.data * 0), stack)
