@@ -46,7 +46,7 @@ def test_a_field_is_found(found: np.ndarray) -> None:
     assert found.max() <= found[BRAIN].max() + 1e-6
 
 
-def test_without_a_field_none_is_found() -> None:
+def test_without_a_field_none_of_a_hundredth_is_found() -> None:
     assert np.abs(common_log_field(tissues(), BRAIN, GRID)[BRAIN]).mean() < 0.01
 
 
