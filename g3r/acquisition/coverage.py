@@ -95,27 +95,27 @@ def _accumulate(density, linear, offset, sigma, extent, amount):
         for p in range(len(amount)):
             if amount[p] == 0.0:
                 continue
-            m, s = linear[p], sigma[p]
-            peak = amount[p] / (math.sqrt(2.0 * math.pi) * s[2])
-            reach = REACH_SIGMA * s[2]
+            # lengths in standard deviations of the slice's profile
+            m, per_sigma = linear[p] / sigma[p].reshape(3, 1), 1.0 / sigma[p]
+            low, high = extent[p, :, 0] * per_sigma[:2], extent[p, :, 1] * per_sigma[:2]
+            peak = amount[p] * per_sigma[2] / math.sqrt(2.0 * math.pi)
             for j in range(n_j):
-                x = offset[p, 0] + m[0, 0] * i + m[0, 1] * j
-                y = offset[p, 1] + m[1, 0] * i + m[1, 1] * j
-                z = offset[p, 2] + m[2, 0] * i + m[2, 1] * j
+                x = offset[p, 0] * per_sigma[0] + m[0, 0] * i + m[0, 1] * j
+                y = offset[p, 1] * per_sigma[1] + m[1, 0] * i + m[1, 1] * j
+                z = offset[p, 2] * per_sigma[2] + m[2, 0] * i + m[2, 1] * j
                 first, last = 0, n_k
-                if abs(m[2, 2]) * n_k > 1e-9 * reach:
-                    a, b = (-reach - z) / m[2, 2], (reach - z) / m[2, 2]
+                if abs(m[2, 2]) * n_k > 1e-9 * REACH_SIGMA:
+                    a, b = (-REACH_SIGMA - z) / m[2, 2], (REACH_SIGMA - z) / m[2, 2]
                     first = max(first, math.ceil(max(min(a, b), -1.0)))
                     last = min(last, math.floor(min(max(a, b), float(n_k))) + 1)
-                elif abs(z) > reach:
+                elif abs(z) > REACH_SIGMA:
                     continue
                 for k in range(first, last):
-                    height = (z + m[2, 2] * k) / s[2]
+                    height = z + m[2, 2] * k
                     value = peak * math.exp(-0.5 * height * height)
                     for axis in range(2):
                         place = (x if axis == 0 else y) + m[axis, 2] * k
-                        from_low = (place - extent[p, axis, 0]) / s[axis]
-                        to_high = (extent[p, axis, 1] - place) / s[axis]
+                        from_low, to_high = place - low[axis], high[axis] - place
                         if min(from_low, to_high) < REACH_SIGMA:
                             value *= 0.5 * (math.erf(from_low / root2) + math.erf(to_high / root2))
                     density[i, j, k] += value

@@ -81,7 +81,7 @@ def refine_slices(
         fraction = round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9)
         # coarse to fine: the capture range is about a voxel of the volume's blur. Few coarse rounds, since blur moves
         # what is round inwards, and slices follow it along their normal
-        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.1 else 1.6 if fraction < 0.45 else 1.0)
+        voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.1 else 1.6 if fraction < 0.4 else 1.0)
         smoothness = 0.1 if fraction < 0.2 else 0.03 if fraction < 0.7 else 0.01
         if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
             grid, volume = grid_around(slices, voxel), None
