@@ -97,6 +97,11 @@ class AreaProfile:
         return float((steps.max(initial=1) - 1) * self.spacing_mm) if self.n_inside else 0.0
 
     @property
+    def missing_share(self) -> float:
+        """Share of the head in missing slices; too large by up to a half where a stack ends in its largest slice."""
+        return float(self.area_mm2[~self.seen].sum() / self.area_mm2.sum())
+
+    @property
     def has_missing(self) -> bool:
         """Whether a part of the head is missing."""
         return self.is_cut or self.n_inside > 0

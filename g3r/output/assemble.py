@@ -88,7 +88,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             mask,
             grid.voxel_volume_mm3,
             shown=_shown_unseen(found.prior, settings),
-            extent_known=_extent_known(found, settings),
+            share_by_areas=_share_by_areas(found, settings),
+            has_template=found.prior.has_template,
             what=NAME_OF[settings.anatomy],
         )
         tell(FinishedVolume(volume=volume, mask=mask, grid=grid, unseen=unseen_part))
@@ -175,15 +176,15 @@ def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
     return "estimate from other brains" if prior.has_template else "smooth continuation"
 
 
-def _extent_known(found: StageResults, settings: ReconstructionSettings) -> bool:
-    """Whether the brain ends where slices or template say; not so for a single cut stack that no template fits.
+def _share_by_areas(found: StageResults, settings: ReconstructionSettings) -> float | None:
+    """What a single stack that is cut lacks of the head, by the areas of its slices; None where there is none.
 
     Of another object the part in the masks is meant, wherever it ends.
     """
-    if settings.anatomy != FETAL_BRAIN:
-        return True
     profiles = found.registration.profiles
-    return found.prior.has_template or len(profiles) != 1 or not profiles[0].is_cut
+    if settings.anatomy != FETAL_BRAIN or len(profiles) != 1 or not profiles[0].is_cut:
+        return None
+    return profiles[0].missing_share
 
 
 def _record(

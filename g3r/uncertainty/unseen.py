@@ -25,6 +25,7 @@ class UnseenPart:
             share is then too small.
         usable: False where the share is so large, or so little known, that the volume must not be used.
         what: the volume shows, as in "of the brain".
+        share_by_areas: of the head, as the areas of its slices say where the only field of view cuts it; else None.
     """
 
     share: float
@@ -33,6 +34,7 @@ class UnseenPart:
     extent_known: bool
     usable: bool
     what: str = "brain"
+    share_by_areas: float | None = None
 
     @classmethod
     def of(
@@ -42,7 +44,8 @@ class UnseenPart:
         voxel_volume_mm3: float,
         *,
         shown: str,
-        extent_known: bool = True,
+        share_by_areas: float | None = None,
+        has_template: bool = True,
         what: str = "brain",
     ) -> UnseenPart:
         """Measure it.
@@ -52,10 +55,13 @@ class UnseenPart:
             brain: [I, J, K] all of it.
             voxel_volume_mm3: of both.
             shown: what the volume shows there.
-            extent_known: whether the brain may not go on beyond all fields of view.
+            share_by_areas: that no slice saw, by the areas of the slices of a single stack whose field of view cuts the
+                head; None where there is no such stack.
+            has_template: whether an atlas template says how large the brain is.
             what: the volume shows.
         """
         share = float(unseen.sum()) / max(int(brain.sum()), 1)
+        extent_known = share_by_areas is None or has_template
         return cls(
             share=share,
             volume_ml=float(unseen.sum()) * voxel_volume_mm3 / 1000,
@@ -63,14 +69,16 @@ class UnseenPart:
             extent_known=extent_known,
             usable=extent_known and share <= DO_NOT_USE_ABOVE,
             what=what,
+            share_by_areas=share_by_areas,
         )
 
     def line(self) -> str | None:
         """The sentence for terminal, run.json and picture; None where next to nothing is unseen."""
         if not self.extent_known:
+            percent = 10 * round(10 * (self.share_by_areas or 0.0))
             return (
-                "the field of view cuts the head, and no atlas template fits that would say how much of the brain lies "
-                "beyond; do not use this volume"
+                f"the field of view cuts the head: about {percent} % of the {self.what} lies beyond, by the areas of "
+                "slices, and no atlas template fits that would show it; do not use this volume"
             )
         if self.share < MENTIONED_ABOVE:
             return None

@@ -31,6 +31,7 @@ def test_a_whole_head_counts_as_masked(whole: Slices) -> None:
         area_mm2 = np.bincount(one.pixel_plane, minlength=len(one)) * one.planes.spacing_mm.prod(1)
         assert profile.volume_mm3 == pytest.approx(area_mm2.sum() * profile.spacing_mm, rel=1e-12)
         assert not profile.has_missing
+        assert profile.missing_share == 0
         assert profile.longest_gap_mm == 0
 
 
@@ -51,6 +52,7 @@ def test_a_cut_head_is_continued(whole: Slices, span: tuple[float, float], cut: 
     assert found.cut == cut
     assert found.volume_mm3 == pytest.approx(given.volume_mm3, rel=0.1)
     assert seen_mm3 < 0.7 * given.volume_mm3
+    assert found.missing_share == pytest.approx(1 - seen_mm3 / given.volume_mm3, abs=0.07)
     assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 3
 
 

@@ -42,7 +42,12 @@ def stack(
 
 def unseen(share: float = 0.0, *, usable: bool = True, extent_known: bool = True) -> UnseenPart:
     return UnseenPart(
-        share=share, volume_ml=280 * share, shown="smooth continuation", extent_known=extent_known, usable=usable
+        share=share,
+        volume_ml=280 * share,
+        shown="smooth continuation",
+        extent_known=extent_known,
+        usable=usable,
+        share_by_areas=None if extent_known else 0.4,
     )
 
 

@@ -71,10 +71,19 @@ def test_no_brain_is_no_division_by_zero() -> None:
 
 def test_a_cut_head_of_unknown_size_must_not_be_used() -> None:
     """However little of what is called brain is unseen."""
-    found = UnseenPart.of(np.zeros_like(BRAIN), BRAIN, 8.0, shown="smooth continuation", extent_known=False)
+    nothing = np.zeros_like(BRAIN)
+    found = UnseenPart.of(nothing, BRAIN, 8.0, shown="smooth continuation", share_by_areas=0.43, has_template=False)
     assert found.share == 0
     assert not found.usable
     line = found.line()
     assert line is not None
-    assert "no atlas template fits" in line
+    assert "about 40 % of the brain lies beyond" in line
     assert line.endswith("do not use this volume")
+
+
+def test_the_size_of_a_cut_head_is_that_of_a_template_that_fits() -> None:
+    found = UnseenPart.of(BRAIN, BRAIN, 8.0, shown="estimate from other brains", share_by_areas=0.43)
+    assert found.extent_known
+    line = found.line()
+    assert line is not None
+    assert line.startswith("100 % of the brain was not seen")
