@@ -18,8 +18,8 @@ from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.stack_registration import register_stacks
 from g3r.registration.thresholds import (
-    MIN_ATLAS_CORRELATION,
     MIN_COST_GAIN,
+    MIN_SINGLE_CORRELATION,
     MIN_SINGLE_GAIN,
     MIN_SINGLE_GAIN_PER_SAMPLE,
     RETRY_BELOW_CORRELATION,
@@ -157,6 +157,6 @@ def search_single(
         head.volume,
         head.grid,
         min_cost_gain=max(MIN_SINGLE_GAIN, MIN_SINGLE_GAIN_PER_SAMPLE * sample.pixels.n_samples),
-        min_correlation=MIN_ATLAS_CORRELATION,
+        min_correlation=MIN_SINGLE_CORRELATION,
     )
     return SearchResult(motion, "headers" if is_rigid else "template", {}, placed)

@@ -25,6 +25,13 @@ gains reach 126, 0.06 per sample, and one motion for all slices is nearer to the
 1.3, means over all slices). With moderate motion segments are nearer in 10 of 11 heads above both limits (2.3 mm
 instead of 3.8; gains from 218 on) and in 3 of 6 below; with jerks in 9 of 11 above (by hand)."""
 
+MIN_SINGLE_CORRELATION = 0.67
+"""Correlation of motion segments of a single stack with the template below which they are not believed, whatever they
+gain. First stacks of 72 heads, simulated, 20 of them with holes: of the 28 whose gain was above both limits four had
+less. With jerks and a hole one was nearer to the truth (0.60, poses 1.2 mm off in place of 2.6); segments had brought
+three further away (0.65 each, 3 mm in place of 0.6 to 1.9). The other 24 had 0.70 to 0.82, and segments were nearer in
+18 (by hand; 26 of the heads are of published tables)."""
+
 MAX_HELD_OUT_LOSS = 0.02
 """A rigid stack whose held-out correlation falls by more than this as its slices move becomes rigid again."""
 
@@ -34,10 +41,7 @@ where nothing moved, which is noise, 0.02 to 0.05 with mild motion."""
 
 MIN_ATLAS_CORRELATION = 0.6
 """Correlation with the atlas template below which the standard orientation is unknown: 0.7 to 0.8 for simulated heads
-of 24 to 34 weeks, 0.4 for wrongly oriented heads; but see `MIN_RIVAL_MARGIN`. Nor are motion segments of a single stack
-believed below it: with jerks the two heads of `MIN_SINGLE_GAIN` that segments had brought further away had 0.50 and
-0.57, the other nine 0.60 to 0.82. Segments in phantoms, which no template shows, have 0.33 to 0.65: of 24 eleven gained
-enough, and slices of one of these ended 13 mm off (by hand)."""
+of 24 to 34 weeks, 0.4 for wrongly oriented heads; but see `MIN_RIVAL_MARGIN`."""
 
 MIN_RIVAL_MARGIN = 0.04
 """The orientation of a single stack is doubtful where its correlation with the template in another one is lower by less
