@@ -262,7 +262,7 @@ def prior() -> Iterator[Claim]:
         yield with_prior("with distillation", "fit without prior", n, "The prior with distillation")
     for n in (1, 2, 3):
         yield with_prior("with distillation", "prior as initialisation", n, "Distillation, beside initialisation,")
-    yield over_coarse("one stack", 3.0)
+    yield over_coarse("1 stack", 3.0)
     yield over_coarse("3 stacks", 2.0)
     yield gate("all", "over the whole brain")
     yield gate("c of 0 to 0.05", "where no slice looked")
