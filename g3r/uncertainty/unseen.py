@@ -75,9 +75,9 @@ class UnseenPart:
     def line(self) -> str | None:
         """The sentence for terminal, run.json and picture; None where next to nothing is unseen."""
         if not self.extent_known:
-            percent = 10 * round(10 * (self.share_by_areas or 0.0))
+            tens = 10 * round(10 * (self.share_by_areas or 0.0))
             return (
-                f"the field of view cuts the head: about {percent} % of the {self.what} lies beyond, by the areas of "
+                f"the field of view cuts the head: about {tens} % of the {self.what} lies beyond, by the areas of "
                 "slices, and no atlas template fits that would show it; do not use this volume"
             )
         if self.share < MENTIONED_ABOVE:
