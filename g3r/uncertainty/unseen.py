@@ -78,7 +78,7 @@ class UnseenPart:
             tens = 10 * round(10 * (self.share_by_areas or 0.0))
             return (
                 f"the field of view cuts the head: about {tens} % of the {self.what} lies beyond, by the areas of "
-                "slices, and no atlas template fits that would show it; do not use this volume"
+                "slices, and no atlas template was fitted that would show it; do not use this volume"
             )
         if self.share < MENTIONED_ABOVE:
             return None
