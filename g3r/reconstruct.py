@@ -149,6 +149,7 @@ class GaussianReconstructor:
         self, slices: Slices, given: Registration | GivenPoses | None, plan: Plan, run: RunContext
     ) -> Registration:
         """The slices in their poses."""
+        deadline = plan.for_registration() if given is None else None  # first: a time budget chooses the search
         asked, report = plan.settings.registration, run.report(Stage.REGISTRATION)
         if isinstance(given, GivenPoses):
             run.notes += given.notes
@@ -160,7 +161,6 @@ class GaussianReconstructor:
             with run.timed(Stage.REGISTRATION) as tell:
                 tell(poses := with_pixels_of(slices, given))
         else:
-            deadline = plan.for_registration()
             poses = run.stage(Stage.REGISTRATION, lambda: self.register(slices, asked, report, deadline))
         if asked.standard_orientation and poses.orientation is None:
             run.notes.append(unknown_orientation_note(slices))

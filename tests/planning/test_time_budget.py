@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.geometry.grid import on_grid
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
+from g3r.registration import Registration, RegistrationSettings
 from g3r.report.verdict import verdict_of
 from g3r.run.deadline import Deadline
 from tests.quick import QUICK_FIT
@@ -75,6 +78,22 @@ def test_registration_keeps_the_space_and_the_seed_that_were_asked_for() -> None
     assert one.settings.registration.seed == 7
     assert not one.settings.registration.standard_orientation
     assert 0 < deadline.remaining_s < 60
+
+
+def test_slices_are_searched_for_as_the_budget_chose(stacks: list[Stack], monkeypatch: pytest.MonkeyPatch) -> None:
+    class Searched(Exception):
+        """Ends the run where the search would begin."""
+
+    def register(slices: Slices, settings: RegistrationSettings, *_: Any) -> Registration:
+        raise Searched(settings)
+
+    reconstructor, plan = GaussianReconstructor(settings=SETTINGS), TimeBudget.of(SETTINGS, 5.0)
+    monkeypatch.setattr(reconstructor, "register", register)
+    with pytest.raises(Searched) as searched:
+        reconstructor.reconstruct(stacks, plan=plan)
+    preview = replace(PRESETS["preview"].registration, seed=SETTINGS.registration.seed)
+    assert searched.value.args == (preview,)
+    assert preview != SETTINGS.registration
 
 
 def test_views_of_the_prior_follow_the_time_and_stay_within_what_there_is() -> None:
