@@ -39,22 +39,25 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration(weeks=22, n_stacks=1, preset="preview", voxel_mm=1.2),
-    Configuration(weeks=22, n_stacks=3, preset="preview", voxel_mm=0.5),
+    Configuration(weeks=22, n_stacks=1, preset="fast", voxel_mm=1.2),
+    Configuration(weeks=22, n_stacks=3, preset="fast", voxel_mm=0.5),
     Configuration(weeks=22, n_stacks=6, preset="fast", voxel_mm=0.8),
-    Configuration(weeks=30, n_stacks=1, preset="preview", voxel_mm=0.5),
+    Configuration(weeks=30, n_stacks=1, preset="fast", voxel_mm=0.5),
     Configuration(weeks=30, n_stacks=3, preset="preview", voxel_mm=0.8, threads=2),
     Configuration(weeks=30, n_stacks=3, preset="balanced", voxel_mm=0.8),
-    Configuration(weeks=30, n_stacks=6, preset="preview", voxel_mm=1.2),
-    Configuration(weeks=37, n_stacks=1, preset="preview", voxel_mm=0.8),
-    Configuration(weeks=37, n_stacks=3, preset="preview", voxel_mm=1.2, threads=1, more=("--no-prior",)),
-    Configuration(weeks=37, n_stacks=3, preset="preview", voxel_mm=0.5, threads=2),
+    Configuration(weeks=30, n_stacks=3, preset="accurate", voxel_mm=0.8, threads=2),
+    Configuration(weeks=30, n_stacks=6, preset="fast", voxel_mm=1.2),
+    Configuration(weeks=37, n_stacks=1, preset="fast", voxel_mm=0.8),
+    Configuration(weeks=37, n_stacks=3, preset="preview", voxel_mm=0.5),
+    Configuration(weeks=37, n_stacks=3, preset="fast", voxel_mm=1.2, more=("--no-prior",)),
+    Configuration(weeks=37, n_stacks=3, preset="fast", voxel_mm=0.5, threads=2),
 )
-"""Small and large heads, few and many stacks, coarse and fine voxels; preview where nothing else is asked."""
+"""Small and large heads, few and many stacks, coarse and fine voxels; `fast` where nothing else is asked, since it has
+all that needs memory."""
 
 LIMITED = (
-    Configuration(weeks=30, n_stacks=3, preset="preview", voxel_mm=0.8),
-    Configuration(weeks=30, n_stacks=1, preset="preview", voxel_mm=0.5),
+    Configuration(weeks=30, n_stacks=3, preset="fast", voxel_mm=0.8),
+    Configuration(weeks=30, n_stacks=1, preset="fast", voxel_mm=0.5),
 )
 """Run below limits: the usual case, whose prior network needs most, and one of many voxels."""
 
