@@ -16,16 +16,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.fitting.parameters import FitParameters
-
-MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
-"""Singular values of the map from strains to what slices of all stacks see of them in plane: the least one of an open
-strain, and the next one. The first lets further stacks be 10 degrees from one of two orientations; the second asks for
-45 degrees between the two, since slices of one orientation leave more than one strain open."""
-
-MIN_LENGTH = 0.5
-"""Of the mean of a stack's unit normals. Where it is shorter its slices have no orientation in common, as those of a
-radial scan."""
-
+from g3r.registration.open_strain import mean_normals, open_strain
 
 @dataclass(frozen=True, kw_only=True)
 class OpenShear:
@@ -90,30 +81,3 @@ class OpenShear:
 
     def _of_centres(self, parameters: FitParameters) -> NDArray[np.float64]:
         return np.asarray((parameters.value["mean_mm"].astype(np.float64) - self.middle_mm) @ self.strain)
-
-
-def mean_normals(slices: Slices) -> NDArray[np.float64]:
-    """The mean of the unit normals of each stack [n_stacks, 3]; the shorter, the more its slices are turned."""
-    normal = slices.planes.rotation[:, :, 2]
-    return np.stack([normal[slices.stack_id == stack].mean(0) for stack in np.unique(slices.stack_id)])
-
-
-def open_strain(normals: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The strain [3, 3] that no stack sees in plane; None where there is not exactly one.
-
-    Args:
-        normals: [n_stacks, 3] see `mean_normals`.
-    """
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    if length.min() < MIN_LENGTH:
-        return None
-    normals = normals / length
-    units = [np.outer(one, other) for one in np.eye(3) for other in np.eye(3)]
-    strains = [unit + unit.T for unit in np.array(units)[[0, 1, 2, 4, 5, 8]]]
-    strains = [strain / np.linalg.norm(strain) for strain in strains]
-    in_plane = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    seen = np.stack([(in_plane @ strain @ in_plane).ravel() for strain in strains], axis=1)
-    _, size, combinations = np.linalg.svd(seen, full_matrices=False)
-    if size[-1] > MAX_CLOSED or size[-2] < MIN_OTHERS:
-        return None
-    return np.einsum("n,nij->ij", combinations[-1], np.stack(strains))

@@ -24,6 +24,7 @@ from g3r.fitting.slice_targets import SliceModel, slice_target
 from g3r.gaussians import render
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
+from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.normal_equations import SliceModel as SamplingModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
 
@@ -195,7 +196,7 @@ def _registered_to_fit(
     slices, gain, at_end = register_slices(model, slices, gain, n_steps=n_steps, width=width)
     moved = replace(
         registration,
-        slices=registration.slices.with_pose(slices.planes.pose),
+        slices=without_excess_shear(registration.slices.with_pose(slices.planes.pose), registration.interleave),
         gain=gain,
         weight=slice_weights(at_end.loss, gain),
         ncc=at_end.ncc,

@@ -19,6 +19,7 @@ from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
+from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
@@ -126,7 +127,7 @@ def register(
         orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
     pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
     return Registration(
-        slices=given.with_pose(pose),
+        slices=without_excess_shear(given.with_pose(pose), interleave),
         gain=fitted.gain,
         weight=fitted.weight,
         ncc=fitted.ncc,

@@ -9,13 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from g3r.acquisition.planes import Slices
-from g3r.fitting.open_shear import OpenShear, mean_normals, open_strain
+from g3r.fitting.open_shear import OpenShear
 from g3r.fitting.parameters import Block, FitParameters, LearningRates
 from g3r.fitting.slice_parameters import slice_blocks
 from g3r.fitting.slice_stage import SliceLoss, SliceStageSettings
 from g3r.gaussians import GaussianCloud, render
 from g3r.geometry import RigidPose
 from g3r.geometry.quaternion import rotation_from_quaternion
+from g3r.registration.open_strain import mean_normals, open_strain
 from tests.fitting.scene import fit, make_slices, true_cloud, true_volume
 from tests.gaussians.scenes import cloud_of
 

@@ -1,0 +1,61 @@
+"""The strain of the head that slices of two orientations leave open.
+
+Let n and m be the normals of two stacks and E a multiple of n m^T + m n^T. The motion x -> x + a E x of the head keeps
+every slice of either stack a rigid plane, to first order: E has no part within a slice, where one of its two factors is
+zero. Slices shift along the other normal and tilt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+
+MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
+"""Singular values of the map from strains to what slices of all stacks see of them in plane: the least one of an open
+strain, and the next one. The first lets further stacks be 10 degrees from one of two orientations; the second asks for
+45 degrees between the two, since slices of one orientation leave more than one strain open."""
+
+MIN_LENGTH = 0.5
+"""Of the mean of a stack's unit normals. Where it is shorter its slices have no orientation in common, as those of a
+radial scan."""
+
+
+def mean_normals(slices: Slices) -> NDArray[np.float64]:
+    """The mean of the unit normals of each stack [n_stacks, 3]; the shorter, the more its slices are turned."""
+    normal = slices.planes.rotation[:, :, 2]
+    return np.stack([normal[slices.stack_id == stack].mean(0) for stack in np.unique(slices.stack_id)])
+
+
+def open_strain(normals: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The strain [3, 3] that no stack sees in plane; None where there is not exactly one.
+
+    Args:
+        normals: [n_stacks, 3] see `mean_normals`.
+    """
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if length.min() < MIN_LENGTH:
+        return None
+    normals = normals / length
+    units = [np.outer(one, other) for one in np.eye(3) for other in np.eye(3)]
+    strains = [unit + unit.T for unit in np.array(units)[[0, 1, 2, 4, 5, 8]]]
+    strains = [strain / np.linalg.norm(strain) for strain in strains]
+    in_plane = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    seen = np.stack([(in_plane @ strain @ in_plane).ravel() for strain in strains], axis=1)
+    _, size, combinations = np.linalg.svd(seen, full_matrices=False)
+    if size[-1] > MAX_CLOSED or size[-2] < MIN_OTHERS:
+        return None
+    return np.einsum("n,nij->ij", combinations[-1], np.stack(strains))
+
+
+def tilts(normals: NDArray[np.float64], strain: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors [K, 3] that keep rigid planes in a head that is strained, per unit of an open strain.
+
+    Args:
+        normals: [K, 3] unit normals of the planes.
+        strain: [3, 3] see `open_strain`.
+    """
+    out_of_plane = normals @ strain
+    out_of_plane -= normals * (out_of_plane * normals).sum(1, keepdims=True)
+    return np.cross(out_of_plane, normals)
