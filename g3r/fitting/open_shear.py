@@ -18,6 +18,7 @@ from g3r.acquisition.planes import Slices
 from g3r.fitting.parameters import FitParameters
 from g3r.registration.open_strain import mean_normals, open_strain
 
+
 @dataclass(frozen=True, kw_only=True)
 class OpenShear:
     """How Gaussians and slices move together per unit of the shear.
