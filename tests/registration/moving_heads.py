@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
@@ -13,6 +14,7 @@ from g3r.acquisition.slicing import slices_from_stacks
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid_robust
 from g3r.registration import Registration
+from g3r.registration.open_strain import mean_normals, open_strain, tilts
 
 STILL = MotionLevel()
 
@@ -102,3 +104,12 @@ def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, translation_mm: 
 def rotation_angle_deg(rotation: np.ndarray) -> float:
     """Angle of a rotation [3, 3]."""
     return float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+
+
+def sheared(slices: Slices, amount: float) -> Slices:
+    """Slices that follow a shear of the head which changes none of their pixels, to first order."""
+    strain, pose = open_strain(mean_normals(slices)), slices.planes.pose
+    assert strain is not None
+    turn = Rotation.from_rotvec(amount * tilts(pose.rotation[:, :, 2], strain)).as_matrix()
+    moved = pose.translation_mm + amount * pose.translation_mm @ strain
+    return slices.with_pose(RigidPose(turn @ pose.rotation, moved))

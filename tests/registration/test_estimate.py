@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_synth.motion import LEVELS
+from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
 from g3r.registration.atlas_frame import centred_on_headers
-from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm
+from g3r.registration.motion_shear import motion_shear
+from tests.registration.moving_heads import Moving, as_slices, pixel_errors_mm, sheared, simulated
 
 OFF = RegistrationSettings(template=False, network=False, stacks=False, segments=False, n_rounds=0, finest_voxel_mm=1.8)
 
@@ -101,7 +104,8 @@ def test_proposals_are_initialisations_like_the_others(moving: Moving) -> None:
     settings = replace(OFF, network=True)
     estimate = register(moving.slices, settings, proposals=proposals)
     assert estimate.initialisation == "oracle"
-    assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 1e-6
+    # two of the three stacks ended up parallel, so a little of an open shear is taken out
+    assert np.median(pixel_errors_mm(estimate.slices, moving.truth)) < 0.01
     deaf = register(moving.slices, replace(settings, network=False), proposals=proposals)
     assert set(deaf.initialisations) == {"headers"}
 
@@ -118,3 +122,19 @@ def test_the_common_motion_of_all_slices_is_removed(still: list[SimulatedStack])
     distance = np.linalg.norm(found.planes.center_mm - slices.planes.center_mm, axis=1)
     assert distance[usual].max() < 0.2
     assert distance[~usual].min() > 20
+
+
+def test_poses_of_two_stacks_do_not_keep_a_shear_that_motion_is_not_likely_to_have(head: Phantom) -> None:
+    slices, truth = as_slices(simulated(head, LEVELS["mild"], n_stacks=2, seed=4))
+    true = slices.with_motion(truth)
+    astray = sheared(true, 0.03)
+    estimate = register(slices, replace(OFF, network=True), proposals={"network": astray.world_from_header()})
+    assert estimate.initialisation == "network"
+    amounts = []
+    for found in (true, astray, estimate.slices):
+        shear = motion_shear(found, [2, 2])
+        assert shear is not None
+        amounts.append(abs(shear.amount))
+    of_truth, of_proposal, of_estimate = amounts
+    assert of_truth < 0.2 * of_proposal
+    assert of_estimate < 0.6 * of_proposal

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from data_synth.motion import MotionLevel, slice_trajectory
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import fit_rigid
 from g3r.registration.motion_shear import SHEAR_ERROR, motion_shear, without_excess_shear
-from g3r.registration.open_strain import mean_normals, open_strain, tilts
+from g3r.registration.open_strain import mean_normals, open_strain
 from tests.gaussians.scenes import slices_of, stack_planes
+from tests.registration.moving_heads import sheared
 
 N, SPACING_MM = 24, 3.0
 WALK = MotionLevel(walk_deg=0.3, walk_mm=0.15, offset_deg=3.0, offset_mm=2.0)
@@ -30,15 +30,6 @@ def walked(slices: Slices, interleave: int, seed: int, level: MotionLevel = WALK
     rng, n_stacks = np.random.default_rng(seed), slices.n_stacks
     walks = [slice_trajectory(len(slices) // n_stacks, level, np.zeros(3), interleave, rng) for _ in range(n_stacks)]
     return slices.with_motion(RigidPose.concatenated(walks))
-
-
-def sheared(slices: Slices, amount: float) -> Slices:
-    """Slices that follow a shear of the head which changes none of their pixels, to first order."""
-    strain, pose = open_strain(mean_normals(slices)), slices.planes.pose
-    assert strain is not None
-    turn = Rotation.from_rotvec(amount * tilts(pose.rotation[:, :, 2], strain)).as_matrix()
-    moved = pose.translation_mm + amount * pose.translation_mm @ strain
-    return slices.with_pose(RigidPose(turn @ pose.rotation, moved))
 
 
 def apart_mm(one: Slices, other: Slices) -> float:
