@@ -113,9 +113,8 @@ def motion_shear(slices: Slices, interleave: Sequence[int | None]) -> MotionShea
     of_shift, of_turn = slope[:, :3], LEVER_MM * slope[:, 3:] + np.cross(center, slope[:, :3])
     variance = 0.0
     for own, order in zip(rows, interleave, strict=True):
-        time = np.argsort(acquisition_order(int(slices.slice_index[own].max()) + 1, order or 1))[
-            slices.slice_index[own]
-        ]
+        number = slices.slice_index[own]
+        time = np.argsort(acquisition_order(int(number.max()) + 1, order or 1))[number]
         first = np.argsort(time)
         own, time = own[first], time[first]
         about_middle = shift[own] - np.cross(turn[own], center[own])

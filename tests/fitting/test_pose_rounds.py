@@ -109,6 +109,22 @@ def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: p
     assert maker.last == [True]  # the first V_prior was a quick one
 
 
+def test_each_round_leaves_no_more_of_an_open_shear_than_motion_is_likely_to_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken_out: list[Slices] = []
+
+    def without(slices: Slices, interleave: list[int | None]) -> Slices:
+        assert interleave == [None] * 3
+        taken_out.append(slices.with_motion(slices.world_from_header()))
+        return taken_out[-1]
+
+    monkeypatch.setattr(pose_rounds, "without_excess_shear", without)
+    found, _ = run(registration_of(moved_away(make_slices())), 1)
+    assert found.record.n_kept == 1
+    assert found.registration.slices is taken_out[0]
+
+
 def test_rounds_follow_the_number_of_stacks_and_a_single_one_has_them_only_where_the_prior_holds_it() -> None:
     rounds = PoseRoundSettings(single_stack=1, two_stacks=2, more_stacks=3)
     assert [rounds.n_rounds(n) for n in (1, 2, 3, 12)] == [1, 2, 3, 3]
