@@ -31,8 +31,9 @@ REGISTRATION_FROM_S = {"preview": 0.0, "fast": 18.0, "balanced": 36.0, "accurate
 """Budget from which on registration searches as in a preset: about the whole command's own seconds on two
 cores, from one preset to the next."""
 
-PRIOR_FROM_S = 10.0
-"""Seconds left at the start from which on the prior network is used: the import of its libraries takes two of them."""
+PRIOR_FROM_S = 13.0
+"""Seconds left at the start from which on the prior network is used. The import of its libraries takes two of them, and
+with fewer seconds in all there is often no time left for the network itself, on two cores and a 30-week head."""
 
 REGISTRATION_SHARE = 0.5
 """Largest share of the remaining time that registration may take."""
@@ -114,8 +115,7 @@ class TimeBudget:
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"time budget {seconds}; expected a positive number of seconds")
         if seconds - spent_s < PRIOR_FROM_S:
-            least_mm = PRESETS["preview"].least_squares_voxel_mm
-            settings = replace(settings, use_prior=False, prior_views=0, least_squares_voxel_mm=least_mm)
+            settings = _by_least_squares(settings)
         deadline = replace(Deadline.after(seconds - spent_s), loop_record=LoopRecord())
         return cls(settings=settings, deadline=deadline, given_s=seconds)
 
@@ -149,8 +149,10 @@ class TimeBudget:
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
         pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
-        if not self.settings.use_prior or self.deadline.remaining_s < WRITING_S + VOLUME_AT_END * coarse_s + view_s:
-            self.settings = replace(self.settings, use_prior=False, prior_views=0)
+        if not self.settings.use_prior:
+            self.settings = replace(self.settings, prior_views=0)
+        elif self.deadline.remaining_s < WRITING_S + VOLUME_AT_END * coarse_s + view_s:
+            self.settings = _by_least_squares(self.settings)
         self.choices |= {"prior_views": self.settings.prior_views, "pose_rounds": pose_rounds.two_stacks}
 
     def for_fit_to_prior(self, prior: PriorVolume, coarse_s: float, n_output_voxels: int) -> Deadline:
@@ -222,6 +224,12 @@ class TimeBudget:
         """The decisions, for run.json."""
         loops = self.deadline.loop_record.loops if self.deadline.loop_record else []
         return BudgetRecord(seconds=self.given_s, loops=loops, **self.choices)
+
+
+def _by_least_squares(settings: ReconstructionSettings) -> ReconstructionSettings:
+    """The settings without the prior network, with the volume of `preview` in its place."""
+    least_mm = PRESETS["preview"].least_squares_voxel_mm
+    return replace(settings, use_prior=False, prior_views=0, least_squares_voxel_mm=least_mm)
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, number: float) -> float:

@@ -143,12 +143,15 @@ def test_without_a_fit_the_prior_volume_is_shown_and_nothing_is_said_of_its_erro
 
 
 def test_the_less_time_the_less_is_done_after_registration() -> None:
-    done = []
+    done, by_least_squares = [], []
     for seconds in (0.5, 2.0, 3.5, 5.0):
         one = budget(seconds, PRESETS["balanced"])
         one.for_prior(1.0)
         done.append(one.settings.use_prior)
+        by_least_squares.append(one.settings.least_squares_voxel_mm)
     assert done == [False, False, True, True]
+    preview_mm = PRESETS["preview"].least_squares_voxel_mm
+    assert by_least_squares == [preview_mm, preview_mm, 0.0, 0.0]
 
 
 def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
