@@ -49,11 +49,12 @@ def test_convergence_measures_every_way_against_the_best_of_all() -> None:
 def test_budgets_mark_what_is_late_or_worse_and_nothing_else() -> None:
     given = [(10, 13.0, 30.0), (20, 24.1, 29.95), (30, 30.0, 29.8)]
     more = {"case": "one", "registration": "preview", "fit": "fast", "n_steps": 5, "n_gaussians": 1234}
-    rows = {str(b): {"budget_s": b, "seconds": s, "psnr_db": db, **more} for b, s, db in given}
+    rows = {str(b): {"budget_s": b, "seconds": s, "busy_seconds": s + 0.1, "psnr_db": db, **more} for b, s, db in given}
     text = time_budgets.tables({"rows": rows})["time-budgets"]
     lines = [line for line in text.splitlines() if line.startswith("| one")]
-    assert [line.count("(!)") for line in lines] == [0, 1, 1]
-    assert "24.1 (!)" in lines[1]
+    assert [line.count("(!)") for line in lines] == [1, 2, 1]
+    assert "13.0 | 13.1 (!) |" in lines[0]
+    assert "24.1 (!) | 24.2 (!) |" in lines[1]
     assert "29.80 (!)" in lines[2]
     assert "1,234" in lines[0]
 
