@@ -120,7 +120,13 @@ PRESETS: dict[str, ReconstructionSettings] = {
         use_prior=False,
         prior_views=0,
         registration=replace(
-            _QUICK_SEARCH, network=False, n_rounds=8, finest_voxel_mm=1.1, finest_voxel_pixels=0.9, max_pixels=400_000
+            _QUICK_SEARCH,
+            network=False,
+            n_rounds=8,
+            finest_voxel_mm=1.1,
+            finest_voxel_pixels=0.9,
+            max_pixels=400_000,
+            check_handedness=False,
         ),
     ),
     "fast": replace(

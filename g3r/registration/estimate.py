@@ -17,6 +17,7 @@ from g3r.registration.atlas_frame import Orientation, centred_on_headers, standa
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
+from g3r.registration.handedness import handedness
 from g3r.registration.held_out import estimate_interleave, held_out_score
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
 from g3r.registration.motion_shear import without_excess_shear
@@ -55,6 +56,7 @@ class Registration:
         history: figures of each round.
         profiles: of each stack, missing slices included.
         overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
+        handedness: of each stack, see `registration.handedness`; None where it was not asked for.
     """
 
     slices: Slices
@@ -70,6 +72,7 @@ class Registration:
     history: list[dict[str, float]] = field(default_factory=list)
     profiles: list[AreaProfile] = field(default_factory=list)
     overlap: Overlap | None = None
+    handedness: list[float | None] | None = None
 
     def __repr__(self) -> str:
         frame = "scanner frame" if self.orientation is None else "atlas frame"
@@ -126,6 +129,9 @@ def register(
         rng = np.random.default_rng(settings.seed)
         orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
     pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
+    hands = None
+    if orientation is not None and not single and settings.check_handedness:
+        hands = handedness(fitted.slices.with_pose(pose), fitted.gain, settings.seed)
     return Registration(
         slices=without_excess_shear(given.with_pose(pose), interleave),
         gain=fitted.gain,
@@ -140,6 +146,7 @@ def register(
         history=fitted.history,
         profiles=[sample.profile for sample in samples],
         overlap=overlap,
+        handedness=hands,
     )
 
 

@@ -187,6 +187,19 @@ def held_out_score(
     return HeldOutScore(predictions)
 
 
+def fine_volume_without(slices: Slices, stack: int) -> tuple[NDArray[np.float32], NDArray[np.float32], VolumeGrid]:
+    """A volume from all slices except those of one stack, finer than that of the search; where it was seen; the grid.
+
+    Args:
+        slices: all slices at their present poses, gains divided out.
+        stack: the one to hold out.
+    """
+    operator, values, grid = _of_others(slices, stack, FINE_VOXEL_MM, None, FINE_PIXELS_OF_VOLUME)
+    weight = np.ones(len(values), np.float32)
+    volume = solve_volume(operator, values, weight, n_iterations=8, smoothness=0.1)
+    return volume, coverage_share(operator.adjoint(weight)), grid
+
+
 def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> list[float]:
     """How well the masked pixels of each stack are predicted by the others, finely enough to tell poses 0.3 mm apart.
 
@@ -204,10 +217,7 @@ def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> lis
     evened = replace(slices, value=value)
     found = []
     for stack in np.unique(slices.stack_id):
-        operator, values, grid = _of_others(evened, stack, FINE_VOXEL_MM, None, FINE_PIXELS_OF_VOLUME)
-        weight = np.ones(len(values), np.float32)
-        volume = solve_volume(operator, values, weight, n_iterations=8, smoothness=0.1)
-        share = coverage_share(operator.adjoint(weight))
+        volume, share, grid = fine_volume_without(evened, stack)
         own = evened.take(evened.stack_id == stack)
         index = own.pixel_index[:: max(1, len(own.pixel_index) // FINE_PIXELS_OF_VOLUME)]
         sampling = VoxelOperator(own.planes, grid, index, (1, 1, 5))

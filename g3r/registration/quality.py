@@ -22,6 +22,7 @@ from g3r.registration.thresholds import (
     MIN_NCC,
     MIN_OVERLAP_CORRELATION,
     MIN_OVERLAP_SHARE,
+    MIRRORED_BELOW,
 )
 
 
@@ -41,6 +42,8 @@ class StackQuality:
         overlap_share: share of its pixels that other stacks saw; None for a single stack, and where no stack
             lacks slices.
         overlap_correlation: with the other stacks over those pixels.
+        handedness: whether it shows the asymmetry of the head as the others do (`registration.handedness`); None where
+            that was not asked for or cannot be said.
     """
 
     reliable: bool | None
@@ -52,6 +55,7 @@ class StackQuality:
     is_cut: bool = False
     overlap_share: float | None = None
     overlap_correlation: float | None = None
+    handedness: float | None = None
 
     def record(self) -> dict[str, Any]:
         """For run.json."""
@@ -98,10 +102,16 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             downweighted_share=downweighted,
             overlap_share=share,
             overlap_correlation=correlation,
+            handedness=None if registration.handedness is None else registration.handedness[present.index(n)],
             **missing,
         )
-        found.append(one if held_out is None else replace(one, reliable=not shortfalls(one)))
+        found.append(one if held_out is None else replace(one, reliable=not (shortfalls(one) or is_mirrored(one))))
     return found
+
+
+def is_mirrored(one: StackQuality) -> bool:
+    """Whether the stack seems to be a mirror image of what the others show."""
+    return one.handedness is not None and one.handedness < MIRRORED_BELOW
 
 
 def shortfalls(one: StackQuality) -> list[str]:
@@ -143,6 +153,11 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
     for stack, one in zip(stacks, qualities, strict=True):
         if one.median_slice_ncc is None:
             lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
+        elif is_mirrored(one) and not shortfalls(one):
+            lines.append(
+                f"{stack.name}: probably a mirror image of what the other stacks show (handedness "
+                f"{one.handedness:.2f}); do not rely on the volume"
+            )
         elif one.reliable is False:
             lines.append(
                 f"{stack.name}: registration probably failed (correlation with the other stacks "

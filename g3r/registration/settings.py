@@ -24,6 +24,7 @@ class RegistrationSettings:
             thickness): in a volume of smaller voxels each slice finds itself, wherever it is.
         max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
+        check_handedness: ask whether a stack is a mirror image of the others, where the standard orientation is known.
         seed: of the random search.
     """
 
@@ -40,4 +41,5 @@ class RegistrationSettings:
     finest_voxel_pixels: float = 0.0
     max_pixels: int = 400_000
     standard_orientation: bool = True
+    check_handedness: bool = True
     seed: int = 0

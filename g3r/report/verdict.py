@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.planning.anatomy import NAME_OF
-from g3r.registration.quality import shortfalls
-from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, RETRY_BELOW_CORRELATION
+from g3r.registration.quality import is_mirrored, shortfalls
+from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
@@ -47,6 +47,13 @@ MESSAGES = {
         DO_NOT_USE,
         "{stack} does not fit the other stacks ({shortfalls})",
         "Leave that stack out and run again, or check that it shows the same head and that its mask is right.",
+    ),
+    "stack mirrored": Message(
+        DO_NOT_USE,
+        "{stack} seems to be a mirror image of what the other stacks show (handedness {handedness}; good is above "
+        "{good:g})",
+        "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
+        "as left may be right. Find out which one is wrong, leave it out, and run again.",
     ),
     "stack not used": Message(
         DO_NOT_USE,
@@ -221,6 +228,10 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if quality is None:
         return
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
+    if is_mirrored(quality):
+        yield "stack mirrored", facts | {"handedness": f"{quality.handedness:.2f}", "good": MIRRORED_BELOW}
+        if not shortfalls(quality):
+            return
     if quality.reliable is False:
         why = "; ".join(shortfalls(quality))
         yield "stack not used" if quality.median_slice_ncc is None else "stack failed", facts | {"shortfalls": why}
@@ -251,5 +262,5 @@ def _is_said_otherwise(line: str, record: RunRecord) -> bool:
     """Whether a warning of the run has a message of its own in the table."""
     if line.startswith("the loss of the fit rose: "):
         return record.n_rollbacks > 0
-    ends = ("registration probably failed", "no slice with enough masked pixels")
+    ends = ("registration probably failed", "probably a mirror image of", "no slice with enough masked pixels")
     return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)

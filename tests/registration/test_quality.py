@@ -13,7 +13,14 @@ from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.overlap import Overlap
 from g3r.registration.quality import StackQuality, pose_warnings, registration_summary, stack_qualities
-from g3r.registration.thresholds import IN_PLACE_NCC, LEEWAY, MIN_HELD_OUT, MIN_NCC, MIN_OVERLAP_CORRELATION
+from g3r.registration.thresholds import (
+    IN_PLACE_NCC,
+    LEEWAY,
+    MIN_HELD_OUT,
+    MIN_NCC,
+    MIN_OVERLAP_CORRELATION,
+    MIRRORED_BELOW,
+)
 from tests.registration.moving_heads import STILL, Moving, as_slices, simulated
 
 QUICK = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=2, finest_voxel_mm=1.8)
@@ -80,6 +87,7 @@ def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[f
     return SimpleNamespace(
         profiles=[],
         overlap=None,
+        handedness=None,
         slices=SimpleNamespace(stack_id=np.array(ids)),
         held_out=held_out,
         ncc=np.array(ncc),
@@ -122,6 +130,19 @@ def test_a_good_fit_counts_where_others_saw_the_stack(share: float, reliable: bo
     estimate = estimate_with([0.8, 0.8], [IN_PLACE_NCC] * 2, [1.0] * 2, [0, 1])
     estimate.overlap = SimpleNamespace(stack_share=[1.0, share], correlation=[0.9, MIN_OVERLAP_CORRELATION - LEEWAY])
     assert [one.reliable for one in stack_qualities(estimate, 2)] == [True, reliable]
+
+
+@pytest.mark.parametrize(("hand", "reliable"), [(0.2, True), (None, True), (MIRRORED_BELOW - 0.01, False)])
+def test_a_mirror_image_is_not_reliable_and_called_by_its_name(
+    still: list[SimulatedStack], hand: float | None, reliable: bool
+) -> None:
+    estimate = estimate_with([0.8, 0.8], [0.95] * 2, [1.0] * 2, [0, 2])
+    estimate.handedness = [0.2, hand]
+    found = stack_qualities(estimate, 3)
+    assert [one.reliable for one in found] == [True, False, reliable]
+    lines = pose_warnings(estimate, found, [one.stack for one in still])[1:]
+    assert len(lines) == (0 if reliable else 1)
+    assert all(line.startswith(f"{still[2].stack.name}: probably a mirror image") for line in lines)
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]) -> None:

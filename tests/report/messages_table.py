@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from g3r.bench.record import markdown_table, put_between_markers
-from g3r.registration.thresholds import RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict import CHECK, DO_NOT_USE, MESSAGES, USE
 from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
 from tests.rooms import REPOSITORY
@@ -25,6 +25,7 @@ FILLED_IN = {
     "best": "N",
     "rival": "N",
     "what": "brain",
+    "handedness": "N",
     "shortfalls": "what is bad of it, and what is good",
 }
 
@@ -44,7 +45,8 @@ def table() -> str:
     for word in (DO_NOT_USE, CHECK, USE):
         for name, message in MESSAGES.items():
             if message.word == word:
-                facts = FILLED_IN | {"good": RETRY_BELOW_CORRELATION, "line": LINES.get(name, "")}
+                good = MIRRORED_BELOW if name == "stack mirrored" else RETRY_BELOW_CORRELATION
+                facts = FILLED_IN | {"good": good, "line": LINES.get(name, "")}
                 rows.append([word, message.text.format(**facts), message.advice])
     return markdown_table(["verdict", "what it says", "what it advises"], rows).replace("---:", "---")
 

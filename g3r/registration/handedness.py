@@ -1,0 +1,107 @@
+"""Whether each stack shows the head as the others do, or its mirror image.
+
+Slices that are stored in reverse order, or a header that swaps two sides, make a mirrored head. Heads are nearly
+symmetric, so registration finds a place for it, and no other check notices: the volume mixes left and right. What
+gives it away is the part of the head that changes its sign at the mid-sagittal plane. It is found as the difference of
+a volume of the other stacks and its mirror image.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.held_out import fine_volume_without
+from g3r.registration.normal_equations import SliceModel
+from g3r.registration.pose_sampling import perturbed
+from g3r.registration.similarity import SearchPixels, correlation
+from g3r.registration.slice_registration import register_slices
+from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW
+
+logger = logging.getLogger(__name__)
+
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+"""In the atlas frame: swaps left and right."""
+
+ROUNDS = ((5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
+"""Random rotations (degrees) and translations (mm) of a stack in the mirrored volume, round by round."""
+
+N_CANDIDATES, PIXELS_PER_SLICE, MAX_PIXELS = 300, 200, 60_000
+
+N_STEPS = 5
+"""Gauss-Newton steps of each slice, in the volume and in its mirror image, where a stack is suspected."""
+
+MIN_CORRELATION = 0.5
+"""Of pixels with the symmetric part of the volume; below, the stack shows something else, and nothing is said."""
+
+
+def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list[float | None]:
+    """Whether each stack shows the asymmetry of the head as the others do.
+
+    Args:
+        slices: of two or more stacks, in the atlas frame (`Orientation`).
+        gain: [K] intensity factors.
+        seed: of the search in the mirrored volume.
+
+    Returns:
+        For each stack the correlation of its masked pixels with the antisymmetric part of the head, after the symmetric
+        part was taken out of both: above zero for the same head, near zero for a symmetric one, and below
+        `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said.
+    """
+    value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
+    evened, rng = replace(slices, value=value), np.random.default_rng(seed)
+    found = [_of_stack(evened, int(stack), rng) for stack in np.unique(slices.stack_id)]
+    logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found))
+    return found
+
+
+def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | None:
+    volume, _, grid = fine_volume_without(slices, stack)
+    own = slices.take(slices.stack_id == stack)
+    mirrored = VolumeGrid(grid.shape, MIRROR @ grid.affine)
+    moved = _moved_as_one(own, volume, mirrored, rng)
+    stride = max(1, len(own.pixel_index) // MAX_PIXELS)
+    here, there = SliceModel(own, volume, grid, stride=stride), SliceModel(moved, volume, mirrored, stride=stride)
+    first = _antisymmetric(here.value, here.operator.forward(volume), there.operator.forward(volume))
+    if first is None or first >= MIRROR_SUSPECTED_BELOW:
+        return first
+    return _antisymmetric(here.value, _registered(here, own), _registered(there, moved))
+
+
+def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
+    """The slices of a stack after the one motion that fits a volume best."""
+    pixels, motion = SearchPixels.of(own, PIXELS_PER_SLICE), RigidPose.identity(1)
+    for rotation_deg, translation_mm in ROUNDS:
+        candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
+        motion = candidate.take([int(correlation(pixels.moments(volume, grid, candidate).sum(1)).argmax())])
+    return own.with_pose(motion.take(np.zeros(len(own), int)) @ own.planes.pose)
+
+
+def _registered(model: SliceModel, slices: Slices) -> NDArray[np.float32]:
+    """What a volume says of the pixels after each slice was registered to it."""
+    gain = np.ones(len(slices))
+    width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
+    placed, gain, _ = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)
+    operator: VoxelOperator = model.operator
+    operator.move(placed.planes)
+    return (operator.forward(model.volume) * gain[operator.plane]).astype(np.float32)
+
+
+def _antisymmetric(
+    value: NDArray[np.float32], here: NDArray[np.float32], mirrored: NDArray[np.float32]
+) -> float | None:
+    """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both."""
+    both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
+    targets = np.stack([value, here - mirrored], 1).astype(np.float64)
+    if min(value.std(), both[:, 1].std()) == 0 or np.corrcoef(value, both[:, 1])[0, 1] ** 2 < MIN_CORRELATION**2:
+        return None
+    left = targets - both @ np.linalg.lstsq(both, targets, rcond=None)[0]
+    spread = left.std(0)
+    return float((left[:, 0] * left[:, 1]).mean() / spread.prod()) if spread.min() > 0 else None

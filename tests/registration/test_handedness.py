@@ -1,0 +1,92 @@
+"""A stack that is a mirror image of the others is told from one that is not, whatever else is wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.phantom import Phantom
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.planes import Slices
+from g3r.geometry import RigidPose
+from g3r.registration import RegistrationSettings, register
+from g3r.registration.handedness import handedness
+from g3r.registration.thresholds import MIRRORED_BELOW
+from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed
+
+
+@pytest.fixture(scope="module")
+def mirrored(head: Phantom) -> list[SimulatedStack]:
+    """The stacks of the head with left and right swapped, at the same places."""
+    assert np.allclose(
+        head.affine[:3, 3], -head.affine[:3, :3] @ (np.array(head.t2.shape) - 1) / 2
+    )  # x = 0 is its middle
+    return simulated(replace(head, t2=head.t2[::-1], mask=head.mask[::-1]))
+
+
+def found(stacks: list[SimulatedStack], seed: int = 0, *, mm: float = 0.0) -> list[float]:
+    slices = as_slices(stacks)[0]
+    of_stacks = handedness(slices_disturbed(slices, mm, mm, seed), np.ones(len(slices)))
+    assert all(one is not None for one in of_stacks)
+    return [one for one in of_stacks if one is not None]
+
+
+@pytest.mark.parametrize("mm", [0.0, 0.4])
+def test_stacks_of_one_head_have_its_hand(still: list[SimulatedStack], mm: float) -> None:
+    assert min(found(still, mm=mm)) > 0.05
+    assert min(found(still[:2], mm=mm)) > 0.05
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+@pytest.mark.parametrize("mm", [0.0, 0.4])
+def test_the_mirrored_one_of_three_is_found(
+    still: list[SimulatedStack], mirrored: list[SimulatedStack], which: int, mm: float
+) -> None:
+    of_stacks = found([mirrored[n] if n == which else one for n, one in enumerate(still)], mm=mm)
+    assert np.argmin(of_stacks) == which
+    assert of_stacks[which] < MIRRORED_BELOW
+
+
+def test_of_two_each_is_the_mirror_image_of_the_other(
+    still: list[SimulatedStack], mirrored: list[SimulatedStack]
+) -> None:
+    assert max(found([still[0], mirrored[1]])) < MIRRORED_BELOW
+
+
+def test_a_head_that_is_mirrored_as_a_whole_agrees_with_itself(mirrored: list[SimulatedStack]) -> None:
+    assert min(found(mirrored)) > 0.05
+
+
+def test_gains_and_brightness_do_not_count(still: list[SimulatedStack]) -> None:
+    slices = as_slices(still)[0]
+    gain = np.exp(np.random.default_rng(0).normal(0, 0.2, len(slices)))
+    brighter = replace(slices, value=(slices.value * 5 * gain[slices.planes.plane_id()]).astype(np.float32))
+    plain, scaled = handedness(slices, np.ones(len(slices))), handedness(brighter, gain)
+    assert scaled == pytest.approx(plain, abs=0.01)
+
+
+def test_nothing_is_said_of_a_stack_that_shows_something_else(still: list[SimulatedStack]) -> None:
+    slices = as_slices(still)[0]
+    rng, of_one = np.random.default_rng(0), slices.stack_id[slices.planes.plane_id()] == 1
+    value = np.where(of_one, rng.uniform(0, 1, slices.value.shape), slices.value).astype(np.float32)
+    noise = handedness(replace(slices, value=value), np.ones(len(slices)))
+    assert noise[1] is None
+
+
+def test_an_even_stack_is_no_error(still: list[SimulatedStack]) -> None:
+    slices = as_slices(still)[0]
+    assert handedness(replace(slices, value=np.ones_like(slices.value)), np.ones(len(slices))) == [None] * 3
+
+
+def test_registration_asks_where_it_knows_the_orientation(moving: Moving) -> None:
+    assert moving.estimate.orientation is not None
+    assert moving.estimate.handedness is not None
+    assert len(moving.estimate.handedness) == 3
+    assert all(one is None or one > MIRRORED_BELOW for one in moving.estimate.handedness)
+
+
+def test_registration_does_not_ask_where_it_does_not(still_slices: tuple[Slices, RigidPose]) -> None:
+    quick = RegistrationSettings(network=False, stacks=False, segments=False, n_rounds=1, finest_voxel_mm=1.8)
+    assert register(still_slices[0], quick).handedness is None
