@@ -121,6 +121,7 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "is_cut": False,
         "overlap_share": None,
         "overlap_correlation": None,
+        "handedness": None,
     }
 
 
