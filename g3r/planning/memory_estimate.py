@@ -84,7 +84,10 @@ def estimate_memory(
     start = held_bytes() + _libraries_to_come(settings) if process_bytes is None else process_bytes
     buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
-    base = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
+    libraries = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) - (
+        0 if settings.n_lattices else FIT_LIBRARIES
+    )
+    base = libraries + SLICES_PER_PIXEL * n_pixels
     volumes = base + VOLUMES_PER_VOXEL * voxels
     projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
@@ -106,6 +109,9 @@ def estimate_memory(
     stages[Stage.WRITING] = outputs + WRITING_PER_VOXEL * output
     if not settings.n_lattices:
         stages[Stage.PRIOR] = max(stages.get(Stage.PRIOR, 0), volumes + rim)  # by least squares
+        # masks are read from the prior's grid, and there are no maps to write
+        stages[Stage.VOLUME] = outputs + READ_MASKS_PER_VOXEL * output
+        stages[Stage.WRITING] = outputs + WRITING_ALONE_PER_VOXEL * output
         return MemoryEstimate({name: round(start + own) for name, own in stages.items()})
     stages |= {
         Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
@@ -130,6 +136,8 @@ def estimate_memory(
 # What the compiler holds in a run that finds no kernel compiled counts as a library: 95 MB, by the peaks of a small
 # run with NUMBA_CACHE_DIR at an empty folder and again at the same one. SimpleITK takes another 80 MB.
 LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 315_000_000, 275_000_000
+FIT_LIBRARIES = 90_000_000  # the part of these, beside torch, that a run without Gaussians does not load or compile
+READ_MASKS_PER_VOXEL, WRITING_ALONE_PER_VOXEL = 12, 14  # of such a run
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 REGISTRATION_PER_PIXEL = 150

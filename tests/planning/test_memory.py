@@ -203,6 +203,14 @@ def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRu
     assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
 
 
+def test_a_preview_states_what_it_needs_without_torch_and_maps(subject: Path, tmp_path: Path) -> None:
+    given = [word if word != "1.5" else "0.5" for word in arguments(subject, tmp_path / "out")]
+    run = run_infer([*given, "--preset", "preview", "--threads", "1", "--quiet"], tmp_path / "out")
+    said = run.record.memory
+    assert said is not None
+    assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
+
+
 def test_a_limited_run_stays_below_it_and_gives_the_same_volume(
     subject: Path, unlimited: tuple[CommandRun, np.ndarray], tmp_path: Path
 ) -> None:
