@@ -23,7 +23,7 @@ from g3r.registration.normal_equations import SliceModel
 from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity import SearchPixels, correlation
 from g3r.registration.slice_registration import register_slices
-from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW
+from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW
 
 logger = logging.getLogger(__name__)
 
@@ -57,8 +57,19 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
     """
     value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
     evened, rng = replace(slices, value=value), np.random.default_rng(seed)
-    found = [_of_stack(evened, int(stack), rng) for stack in np.unique(slices.stack_id)]
-    logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found))
+    found = _of_all(evened, rng)
+    logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found.values()))
+    return list(found.values())
+
+
+def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, float | None]:
+    """By number of the stack; where one of more than two is mirrored, the others are asked again without it."""
+    stacks = np.unique(slices.stack_id).tolist()
+    found = {stack: _of_stack(slices, stack, rng) for stack in stacks}
+    known = {stack: one for stack, one in found.items() if one is not None}
+    if len(stacks) > 2 and known and min(known.values()) < MIRRORED_BELOW:
+        lowest = min(known, key=lambda stack: known[stack])
+        found |= _of_all(slices.take(slices.stack_id != lowest), rng)
     return found
 
 

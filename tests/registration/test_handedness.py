@@ -47,6 +47,7 @@ def test_the_mirrored_one_of_three_is_found(
     of_stacks = found([mirrored[n] if n == which else one for n, one in enumerate(still)], mm=mm)
     assert np.argmin(of_stacks) == which
     assert of_stacks[which] < MIRRORED_BELOW
+    assert min(one for n, one in enumerate(of_stacks) if n != which) > 0.05  # as without it
 
 
 def test_of_two_each_is_the_mirror_image_of_the_other(
