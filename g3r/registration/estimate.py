@@ -123,15 +123,17 @@ def register(
         rigid = [sample.stack for sample, n in zip(samples, n_segments, strict=True) if n == 1]
         fitted, held_out = _with_rigid_stacks(slices, samples, rigid, found, fitted, settings)
     overlap = overlap_of(slices, samples, fitted.slices.world_from_header()) if missing else None
-    orientation = None
-    if found.placed is not None and settings.standard_orientation:
+    orientation, hands = None, None
+    asks = settings.check_handedness and not single
+    if found.placed is not None and (settings.standard_orientation or asks):
         start = found.placed.motion(len(slices), samples)
         rng = np.random.default_rng(settings.seed)
         orientation = standard_orientation(fitted.slices, found.placed.templates, start, rng)
+        if orientation is not None and asks:
+            hands = handedness(fitted.slices.with_pose(orientation.pose), fitted.gain, settings.seed)
+    if not settings.standard_orientation:
+        orientation = None
     pose = centred_on_headers(fitted.slices).planes.pose if orientation is None else orientation.pose
-    hands = None
-    if orientation is not None and not single and settings.check_handedness:
-        hands = handedness(fitted.slices.with_pose(pose), fitted.gain, settings.seed)
     return Registration(
         slices=without_excess_shear(given.with_pose(pose), interleave),
         gain=fitted.gain,

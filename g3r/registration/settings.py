@@ -24,7 +24,7 @@ class RegistrationSettings:
             thickness): in a volume of smaller voxels each slice finds itself, wherever it is.
         max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
-        check_handedness: ask whether a stack is a mirror image of the others, where the standard orientation is known.
+        check_handedness: ask whether a stack is a mirror image of the others, where an atlas template fits.
         seed: of the random search.
     """
 

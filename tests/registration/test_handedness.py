@@ -9,6 +9,7 @@ import pytest
 
 from data_synth.phantom import Phantom
 from data_synth.simulator import SimulatedStack
+from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
@@ -86,6 +87,16 @@ def test_registration_asks_where_it_knows_the_orientation(moving: Moving) -> Non
     assert moving.estimate.handedness is not None
     assert len(moving.estimate.handedness) == 3
     assert all(one is None or one > MIRRORED_BELOW for one in moving.estimate.handedness)
+
+
+def test_it_asks_in_the_frame_of_the_scanner_too(moving: Moving, template: AtlasTemplate) -> None:
+    quick = RegistrationSettings(
+        network=False, stacks=False, n_rounds=1, finest_voxel_mm=1.8, standard_orientation=False
+    )
+    found = register(moving.slices, quick, template=template)
+    assert found.orientation is None
+    assert found.handedness is not None
+    assert register(moving.slices, replace(quick, check_handedness=False), template=template).handedness is None
 
 
 def test_registration_does_not_ask_where_it_does_not(still_slices: tuple[Slices, RigidPose]) -> None:
