@@ -24,10 +24,11 @@ from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options, told_options, without_names
 from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
 from g3r.cli.terminal import PROGRAM, Terminal
-from g3r.cli.time_left import TimeLeft, expected_seconds, needs_compiling
+from g3r.cli.time_left import TimeLeft, expected_seconds
 from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
 from g3r.run.idle_threads import let_threads_sleep
+from g3r.run.kernel_cache import needs_compiling
 from g3r.run.lean_import import import_lean, load_nibabel
 from g3r.run.log_file import LOG_NAME, LogFile
 from g3r.run.stop_request import StopRequest

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, WRITING
 
@@ -84,13 +82,6 @@ EVEN = 0.7
 
 NEARLY = 0.97
 """Most that is taken for done of a stage that has not ended."""
-
-
-def needs_compiling() -> bool:
-    """Whether numba will compile: nothing of it lies in the folders that it keeps its results in."""
-    package = Path(__file__).parents[1]
-    folders = [Path(given)] if (given := os.environ.get("NUMBA_CACHE_DIR")) else [package]
-    return not any(next(folder.rglob("kernels*.nbi"), None) for folder in folders)
 
 
 def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[str, float]:

@@ -19,6 +19,7 @@ from g3r.fitting.initial_volumes import MARGIN_MM
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage
+from g3r.run.kernel_cache import needs_compiling
 from g3r.run.machine import held_bytes
 
 GRID_SLACK = 1.1
@@ -133,9 +134,11 @@ def estimate_memory(
 
 
 # Bytes, measured; see the module's docstring.
-# What the compiler holds in a run that finds no kernel compiled counts as a library: 95 MB, by the peaks of a small
-# run with NUMBA_CACHE_DIR at an empty folder and again at the same one. SimpleITK takes another 80 MB.
+# Part of what the compiler holds in a run that finds no kernel compiled counts as a library. By the peaks of a small
+# run with NUMBA_CACHE_DIR at an empty folder and again at the same one it is 250 MB with a fit, 150 MB without one; the
+# rest of the first is added where there is nothing compiled. SimpleITK takes 80 MB.
 LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 315_000_000, 275_000_000
+COMPILER_BYTES = 80_000_000
 FIT_LIBRARIES = 90_000_000  # the part of these, beside torch, that a run without Gaussians does not load or compile
 READ_MASKS_PER_VOXEL, WRITING_ALONE_PER_VOXEL = 12, 14  # of such a run
 SLICES_PER_PIXEL = 45
@@ -154,10 +157,11 @@ SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 
 
 
 def _libraries_to_come(settings: ReconstructionSettings) -> int:
-    """What the libraries will hold that are imported on demand."""
+    """What the libraries will hold that are imported on demand, and the compiler where it has work to do."""
     torch = TORCH_BYTES if settings.n_lattices and "torch" not in sys.modules else 0
     monai = MONAI_BYTES if settings.use_prior and "monai" not in sys.modules else 0
-    return torch + monai
+    compiler = COMPILER_BYTES if settings.n_lattices and needs_compiling("gaussians") else 0
+    return torch + monai + compiler
 
 
 def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: float | None = None) -> ProblemSizes:

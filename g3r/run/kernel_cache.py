@@ -26,6 +26,16 @@ def ensure_kernel_cache() -> None:
         sys.modules["numba"].config.CACHE_DIR = folder
 
 
+def needs_compiling(room: str = "") -> bool:
+    """Whether numba will compile: none of its results lies in the folders that it keeps them in.
+
+    Args:
+        room: package of the kernels that are asked for; all when empty.
+    """
+    folders = [Path(given)] if (given := os.environ.get("NUMBA_CACHE_DIR")) else [PACKAGE]
+    return not any(next(folder.rglob(f"{room}*/**/kernels*.nbi"), None) for folder in folders)
+
+
 def may_write(folder: Path) -> bool:
     """Whether a folder can be written, or made where it does not exist yet."""
     try:

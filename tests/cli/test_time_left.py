@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from g3r.cli.infer_options import parsed_options
-from g3r.cli.time_left import EXPECTED_S, POSE_ROUNDS, TimeLeft, expected_seconds, needs_compiling
+from g3r.cli.time_left import EXPECTED_S, POSE_ROUNDS, TimeLeft, expected_seconds
 from g3r.planning import PRESET_NAMES
 from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
-from g3r.report.stage_words import DOING, FINDING_MASKS, LINES, PREPARING, STARTING, WITHOUT_FACTS, line
+from g3r.report.stage_words import DOING, FINDING_MASKS, LINES, PREPARING, STARTING, WITHOUT_FACTS
 
 STACKS = ("--stacks", "a.nii", "b.nii", "--output", "o")
 
@@ -130,19 +128,3 @@ def test_each_round_is_expected() -> None:
     assert one > 0
     assert rounds_s(2, "accurate") == pytest.approx(2 * one)
     assert rounds_s(2, "fast") > rounds_s(3, "fast") == 0
-
-
-def test_compiled_kernels_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert needs_compiling()
-    (tmp_path / "gaussians_ab").mkdir()
-    (tmp_path / "gaussians_ab" / "kernels.forward-217.py311.nbi").touch()
-    assert not needs_compiling()
-
-
-def test_counts_are_said_as_one_or_several() -> None:
-    assert line("stacks", {"n_stacks": 1, "n_slices": 22, "thickness": "3 mm"}).endswith(
-        "1 stack, 22 slices 3 mm thick"
-    )
-    assert line("head found", {"n_agree": 3, "n_stacks": 3}) == "finding the head: found, 3 of 3 stacks agree"
-    assert line("gaussians", {"n": 2}, resumed=True).endswith("made of 2 Gaussians (from the earlier run)")

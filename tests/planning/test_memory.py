@@ -203,6 +203,16 @@ def test_a_run_states_what_it_needs_and_needs_no_more(unlimited: tuple[CommandRu
     assert run.peak_bytes <= said.stated_bytes <= 1.5 * run.peak_bytes
 
 
+def test_the_compiler_counts_where_it_has_work_to_do(
+    slices: Slices, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    first = estimate_memory(slices, PREVIEW).peak
+    (tmp_path / "gaussians_ab").mkdir()
+    (tmp_path / "gaussians_ab" / "kernels.one.nbi").touch()
+    assert 50 * MB < first - estimate_memory(slices, PREVIEW).peak < 150 * MB
+
+
 def test_a_preview_states_what_it_needs_without_torch_and_maps(subject: Path, tmp_path: Path) -> None:
     given = [word if word != "1.5" else "0.5" for word in arguments(subject, tmp_path / "out")]
     run = run_infer([*given, "--preset", "preview", "--threads", "1", "--quiet"], tmp_path / "out")

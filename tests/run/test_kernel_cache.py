@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from g3r.run import kernel_cache as _kernel_cache
-from g3r.run.kernel_cache import ensure_kernel_cache, may_write
+from g3r.run.kernel_cache import ensure_kernel_cache, may_write, needs_compiling
 
 PACKAGE = Path(_kernel_cache.__file__).parents[1]
 
@@ -89,3 +89,24 @@ def test_may_write(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert not may_write(tmp_path / "file")
     assert not may_write(tmp_path / "file" / "below")
+
+
+def test_compiled_kernels_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert needs_compiling()
+    (tmp_path / "acquisition_ab").mkdir()
+    (tmp_path / "acquisition_ab" / "kernels.scatter-91.py311.nbi").touch()
+    assert not needs_compiling()
+    assert needs_compiling("gaussians")
+    (tmp_path / "gaussians_ab").mkdir()
+    (tmp_path / "gaussians_ab" / "kernels.forward-217.py311.nbi").touch()
+    assert not needs_compiling("gaussians")
+
+
+def test_compiled_kernels_of_the_package_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(_kernel_cache, "PACKAGE", tmp_path)
+    assert needs_compiling("gaussians")
+    (tmp_path / "gaussians" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "gaussians" / "__pycache__" / "kernels.forward-217.py311.nbi").touch()
+    assert not needs_compiling("gaussians")
