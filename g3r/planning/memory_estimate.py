@@ -85,10 +85,8 @@ def estimate_memory(
     start = held_bytes() + _libraries_to_come(settings) if process_bytes is None else process_bytes
     buffers = min(n_threads, MAX_SCATTER_BUFFERS)
     n_pixels, voxels, output = sizes.n_pixels, sizes.prior_voxels, sizes.output_voxels
-    libraries = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) - (
-        0 if settings.n_lattices else FIT_LIBRARIES
-    )
-    base = libraries + SLICES_PER_PIXEL * n_pixels
+    base = (LIBRARIES_LATER_AT_ONCE if at_once else LIBRARIES_LATER) + SLICES_PER_PIXEL * n_pixels
+    base -= 0 if settings.n_lattices else FIT_LIBRARIES
     volumes = base + VOLUMES_PER_VOXEL * voxels
     projections = min(PROJECTION_BYTES * sizes.n_pairs, settings.slice_stage.projection_bytes)
     cloud = CLOUD_PER_GAUSSIAN * (1 + n_threads) * sizes.n_gaussians + PAIR_INDEX_BYTES * sizes.n_pairs
