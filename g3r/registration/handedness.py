@@ -33,10 +33,13 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 ROUNDS = ((5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 """Random rotations (degrees) and translations (mm) of a stack in the mirrored volume, round by round."""
 
-N_CANDIDATES, PIXELS_PER_SLICE, MAX_PIXELS = 300, 200, 60_000
+N_CANDIDATES, PIXELS_PER_SLICE, MIN_PIXELS, MAX_PIXELS = 300, 200, 1_000, 60_000
 
 N_STEPS = 5
 """Gauss-Newton steps of each slice, in the volume and in its mirror image, where a stack is suspected."""
+
+SEEN_SHARE = 0.5
+"""Of the usual coverage by the other stacks, there and on the other side, from which on a pixel counts."""
 
 MIN_CORRELATION = 0.5
 """Of pixels with the symmetric part of the volume; below, the stack shows something else, and nothing is said."""
@@ -74,16 +77,18 @@ def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, float | None]
 
 
 def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | None:
-    volume, _, grid = fine_volume_without(slices, stack)
+    volume, share, grid = fine_volume_without(slices, stack)
     own = slices.take(slices.stack_id == stack)
     mirrored = VolumeGrid(grid.shape, MIRROR @ grid.affine)
     moved = _moved_as_one(own, volume, mirrored, rng)
     stride = max(1, len(own.pixel_index) // MAX_PIXELS)
     here, there = SliceModel(own, volume, grid, stride=stride), SliceModel(moved, volume, mirrored, stride=stride)
-    first = _antisymmetric(here.value, here.operator.forward(volume), there.operator.forward(volume))
+    # where the others saw one side alone, the stack is like the side that is not zero
+    seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
+    first = _antisymmetric(here.value[seen], here.operator.forward(volume)[seen], there.operator.forward(volume)[seen])
     if first is None or first >= MIRROR_SUSPECTED_BELOW:
         return first
-    return _antisymmetric(here.value, _registered(here, own), _registered(there, moved))
+    return _antisymmetric(here.value[seen], _registered(here, own)[seen], _registered(there, moved)[seen])
 
 
 def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
@@ -111,7 +116,11 @@ def _antisymmetric(
     """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both."""
     both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
     targets = np.stack([value, here - mirrored], 1).astype(np.float64)
-    if min(value.std(), both[:, 1].std()) == 0 or np.corrcoef(value, both[:, 1])[0, 1] ** 2 < MIN_CORRELATION**2:
+    if (
+        len(value) < MIN_PIXELS
+        or min(value.std(), both[:, 1].std()) == 0
+        or np.corrcoef(value, both[:, 1])[0, 1] ** 2 < MIN_CORRELATION**2
+    ):
         return None
     left = targets - both @ np.linalg.lstsq(both, targets, rcond=None)[0]
     spread = left.std(0)

@@ -77,6 +77,17 @@ def test_nothing_is_said_of_a_stack_that_shows_something_else(still: list[Simula
     assert noise[1] is None
 
 
+def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[SimulatedStack]) -> None:
+    """Beyond their last slice their volume is zero, and a pixel is more like the other side."""
+    slices = as_slices(still)[0]
+    across = np.abs(slices.planes.rotation[:, 0, 2]) > 0.9  # sagittal slices
+    first = slices.stack_id == slices.stack_id[~across][0]
+    halved = slices.take(first | (across & (slices.planes.center_mm[:, 0] < 12)))
+    of_first = handedness(halved, np.ones(len(halved)))[0]
+    assert of_first is not None
+    assert of_first > 0.05
+
+
 def test_an_even_stack_is_no_error(still: list[SimulatedStack]) -> None:
     slices = as_slices(still)[0]
     assert handedness(replace(slices, value=np.ones_like(slices.value)), np.ones(len(slices))) == [None] * 3
