@@ -94,4 +94,4 @@ mirror image before it is asked again; below the second it is reported. The lowe
 heads that are symmetric, had -0.02. Where a stack was in reverse order, the lowest had -0.04 to -0.15 with two stacks
 (6 of 6 sets below the limit), -0.03 to -0.08 with slices of 4.4 mm (8 of 9), -0.02 to -0.09 with gaps as wide as slices
 (6 of 9), and in three stacks of a real subject -0.09 to -0.17 (3 of 3). All by hand, and before pixels that the others
-saw on one side alone were left out; with that the real ones have -0.12 to -0.18, and sound sets with gaps 0.06 or more."""
+saw on one side alone were left out; since then the real ones have -0.12 to -0.18, sound sets with gaps 0.06 or more."""
