@@ -123,6 +123,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
             _QUICK_SEARCH,
             network=False,
             n_rounds=8,
+            stray_searches=1,
             finest_voxel_mm=1.1,
             finest_voxel_pixels=0.9,
             max_pixels=400_000,

@@ -55,8 +55,8 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
 
     Returns:
         For each stack the correlation of its masked pixels with the antisymmetric part of the head, after the symmetric
-        part was taken out of both: above zero for the same head, near zero for a symmetric one, and below
-        `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said.
+        part was taken out of both, plus its standard error: above zero for the same head, near zero for a symmetric
+        one, and below `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said.
     """
     value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
     evened, rng = replace(slices, value=value), np.random.default_rng(seed)
@@ -85,10 +85,11 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | N
     here, there = SliceModel(own, volume, grid, stride=stride), SliceModel(moved, volume, mirrored, stride=stride)
     # where the others saw one side alone, the stack is like the side that is not zero
     seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
-    first = _antisymmetric(here.value[seen], here.operator.forward(volume)[seen], there.operator.forward(volume)[seen])
+    value, plane = here.value[seen], here.operator.plane[seen]
+    first = _antisymmetric(value, here.operator.forward(volume)[seen], there.operator.forward(volume)[seen], plane)
     if first is None or first >= MIRROR_SUSPECTED_BELOW:
         return first
-    return _antisymmetric(here.value[seen], _registered(here, own)[seen], _registered(there, moved)[seen])
+    return _antisymmetric(value, _registered(here, own)[seen], _registered(there, moved)[seen], plane)
 
 
 def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
@@ -111,9 +112,12 @@ def _registered(model: SliceModel, slices: Slices) -> NDArray[np.float32]:
 
 
 def _antisymmetric(
-    value: NDArray[np.float32], here: NDArray[np.float32], mirrored: NDArray[np.float32]
+    value: NDArray[np.float32], here: NDArray[np.float32], mirrored: NDArray[np.float32], plane: NDArray[np.int64]
 ) -> float | None:
-    """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both."""
+    """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both.
+
+    Its standard error is added, by the jackknife over slices: a stack is not called mirrored for what a few slices say.
+    """
     both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
     targets = np.stack([value, here - mirrored], 1).astype(np.float64)
     if (
@@ -123,5 +127,11 @@ def _antisymmetric(
     ):
         return None
     left = targets - both @ np.linalg.lstsq(both, targets, rcond=None)[0]
-    spread = left.std(0)
-    return float((left[:, 0] * left[:, 1]).mean() / spread.prod()) if spread.min() > 0 else None
+    products = np.stack([left[:, 0] ** 2, left[:, 1] ** 2, left[:, 0] * left[:, 1]])
+    sums = np.stack([np.bincount(plane, one) for one in products])[:, np.unique(plane)]
+    without_one = sums.sum(1)[:, None] - sums  # [3, K] of all slices but one
+    if min(without_one[0].min(), without_one[1].min()) <= 0:
+        return None
+    n, correlations = sums.shape[1], without_one[2] / np.sqrt(without_one[0] * without_one[1])
+    error = float(np.sqrt((n - 1) * correlations.var()))
+    return float(sums[2].sum() / np.sqrt(sums[0].sum() * sums[1].sum())) + error

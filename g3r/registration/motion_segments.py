@@ -107,8 +107,7 @@ def best_segments(
     if keep is not None:
         chosen = np.union1d(chosen, keep)
     motion, cost = motion.take(chosen), cost[:, chosen]
-    penalty = _penalty(head_distance_mm(motion, motion, center_mm))
-    np.fill_diagonal(penalty, 0.0)
+    penalty = transition_penalties(motion, center_mm)
     best: Segments | None = None
     for interleave, order in orders.items():
         path, total = cheapest_path(cost[order], penalty)
@@ -118,6 +117,17 @@ def best_segments(
             best = Segments(choice, interleave, total, 1 + int((np.diff(path) != 0).sum()))
     assert best is not None
     return best
+
+
+def transition_penalties(motion: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Penalty [J, J] of a change from each motion to each other; none of staying.
+
+    Args:
+        motion: J motions of the world.
+        center_mm: [3] centre of the head before the motions.
+    """
+    distance_mm = head_distance_mm(motion, motion, center_mm)
+    return np.where(distance_mm > SAME_PLACE_MM, _penalty(distance_mm), 0.0)
 
 
 def _penalty(distance_mm: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from g3r.registration.normal_equations import SliceModel
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import GAIN_RANGE
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
+from g3r.registration.stray_slices import find_strays
 from g3r.run.deadline import Deadline, timed_steps
 
 logger = logging.getLogger(__name__)
@@ -69,49 +70,73 @@ def refine_slices(
         deadline: fewer rounds if they would end after it.
         seen_share: [K] share of each slice that other stacks see; None where nothing is missing.
     """
-    normal_tie = None if seen_share is None else UNSEEN_NORMAL_TIE * (1 - seen_share) ** 2
-    gain = np.ones(len(slices))
-    weight = np.ones(len(slices))
-    volume: NDArray[np.float32] | None = None
-    grid: VolumeGrid | None = None
-    history: list[dict[str, float]] = []
+    rounds = _Rounds(slices, settings, seen_share)
     for number, done in timed_steps(settings.n_rounds, deadline, least=MIN_ROUNDS):
         progress(number, settings.n_rounds)
-        # 1 in the last round; rounded, so that the steps below do not depend on the last digit
-        fraction = round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9)
+        # 1 in the last round; rounded, so that its steps do not depend on the last digit
+        rounds.run(round(min(1.0, done * settings.n_rounds / max(1, settings.n_rounds - 1)), 9))
+    rng = np.random.default_rng(settings.seed)
+    for _ in range(settings.stray_searches if settings.n_rounds else 0):
+        if deadline is not None and deadline.has_passed():
+            break
+        rounds.slices, n_found = find_strays(rounds.slices, rounds.gain, rounds.weight, rng)
+        if not n_found:
+            break
+        logger.info("slices: %d that went astray were found again", n_found)
+        rounds.run(1.0, n_found)
+    n_rounds = max(settings.n_rounds, 1)  # a single stack has none, and is done
+    progress(n_rounds, n_rounds)
+    slices, gain, weight = rounds.slices, rounds.gain, rounds.weight
+    ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm, settings.max_pixels)
+    return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=rounds.history)
+
+
+class _Rounds:
+    """Slices, gains and weights, and the volume of all, as they are after the last round.
+
+    Args:
+        slices, settings, seen_share: see `refine_slices`.
+    """
+
+    def __init__(self, slices: Slices, settings: RegistrationSettings, seen_share: NDArray[np.float64] | None) -> None:
+        self.slices, self.settings = slices, settings
+        self.normal_tie = None if seen_share is None else UNSEEN_NORMAL_TIE * (1 - seen_share) ** 2
+        self.gain, self.weight = np.ones(len(slices)), np.ones(len(slices))
+        self.volume: NDArray[np.float32] | None = None
+        self.grid: VolumeGrid | None = None
+        self.history: list[dict[str, float]] = []
+
+    def run(self, fraction: float, n_found: int = 0) -> None:
+        """One round.
+
+        Args:
+            fraction: of the rounds that is done, from 0 to 1, which decides how fine this one is.
+            n_found: slices that were placed anew just before, for the history.
+        """
+        settings = self.settings
         # coarse to fine: the capture range is about a voxel of the volume's blur. Few coarse rounds, since blur moves
         # what is round inwards, and slices follow it along their normal
         voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.1 else 1.6 if fraction < 0.4 else 1.0)
         smoothness = 0.1 if fraction < 0.2 else 0.03 if fraction < 0.7 else 0.01
-        if grid is None or not np.isclose(grid.spacing_mm[0], voxel):
-            grid, volume = grid_around(slices, voxel), None
+        if self.grid is None or not np.isclose(self.grid.spacing_mm[0], voxel):
+            self.grid, self.volume = grid_around(self.slices, voxel), None
         n_wanted = settings.max_pixels / (voxel / settings.finest_voxel_mm)
-        stride = max(1, round(len(slices.pixel_index) / n_wanted))
-        volume = _volume_of(slices, grid, gain, weight, volume, smoothness, stride)
-        model = SliceModel(slices, volume, grid, stride=stride)
-        residual = model.residuals(slices.planes, gain)
-        width = robust_width(residual, n_sigma=2)
-        moved = 0
+        stride = max(1, round(len(self.slices.pixel_index) / n_wanted))
+        self.volume = _volume_of(self.slices, self.grid, self.gain, self.weight, self.volume, smoothness, stride)
+        model = SliceModel(self.slices, self.volume, self.grid, stride=stride)
+        width = robust_width(model.residuals(self.slices.planes, self.gain), n_sigma=2)
+        moved = n_found
         if 0.1 < fraction < 0.8:
-            slices, moved = try_neighbours(model, slices, gain, width=width)
-        slices, gain, fit = register_slices(
-            model, slices, gain, n_steps=settings.steps_per_round, width=width, normal_tie=normal_tie
+            self.slices, moved = try_neighbours(model, self.slices, self.gain, width=width)
+        self.slices, self.gain, fit = register_slices(
+            model, self.slices, self.gain, n_steps=settings.steps_per_round, width=width, normal_tie=self.normal_tie
         )
-        weight = slice_weights(fit.loss, gain)
-        history.append(
-            {
-                "round": number,
-                "voxel_mm": voxel,
-                "residual": width / 2,
-                "median_ncc": float(np.median(fit.ncc)),
-                "moved": moved,
-            }
+        self.weight = slice_weights(fit.loss, self.gain)
+        number, median_ncc = len(self.history), float(np.median(fit.ncc))
+        self.history.append(
+            {"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": median_ncc, "moved": moved}
         )
         logger.info("slices, round %d: voxel %.1f mm, residual %.4f, moved %d", number + 1, voxel, width / 2, moved)
-    n_rounds = max(settings.n_rounds, 1)  # a single stack has none, and is done
-    progress(n_rounds, n_rounds)
-    ncc = correlation_with_all(slices, gain, weight, settings.finest_voxel_mm, settings.max_pixels)
-    return FittedSlices(slices=slices, gain=gain, weight=weight, ncc=ncc, history=history)
 
 
 def fitted_in_place(

@@ -88,10 +88,10 @@ DOWNWEIGHTED_BELOW, MAX_DOWNWEIGHTED_SHARE = 0.5, 0.6
 """So is one of whose slices a larger share has a weight below the first number; up to 0.4 in good
 reconstructions of real stacks."""
 
-MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW = 0.15, -0.04
+MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW = 0.15, -0.02
 """Handedness of a stack (`registration.handedness`): below the first its slices are registered to the volume and to its
-mirror image before it is asked again; below the second it is reported. The lowest of 24 sound sets, four of them of
-heads that are symmetric, had -0.02. Where a stack was in reverse order, the lowest had -0.04 to -0.15 with two stacks
-(6 of 6 sets below the limit), -0.03 to -0.08 with slices of 4.4 mm (8 of 9), -0.02 to -0.09 with gaps as wide as slices
-(6 of 9), and in three stacks of a real subject -0.09 to -0.17 (3 of 3). All by hand, and before pixels that the others
-saw on one side alone were left out; since then the real ones have -0.12 to -0.18, sound sets with gaps 0.06 or more."""
+mirror image before it is asked again; below the second it is reported. Sound sets of three had 0.06 or more (nine
+simulated, a real one 0.16), but one of 24 weeks in severe motion with slices astray 0.005, the lowest of all. With one
+stack in reverse order that one had -0.06 to -0.23 (9 of 9 below the limit), with slices of 4.4 mm -0.06 to 0.00 (8 of
+9), with gaps as wide as slices -0.10 to 0.00 (8 of 9), in a real subject -0.09 to -0.16 (3 of 3); of two stacks the
+lower one had -0.04 to -0.10 (6 of 6; 3 of 6 real pairs). All by hand."""

@@ -1,0 +1,197 @@
+"""Slices that went astray, searched for again in the volume of all others.
+
+Where the head moves between most slices, some of them end in a wrong place, from which no gradient and no neighbour
+leads back: their weight falls to nothing, and what they saw is lost. The volume of the others is good by then. So they
+are tried in many places of it, and motion in time decides between those as in the search for motion segments.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from g3r.acquisition.bounding_grid import grid_around
+from g3r.acquisition.least_squares import solve_volume
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import DARK, DROPPED_WEIGHT
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.geometry import RigidPose, VolumeGrid
+from g3r.registration.motion_segments import (
+    changes_in_time,
+    cheapest_path,
+    time_orders,
+    transition_penalties,
+    transition_penalty,
+)
+from g3r.registration.pose_sampling import distinct, perturbed
+from g3r.registration.similarity import (
+    CORRELATION_AREA_MM2,
+    SearchPixels,
+    halved_voxels,
+    mean_square_residual,
+    own_moments,
+)
+from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
+
+logger = logging.getLogger(__name__)
+
+VOXEL_MM, PIXELS_OF_VOLUME = 2.0, 200_000
+"""Of the volume in which they are searched."""
+
+N_FIRST = 10_000
+"""Motions that are tried at first, around those of all slices that fit."""
+
+STEPS = ((12.0, 6.0), (6.0, 3.0), (3.0, 1.5), (1.5, 0.8))
+"""Standard deviations of random rotations (degrees) and translations (mm), from step to step."""
+
+N_KEPT = (20, 10, 5, 3)
+"""The best motions of each step for a slice, and for slices that follow each other in time."""
+
+N_EACH = 60
+"""Random motions around each of these in the next step."""
+
+MIN_SAMPLES = 10.0
+"""Independent samples in a slice that is searched: smaller ones fit in many places."""
+
+MIN_GAIN = 5.0
+"""Least fall of the cost (log odds) of a slice for another place to be taken: the best of so many random motions is
+better than one by about the logarithm of their number."""
+
+UNREACHABLE = 1e9
+"""Cost of another motion for a slice that fits where it is."""
+
+
+def find_strays(
+    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Slices, int]:
+    """Better places for slices whose weight has fallen to nothing, though they are not dark.
+
+    Args:
+        slices: K slices at their present poses.
+        gain: [K] intensity factors.
+        weight: [K] slice weights.
+        rng: source of random motions.
+
+    Returns:
+        The slices, and how many were moved. Whether they count is for the next weights to say.
+    """
+    pixels = SearchPixels.of(slices.with_pose(slices.header_pose))
+    n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
+    astray = (weight < DROPPED_WEIGHT) & (gain > DARK * np.median(gain)) & (n_samples >= MIN_SAMPLES)
+    fits = weight >= DOWNWEIGHTED_BELOW
+    if not astray.any() or not fits.any():
+        return slices, 0
+    volume, grid = _volume_of_others(slices, gain, weight)
+    motion = slices.world_from_header()
+    at_home = mean_square_residual(own_moments(pixels, volume, grid, motion))
+    search = _Search(
+        slices, *halved_voxels(volume, grid), noise=float(np.median(at_home[fits])) + 1e-12, center_mm=pixels.center_mm
+    )
+    known, n_found = distinct(motion.take(np.flatnonzero(fits)), pixels.center_mm), 0
+    for stack in np.unique(slices.stack_id[astray]):
+        rows = np.flatnonzero(slices.stack_id == stack)
+        new, moved = search.of_stack(rows, motion.take(rows), astray[rows], known, rng)
+        motion = motion.with_rows(rows, new)
+        n_found += moved
+    return slices.with_motion(motion), n_found
+
+
+class _Search:
+    """Of the slices of one stack, in a volume of all that fit.
+
+    Args:
+        slices: of all stacks.
+        volume: [I, J, K] of the slices that fit, zero outside the masks.
+        grid: its grid.
+        noise: mean square residual of a slice that fits.
+        center_mm: [3] of the head before its motions.
+    """
+
+    def __init__(
+        self,
+        slices: Slices,
+        volume: NDArray[np.float32],
+        grid: VolumeGrid,
+        *,
+        noise: float,
+        center_mm: NDArray[np.float64],
+    ) -> None:
+        self.slices = slices
+        self.volume, self.grid, self.noise, self.center_mm = volume, grid, noise, center_mm
+
+    def costs(self, rows: NDArray[np.int64], motion: RigidPose) -> NDArray[np.float64]:
+        """Negative log likelihood [S, J] of slices under motions, as in `similarity.slice_costs`."""
+        own = self.slices.take(rows)
+        pixels = SearchPixels.of(own.with_pose(own.header_pose))
+        residual = mean_square_residual(pixels.moments(self.volume, self.grid, motion, nearest=True)).T
+        n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
+        return n_samples[:, None] * np.log1p(residual / (2 * self.noise))
+
+    def of_stack(
+        self,
+        rows: NDArray[np.int64],
+        motion: RigidPose,
+        astray: NDArray[np.bool_],
+        known: RigidPose,
+        rng: np.random.Generator,
+    ) -> tuple[RigidPose, int]:
+        """Motions [K] of the slices of a stack, and how many of those astray were moved.
+
+        Args:
+            rows: [K] the slices.
+            motion: [K] of them.
+            astray: [K] which are searched.
+            known: motions of slices that fit.
+            rng: source of random motions.
+        """
+        order = self._order_in_time(rows, motion)
+        wanted = np.flatnonzero(astray)
+        runs = _runs_in_time(order, astray)
+        found, n_each = known, max(1, N_FIRST // len(known))
+        for (rotation_deg, translation_mm), n_kept in zip(STEPS, N_KEPT, strict=True):
+            tried = perturbed(found, self.center_mm, n_each, rotation_deg, translation_mm, rng)
+            cost = self.costs(rows[wanted], tried)
+            sums = [cost] + [cost[np.isin(wanted, run)].sum(0)[None] for run in runs]
+            best = np.argpartition(np.concatenate(sums), min(n_kept, len(tried)) - 1, axis=1)[:, :n_kept]
+            found, n_each = tried.take(np.unique(best)), N_EACH
+        # the present motions of all slices come first, then the places that were found
+        candidate = RigidPose.concatenated([motion, found])
+        cost = np.full((len(rows), len(candidate)), UNREACHABLE)
+        cost[np.arange(len(rows)), np.arange(len(rows))] = 0.0
+        cost[wanted] = self.costs(rows[wanted], candidate)
+        path, _ = cheapest_path(cost[order], transition_penalties(candidate, self.center_mm))
+        choice = np.empty(len(rows), np.int64)
+        choice[order] = path
+        gained = cost[wanted, wanted] - cost[wanted, choice[wanted]]
+        moved = wanted[gained > MIN_GAIN]
+        for k, gain in zip(wanted, gained, strict=True):
+            logger.debug("slice %d: another place is cheaper by %.0f", rows[k], gain)
+        return motion.with_rows(moved, candidate.take(choice[moved])), len(moved)
+
+    def _order_in_time(self, rows: NDArray[np.int64], motion: RigidPose) -> NDArray[np.int64]:
+        index = self.slices.slice_index[rows]
+        orders = time_orders(index)
+        penalty = {n: transition_penalty(changes_in_time(motion, index, self.center_mm, n)) for n in orders}
+        return orders[min(penalty, key=lambda n: penalty[n])]
+
+
+def _runs_in_time(order: NDArray[np.int64], astray: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Slices astray that follow each other in time: two or more."""
+    runs = np.split(order, np.flatnonzero(np.diff(astray[order].astype(int))) + 1)
+    return [run for run in runs if astray[run[0]] and len(run) > 1]
+
+
+def _volume_of_others(
+    slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], VolumeGrid]:
+    """A volume of slices that fit, zero outside the masks, and its grid."""
+    grid = grid_around(slices, VOXEL_MM, margin_mm=20.0)
+    index = np.arange(0, slices.planes.n_pixels, max(1, slices.planes.n_pixels // PIXELS_OF_VOLUME))
+    operator = VoxelOperator(slices.planes, grid, index, (1, 1, 3))
+    value = np.where(slices.mask[index], slices.value[index], 0) / gain[operator.plane]
+    counts = np.where(weight < DROPPED_WEIGHT, 0.0, weight)[operator.plane]
+    volume = solve_volume(operator, value.astype(np.float32), counts.astype(np.float32), n_iterations=6, smoothness=0.1)
+    return gaussian_filter(volume, 0.5), grid

@@ -1,0 +1,99 @@
+"""Slices that went astray are found again; those that fit, and those that show nothing, are left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import DARK
+from g3r.geometry import RigidPose
+from g3r.registration import RegistrationSettings
+from g3r.registration.slice_rounds import refine_slices
+from g3r.registration.stray_slices import MIN_SAMPLES, find_strays
+from tests.registration.moving_heads import turned_about
+
+STACK = 1
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def with_jerk(slices: Slices, at: np.ndarray) -> Slices:
+    """The head was elsewhere while some slices were taken, which lie where their headers say."""
+    center_mm = slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
+    jerk = turned_about(center_mm, np.deg2rad([14.0, -10.0, 8.0]), np.array([5.0, 7.0, -6.0]))
+    header = slices.header_pose
+    moved = jerk @ header.take(at)
+    header = header.with_rows(at, moved)
+    return replace(slices, header_pose=header, planes=slices.planes.with_pose(header))
+
+
+def off_mm(slices: Slices, true: Slices) -> np.ndarray:
+    """Mean distance [K] of the masked pixels of each slice from where they were taken."""
+    there = [one.planes.pixel_world_mm(one.pixel_index) for one in (slices, true)]
+    apart = np.linalg.norm(there[0] - there[1], axis=1)
+    return np.bincount(slices.pixel_plane, apart, len(slices)) / np.bincount(slices.pixel_plane)
+
+
+@pytest.fixture
+def astray(still_slices: tuple[Slices, RigidPose]) -> tuple[Slices, np.ndarray]:
+    """Three stacks with a jerk during two slices that follow each other in time (every second one is taken first)."""
+    slices = still_slices[0]
+    middle = int(np.median(slices.slice_index[slices.stack_id == STACK]))
+    at = np.flatnonzero((slices.stack_id == STACK) & np.isin(slices.slice_index, [middle, middle + 2]))
+    return with_jerk(slices, at), at
+
+
+def test_slices_of_one_jerk_are_found_again(
+    still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]
+) -> None:
+    slices, at = astray
+    weight = np.ones(len(slices))
+    weight[at] = 1e-3
+    found, n_found = find_strays(slices, np.ones(len(slices)), weight, rng())
+    assert n_found == len(at)
+    assert off_mm(slices, still_slices[0])[at].min() > 8
+    assert off_mm(found, still_slices[0])[at].max() < 2.5
+    others = np.delete(np.arange(len(slices)), at)
+    assert np.array_equal(found.planes.pose.rotation[others], slices.planes.pose.rotation[others])
+    assert np.array_equal(found.planes.pose.translation_mm[others], slices.planes.pose.translation_mm[others])
+
+
+def test_rounds_end_with_the_search(still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]) -> None:
+    slices, at = astray
+    settings = RegistrationSettings(n_rounds=4, finest_voxel_mm=1.8, stray_searches=0)
+    without = refine_slices(slices, settings)
+    found = refine_slices(slices, replace(settings, stray_searches=2))
+    assert off_mm(without.slices, still_slices[0])[at].min() > 5
+    assert off_mm(found.slices, still_slices[0])[at].max() < 1.5
+    assert len(found.history) > len(without.history)
+    assert found.weight[at].min() > without.weight[at].max()
+
+
+def test_slices_that_fit_cost_no_search(still_slices: tuple[Slices, RigidPose]) -> None:
+    slices, ones = still_slices[0], np.ones(len(still_slices[0]))
+    assert find_strays(slices, ones, ones, rng()) == (slices, 0)
+
+
+def test_where_nothing_fits_nothing_is_searched(astray: tuple[Slices, np.ndarray]) -> None:
+    slices, ones = astray[0], np.ones(len(astray[0]))
+    assert find_strays(slices, ones, 1e-3 * ones, rng()) == (slices, 0)
+
+
+def test_dark_slices_are_not_searched(astray: tuple[Slices, np.ndarray]) -> None:
+    slices, at = astray
+    gain, weight = np.ones(len(slices)), np.ones(len(slices))
+    gain[at], weight[at] = 0.9 * DARK, 1e-3
+    assert find_strays(slices, gain, weight, rng()) == (slices, 0)
+
+
+def test_tips_are_not_searched(still_slices: tuple[Slices, RigidPose]) -> None:
+    slices = still_slices[0]
+    area_mm2 = slices.planes.shape.prod(1) * slices.planes.spacing_mm.prod(1)
+    tip = int(area_mm2.argmin())
+    assert area_mm2[tip] < 80 * MIN_SAMPLES
+    weight = np.ones(len(slices))
+    weight[tip] = 1e-3
+    assert find_strays(with_jerk(slices, np.array([tip])), np.ones(len(slices)), weight, rng())[1] == 0
