@@ -27,6 +27,7 @@ from g3r.registration.held_out import fine_held_out_correlations
 from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.normal_equations import SliceModel as SamplingModel
 from g3r.registration.slice_registration import register_slices, try_neighbours
+from g3r.registration.stray_slices import find_strays
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ class PoseRounds:
         n_kept: rounds that were kept.
         held_out: mean correlation of each stack with a volume of the others, before the first round and after each, the
             undone one included; empty for a single stack.
-        n_moved: slices that took the motion of a neighbour, in each round.
+        n_moved: slices that took the motion of a neighbour or were found in another place, in each round.
     """
 
     n_kept: int
@@ -160,10 +161,9 @@ def refine_in_rounds(
     n_kept, n_moved = 0, list[int]()
     for number in range(n_rounds):
         progress(number, n_rounds)
-        moved, neighbours = _registered_to_fit(
-            registration, prior, fit.run(prior, registration.weight, rng), fit.settings.newton_steps
-        )
-        n_moved.append(neighbours)
+        fitted = fit.run(prior, registration.weight, rng)
+        moved, n_elsewhere = _registered_to_fit(registration, prior, fitted, fit.settings.newton_steps, rng)
+        n_moved.append(n_elsewhere)
         if checked:
             held_out.append(_mean_held_out(moved))
             logger.info("poses, round %d: held-out correlation %.4f, before %.4f", number + 1, *held_out[:-3:-1])
@@ -183,15 +183,18 @@ def _mean_held_out(registration: Registration) -> float:
 
 
 def _registered_to_fit(
-    registration: Registration, prior: PriorVolume, fit: SliceFit, n_steps: int
+    registration: Registration, prior: PriorVolume, fit: SliceFit, n_steps: int, rng: np.random.Generator
 ) -> tuple[Registration, int]:
-    """Slices registered to the fitted volume from the poses of the fit, and how many took those of a neighbour."""
+    """Slices registered to the fitted volume from the poses of the fit, and how many of them took another place."""
     grid = prior.volumes.grid
     volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * prior.support
     slices: Slices = prior.volumes.slices.with_pose(fit.slices.planes.pose)
     model = SamplingModel(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
     gain: NDArray[np.float64] = fit.gain
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
+    weight = slice_weights(model.losses(slices.planes, gain, width), gain)
+    # the slices of a single stack have no others to be found in
+    slices, n_found = find_strays(slices, gain, weight, rng) if slices.n_stacks > 1 else (slices, 0)
     slices, n_moved = try_neighbours(model, slices, gain, width=width)
     slices, gain, at_end = register_slices(model, slices, gain, n_steps=n_steps, width=width)
     moved = replace(
@@ -201,4 +204,4 @@ def _registered_to_fit(
         weight=slice_weights(at_end.loss, gain),
         ncc=at_end.ncc,
     )
-    return moved, n_moved
+    return moved, n_moved + n_found

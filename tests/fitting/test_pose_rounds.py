@@ -21,6 +21,7 @@ from g3r.prior.maps import DEFAULT_TILING
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
 from tests.fitting.scene import make_slices
+from tests.registration.moving_heads import with_jerk
 
 ERROR_MM = 0.6
 """Standard deviation per axis of how far slices start from where they belong."""
@@ -96,6 +97,29 @@ def test_slices_come_nearer_to_the_truth_round_by_round() -> None:
     assert found.record.held_out == sorted(found.record.held_out)
     assert error_mm(found.registration.slices, true) < 0.5 * error_mm(start.slices, true)
     assert found.prior.volumes.slices.planes.center_mm == pytest.approx(found.registration.slices.planes.center_mm)
+
+
+@pytest.mark.parametrize("n_stacks", [1, 3])
+def test_slices_of_several_stacks_are_searched_for_where_they_do_not_fit(
+    n_stacks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights: list[np.ndarray] = []
+
+    def found_seven(slices: Slices, gain: np.ndarray, weight: np.ndarray, rng: object) -> tuple[Slices, int]:
+        weights.append(weight)
+        return slices, 7
+
+    monkeypatch.setattr(pose_rounds, "find_strays", found_seven)
+    true = make_slices()
+    true = true.take(true.stack_id < n_stacks)
+    middle = int(np.flatnonzero(true.stack_id == 0)[np.count_nonzero(true.stack_id == 0) // 2])
+    start = registration_of(with_jerk(true, np.array([middle])))
+    weight = np.ones(len(true))
+    weight[middle] = 1e-3
+    found, _ = run(replace(start, weight=weight), 1)
+    assert len(weights) == (n_stacks > 1)
+    assert (found.record.n_moved[0] >= 7) == (n_stacks > 1)
+    assert all(one[middle] < 0.5 * np.median(one) for one in weights)
 
 
 def test_a_round_that_does_not_help_is_undone_and_ends_the_rounds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,6 +101,23 @@ def turned_about(center_mm: np.ndarray, rotvec_rad: np.ndarray, translation_mm: 
     return RigidPose(turn.rotation, (center_mm - turn.rotation[0] @ center_mm + translation_mm)[None])
 
 
+def with_jerk(slices: Slices, at: np.ndarray) -> Slices:
+    """The head was elsewhere while some slices were taken, which lie where their headers say."""
+    center_mm = slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
+    jerk = turned_about(center_mm, np.deg2rad([14.0, -10.0, 8.0]), np.array([5.0, 7.0, -6.0]))
+    header = slices.header_pose
+    moved = jerk @ header.take(at)
+    header = header.with_rows(at, moved)
+    return replace(slices, header_pose=header, planes=slices.planes.with_pose(header))
+
+
+def off_mm(slices: Slices, true: Slices) -> np.ndarray:
+    """Mean distance [K] of the masked pixels of each slice from where they were taken."""
+    there = [one.planes.pixel_world_mm(one.pixel_index) for one in (slices, true)]
+    apart = np.linalg.norm(there[0] - there[1], axis=1)
+    return np.bincount(slices.pixel_plane, apart, len(slices)) / np.bincount(slices.pixel_plane)
+
+
 def rotation_angle_deg(rotation: np.ndarray) -> float:
     """Angle of a rotation [3, 3]."""
     return float(np.rad2deg(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

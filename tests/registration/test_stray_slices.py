@@ -11,30 +11,13 @@ from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings
 from g3r.registration.slice_rounds import refine_slices
 from g3r.registration.stray_slices import MIN_SAMPLES, find_strays
-from tests.registration.moving_heads import turned_about
+from tests.registration.moving_heads import off_mm, with_jerk
 
 STACK = 1
 
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-def with_jerk(slices: Slices, at: np.ndarray) -> Slices:
-    """The head was elsewhere while some slices were taken, which lie where their headers say."""
-    center_mm = slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
-    jerk = turned_about(center_mm, np.deg2rad([14.0, -10.0, 8.0]), np.array([5.0, 7.0, -6.0]))
-    header = slices.header_pose
-    moved = jerk @ header.take(at)
-    header = header.with_rows(at, moved)
-    return replace(slices, header_pose=header, planes=slices.planes.with_pose(header))
-
-
-def off_mm(slices: Slices, true: Slices) -> np.ndarray:
-    """Mean distance [K] of the masked pixels of each slice from where they were taken."""
-    there = [one.planes.pixel_world_mm(one.pixel_index) for one in (slices, true)]
-    apart = np.linalg.norm(there[0] - there[1], axis=1)
-    return np.bincount(slices.pixel_plane, apart, len(slices)) / np.bincount(slices.pixel_plane)
 
 
 @pytest.fixture
