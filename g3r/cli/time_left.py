@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, WRITING
+from g3r.run.kernel_cache import COMPILING_FIT_S
 
 BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.3, PREPARING: 0.4}
 """Seconds of three stacks on two cores, before the first stage that a run keeps."""
@@ -62,9 +63,6 @@ COMPILING_S = {
 }
 """What stages take longer where numba has nothing compiled yet."""
 
-COMPILING_FIT_S = 22.0
-"""What the fit to the slices takes longer where no round has compiled it before."""
-
 MASK_S = 8.0
 """For the network to find the brain in one stack."""
 
@@ -112,7 +110,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     if compiling:
         stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
         if ROUNDS not in stages and "fit to slices" in stages:
-            stages["fit to slices"] += COMPILING_FIT_S
+            stages["fit to slices"] += COMPILING_FIT_S  # else a round has compiled it before
     if options.time_budget:
         shorter = max(options.time_budget, 1.0) / sum(stages.values())
         stages = {name: seconds * shorter for name, seconds in stages.items()}

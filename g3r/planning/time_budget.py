@@ -24,6 +24,7 @@ from g3r.gaussians.seeding import seed_cloud
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.run.deadline import Deadline, LoopRecord
+from g3r.run.kernel_cache import COMPILING_FIT_S, needs_compiling
 
 logger = logging.getLogger(__name__)
 
@@ -145,7 +146,7 @@ class TimeBudget:
         view_s = COARSE_PER_VIEW * coarse_s
         views = int(VIEWS_SHARE * max(0.0, self.deadline.remaining_s) / view_s) if view_s > 0 else 1
         views = min(max(1, views), PRESETS["accurate"].prior_views)
-        round_s = ROUND_OVER_COARSE * coarse_s + view_s * views
+        round_s = ROUND_OVER_COARSE * coarse_s + view_s * views + compiling_s()
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
         pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
@@ -165,11 +166,12 @@ class TimeBudget:
         """
         settings, volumes = self.settings, prior.volumes
         after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.values.size)
-        if self.deadline.remaining_s - after_s < NO_FIT * coarse_s:
+        after_compiling_s = self.deadline.remaining_s - after_s - compiling_s()
+        if after_compiling_s < NO_FIT * coarse_s:
             self.settings = replace(settings, n_lattices=0)
             self.choices |= {"fit": "none"}
             return self.deadline
-        if self.deadline.remaining_s - after_s < TOO_LITTLE * coarse_s:
+        if after_compiling_s < TOO_LITTLE * coarse_s:
             # timing a step would take the time of the steps themselves
             reserve_s = after_s + (coarse_s if settings.use_prior else 0.0)
             self.choices |= {"fit": QUICKEST_FIT, "reserve_s": round(reserve_s, 2)}
@@ -230,6 +232,11 @@ def _by_least_squares(settings: ReconstructionSettings) -> ReconstructionSetting
     """The settings without the prior network, with the volume of `preview` in its place."""
     least_mm = PRESETS["preview"].least_squares_voxel_mm
     return replace(settings, use_prior=False, prior_views=0, least_squares_voxel_mm=least_mm)
+
+
+def compiling_s() -> float:
+    """Seconds by which the first fit is longer where none of its kernels is compiled."""
+    return COMPILING_FIT_S if needs_compiling("gaussians") else 0.0
 
 
 def fit_seconds(preset: ReconstructionSettings, step_s: float, number: float) -> float:

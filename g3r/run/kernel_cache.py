@@ -15,6 +15,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 
+COMPILING_FIT_S = 22.0
+"""Seconds that the kernels of the fit to the slices take to compile, on a core of the machine of the tables."""
+
 
 def ensure_kernel_cache() -> None:
     """Set NUMBA_CACHE_DIR to a temporary folder where numba would find no folder of its own."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.geometry.grid import on_grid
+from g3r.planning import time_budget
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
@@ -152,6 +154,20 @@ def test_the_less_time_the_less_is_done_after_registration() -> None:
     assert done == [False, False, True, True]
     preview_mm = PRESETS["preview"].least_squares_voxel_mm
     assert by_least_squares == [preview_mm, preview_mm, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("compiling", "fit", "rounds"), [(False, "fast", 2), (True, "none", 0)])
+def test_the_seconds_of_compiling_count(
+    compiling: bool, fit: str, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time_budget, "needs_compiling", lambda room: compiling)
+    shape = SimpleNamespace(volumes=None, values=np.zeros(8))
+    one = budget(10.0, PRESETS["balanced"])
+    one.for_fit_to_prior(shape, coarse_s=2.0, n_output_voxels=8)  # type: ignore[arg-type]
+    assert one.choices["fit"] == fit
+    another = budget(100.0, PRESETS["balanced"])
+    another.for_prior(coarse_s=1.0)
+    assert another.choices["pose_rounds"] == rounds
 
 
 def test_with_time_enough_every_step_is_made(stacks: list[Stack]) -> None:
