@@ -141,6 +141,7 @@ class Votes:
         grid: of what follows.
         weight: [K] slice weights.
         brain, core, unseen, thin: see `Foreground`.
+        density: [I, J, K] of slices over each voxel (`coverage`).
         rough: [I, J, K] share of the slices over a voxel whose masks contain it.
         distance_voxels: of slices.
     """
@@ -152,6 +153,7 @@ class Votes:
     core: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
     thin: NDArray[np.bool_]
+    density: NDArray[np.float32]
     rough: NDArray[np.float32]
     distance_voxels: float
 
@@ -163,13 +165,13 @@ class Votes:
         operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
         amount = planes.spacing_mm.prod(1) * slices.thickness_mm * counts / grid.voxel_volume_mm3
         inside = operator.adjoint(amount[operator.plane].astype(np.float32))
-        total = coverage(slices, grid, counts)
+        density = coverage(slices, grid, counts)
         stacks = [slices.take(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
         distance_mm = np.array([slice_spacing_mm(stack) for stack in stacks])
         distance_voxels = float(distance_mm.max() / grid.spacing_mm.mean())
         sigma = 0.5 * distance_voxels
-        thin = total < 2 * UNSEEN_BELOW * np.median(counts)
-        inside, total = gaussian_filter(inside, sigma), gaussian_filter(total, sigma)
+        thin = density < 2 * UNSEEN_BELOW * np.median(counts)
+        inside, total = gaussian_filter(inside, sigma), gaussian_filter(density, sigma)
         thickness_mm = np.array([stack.thickness_mm[0] for stack in stacks])
         lone = float((thickness_mm / distance_mm).min() * np.median(counts))
         seen = total > max(SEEN_SHARE * lone, np.finfo(np.float32).tiny)
@@ -178,7 +180,7 @@ class Votes:
             raise InputError("no voxel is covered by a slice; check masks and headers")
         rough = np.divide(inside, total, out=np.zeros_like(total), where=seen)
         core = seen & (inside > CORE_SHARE * total)
-        return cls(slices, grid, counts, brain, core, ~seen, thin, rough, distance_voxels)
+        return cls(slices, grid, counts, brain, core, ~seen, thin, density, rough, distance_voxels)
 
     def foreground(self) -> Foreground:
         """With the share of brain, which takes longer than all else."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
 from g3r.acquisition.common_bias_field import common_log_field, without_field
-from g3r.acquisition.coverage import brain_share, coverage
+from g3r.acquisition.coverage import brain_share
 from g3r.acquisition.foreground import Foreground, Votes
 from g3r.acquisition.least_squares import sharpened_volume
 from g3r.acquisition.planes import Slices
@@ -83,7 +83,7 @@ class InitialVolumes:
         field_rms = 0.0
         with ThreadPoolExecutor(1) as pool:  # N4 has one thread, and releases Python's lock
             field = pool.submit(common_log_field, sharp, votes.core, grid) if common_bias_field else None
-            density, seen = coverage(slices, grid, weight), votes.foreground()
+            seen = votes.foreground()
         if field is not None:
             log_field = field.result()
             slices = without_field(slices, log_field, grid)
@@ -95,7 +95,7 @@ class InitialVolumes:
         return cls(
             slices=slices,
             coarse=coarse,
-            density=density,
+            density=votes.density,
             masked_density=masked,
             sharp=sharp,
             foreground=seen,
