@@ -27,13 +27,7 @@ from g3r.registration.motion_segments import (
     transition_penalty,
 )
 from g3r.registration.pose_sampling import distinct, perturbed
-from g3r.registration.similarity import (
-    CORRELATION_AREA_MM2,
-    SearchPixels,
-    halved_voxels,
-    mean_square_residual,
-    own_moments,
-)
+from g3r.registration.similarity import CORRELATION_AREA_MM2, SearchPixels, mean_square_residual, own_moments
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 
 logger = logging.getLogger(__name__)
@@ -87,9 +81,7 @@ def find_strays(
     volume, grid = _volume_of_others(slices, gain, weight)
     motion = slices.world_from_header()
     at_home = mean_square_residual(own_moments(pixels, volume, grid, motion))
-    search = _Search(
-        slices, *halved_voxels(volume, grid), noise=float(np.median(at_home[fits])) + 1e-12, center_mm=pixels.center_mm
-    )
+    search = _Search(slices, volume, grid, noise=float(np.median(at_home[fits])) + 1e-12, center_mm=pixels.center_mm)
     known, n_found = distinct(motion.take(np.flatnonzero(fits)), pixels.center_mm), 0
     for stack in np.unique(slices.stack_id[astray]):
         rows = np.flatnonzero(slices.stack_id == stack)
@@ -126,7 +118,7 @@ class _Search:
         """Negative log likelihood [S, J] of slices under motions, as in `similarity.slice_costs`."""
         own = self.slices.take(rows)
         pixels = SearchPixels.of(own.with_pose(own.header_pose))
-        residual = mean_square_residual(pixels.moments(self.volume, self.grid, motion, nearest=True)).T
+        residual = mean_square_residual(pixels.moments(self.volume, self.grid, motion)).T
         n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
         return n_samples[:, None] * np.log1p(residual / (2 * self.noise))
 

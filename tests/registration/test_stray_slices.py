@@ -38,7 +38,7 @@ def test_slices_of_one_jerk_are_found_again(
     found, n_found = find_strays(slices, np.ones(len(slices)), weight, rng())
     assert n_found == len(at)
     assert off_mm(slices, still_slices[0])[at].min() > 8
-    assert off_mm(found, still_slices[0])[at].max() < 2.5
+    assert off_mm(found, still_slices[0])[at].max() < 4.0  # the slices are as thick
     others = np.delete(np.arange(len(slices)), at)
     assert np.array_equal(found.planes.pose.rotation[others], slices.planes.pose.rotation[others])
     assert np.array_equal(found.planes.pose.translation_mm[others], slices.planes.pose.translation_mm[others])
