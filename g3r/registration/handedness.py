@@ -86,10 +86,12 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | N
     # where the others saw one side alone, the stack is like the side that is not zero
     seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
     value, plane = here.value[seen], here.operator.plane[seen]
-    first = _antisymmetric(value, here.operator.forward(volume)[seen], there.operator.forward(volume)[seen], plane)
+    first = antisymmetric_correlation(
+        value, here.operator.forward(volume)[seen], there.operator.forward(volume)[seen], plane
+    )
     if first is None or first >= MIRROR_SUSPECTED_BELOW:
         return first
-    return _antisymmetric(value, _registered(here, own)[seen], _registered(there, moved)[seen], plane)
+    return antisymmetric_correlation(value, _registered(here, own)[seen], _registered(there, moved)[seen], plane)
 
 
 def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
@@ -111,12 +113,21 @@ def _registered(model: SliceModel, slices: Slices) -> NDArray[np.float32]:
     return (operator.forward(model.volume) * gain[operator.plane]).astype(np.float32)
 
 
-def _antisymmetric(
+def antisymmetric_correlation(
     value: NDArray[np.float32], here: NDArray[np.float32], mirrored: NDArray[np.float32], plane: NDArray[np.int64]
 ) -> float | None:
     """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both.
 
     Its standard error is added, by the jackknife over slices: a stack is not called mirrored for what a few slices say.
+
+    Args:
+        value: [P] pixels.
+        here: [P] what a volume of the other stacks says of them.
+        mirrored: [P] what its mirror image says.
+        plane: [P] slice of each pixel.
+
+    Returns:
+        The sum; None where there is too little to correlate, or the pixels show something else.
     """
     both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
     targets = np.stack([value, here - mirrored], 1).astype(np.float64)

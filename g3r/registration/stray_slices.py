@@ -141,7 +141,7 @@ class _Search:
         """
         order = self._order_in_time(rows, motion)
         wanted = np.flatnonzero(astray)
-        runs = _runs_in_time(order, astray)
+        runs = runs_in_time(order, astray)
         found, n_each = known, max(1, N_FIRST // len(known))
         for (rotation_deg, translation_mm), n_kept in zip(STEPS, N_KEPT, strict=True):
             tried = perturbed(found, self.center_mm, n_each, rotation_deg, translation_mm, rng)
@@ -170,8 +170,13 @@ class _Search:
         return orders[min(penalty, key=lambda n: penalty[n])]
 
 
-def _runs_in_time(order: NDArray[np.int64], astray: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Slices astray that follow each other in time: two or more."""
+def runs_in_time(order: NDArray[np.int64], astray: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Slices astray that follow each other in time: two or more.
+
+    Args:
+        order: [K] slices of a stack in the order of their acquisition.
+        astray: [K] which are.
+    """
     runs = np.split(order, np.flatnonzero(np.diff(astray[order].astype(int))) + 1)
     return [run for run in runs if astray[run[0]] and len(run) > 1]
 

@@ -13,7 +13,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
-from g3r.registration.handedness import handedness
+from g3r.registration.handedness import antisymmetric_correlation, handedness
 from g3r.registration.thresholds import MIRRORED_BELOW
 from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed
 
@@ -86,6 +86,24 @@ def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[Si
     of_first = handedness(halved, np.ones(len(halved)))[0]
     assert of_first is not None
     assert of_first > 0.05
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.6])
+def test_slices_that_do_not_agree_say_less(spread: float) -> None:
+    """The standard error is that of leaving out each slice in turn, and grows with their disagreement."""
+    rng, n_slices = np.random.default_rng(0), 12
+    plane = np.repeat(np.arange(n_slices), 200)
+    here, mirrored, noise = rng.normal(size=(3, len(plane)))
+    strength = -0.4 + spread * rng.normal(size=n_slices)[plane]
+    value = here + mirrored + strength * (here - mirrored) + noise
+    y, a, b = (one.astype(np.float32) for one in (value, here, mirrored))
+    found = antisymmetric_correlation(y, a, b, plane)
+    both = np.stack([np.ones_like(here), here + mirrored], 1)
+    left, odd = (one - both @ np.linalg.lstsq(both, one, rcond=None)[0] for one in (value, here - mirrored))
+    without = [np.corrcoef(left[plane != k], odd[plane != k])[0, 1] for k in range(n_slices)]
+    error = np.sqrt((n_slices - 1) / n_slices * ((without - np.mean(without)) ** 2).sum())
+    assert (error > 0.05) == (spread > 0)
+    assert found == pytest.approx(np.corrcoef(left, odd)[0, 1] + error, abs=0.01)
 
 
 def test_an_even_stack_is_no_error(still: list[SimulatedStack]) -> None:
