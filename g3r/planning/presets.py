@@ -122,7 +122,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
         registration=replace(
             _QUICK_SEARCH,
             network=False,
-            n_rounds=8,
+            n_rounds=6,
             stray_searches=1,
             finest_voxel_mm=1.1,
             finest_voxel_pixels=0.9,

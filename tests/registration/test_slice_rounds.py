@@ -9,9 +9,9 @@ from scipy.ndimage import binary_dilation
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.voxel_operator import VoxelOperator
-from g3r.registration import RegistrationSettings
-from g3r.registration.slice_rounds import continued_outwards, refine_slices
-from tests.registration.moving_heads import as_slices, pixel_errors_mm
+from g3r.registration import RegistrationSettings, slice_rounds
+from g3r.registration.slice_rounds import CARRIED_ON_MM, carried_on, continued_outwards, refine_slices
+from tests.registration.moving_heads import as_slices, off_mm, pixel_errors_mm, slices_disturbed
 
 
 def test_slices_in_place_stay_there(still: list[SimulatedStack]) -> None:
@@ -19,6 +19,30 @@ def test_slices_in_place_stay_there(still: list[SimulatedStack]) -> None:
     found = refine_slices(slices, RegistrationSettings(n_rounds=7, finest_voxel_mm=1.8)).slices
     # 0.67 mm where the volume ends at the masks and most rounds are coarse
     assert np.median(pixel_errors_mm(found, truth)) < 0.45
+
+
+def test_longer_moves_end_nearer(still: list[SimulatedStack], monkeypatch: pytest.MonkeyPatch) -> None:
+    slices, truth = as_slices(still)
+    disturbed, settings = slices_disturbed(slices, 3.0, 1.0), RegistrationSettings(n_rounds=6, finest_voxel_mm=1.8)
+    longer = np.median(pixel_errors_mm(refine_slices(disturbed, settings).slices, truth))
+    monkeypatch.setattr(slice_rounds, "OVER_RELAXATION", 1.0)
+    assert longer < 0.85 * np.median(pixel_errors_mm(refine_slices(disturbed, settings).slices, truth))
+
+
+def test_slices_are_carried_on_the_way_they_went(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(still)
+    shift = np.zeros((len(slices), 3))
+    shift[:, 0] = 0.5
+    shift[3, 0] = 1.1 * CARRIED_ON_MM
+    pose = slices.planes.pose
+    moved = slices.with_pose(replace(pose, translation_mm=pose.translation_mm + shift))
+    assert np.allclose(off_mm(carried_on(slices, moved, 1.0), slices), np.abs(shift[:, 0]))
+    went = off_mm(carried_on(slices, moved, 1.8), slices)
+    assert went[3] == pytest.approx(1.1 * CARRIED_ON_MM)
+    assert np.allclose(np.delete(went, 3), 0.9)
+    turned = slices_disturbed(slices, 0.3, 0.0)
+    twice = carried_on(slices, turned, 2.0).planes.pose
+    assert np.allclose((pose.inverse() @ twice).rotvec_rad(), 2 * (pose.inverse() @ turned.planes.pose).rotvec_rad())
 
 
 def test_a_slice_without_signal_counts_for_nothing(still: list[SimulatedStack]) -> None:
