@@ -42,7 +42,7 @@ STEPS = ((12.0, 6.0), (6.0, 3.0), (3.0, 1.5), (1.5, 0.8))
 """Standard deviations of random rotations (degrees) and translations (mm), from step to step."""
 
 N_KEPT = (20, 10, 5, 3)
-"""The best motions of each step for a slice, and for slices that follow each other in time."""
+"""The best motions of each step for a slice."""
 
 N_EACH = 60
 """Random motions around each of these in the next step."""
@@ -141,13 +141,11 @@ class _Search:
         """
         order = self._order_in_time(rows, motion)
         wanted = np.flatnonzero(astray)
-        runs = runs_in_time(order, astray)
         found, n_each = known, max(1, N_FIRST // len(known))
         for (rotation_deg, translation_mm), n_kept in zip(STEPS, N_KEPT, strict=True):
             tried = perturbed(found, self.center_mm, n_each, rotation_deg, translation_mm, rng)
             cost = self.costs(rows[wanted], tried)
-            sums = [cost] + [cost[np.isin(wanted, run)].sum(0)[None] for run in runs]
-            best = np.argpartition(np.concatenate(sums), min(n_kept, len(tried)) - 1, axis=1)[:, :n_kept]
+            best = np.argpartition(cost, min(n_kept, len(tried)) - 1, axis=1)[:, :n_kept]
             found, n_each = tried.take(np.unique(best)), N_EACH
         # the present motions of all slices come first, then the places that were found
         candidate = RigidPose.concatenated([motion, found])
@@ -168,17 +166,6 @@ class _Search:
         orders = time_orders(index)
         penalty = {n: transition_penalty(changes_in_time(motion, index, self.center_mm, n)) for n in orders}
         return orders[min(penalty, key=lambda n: penalty[n])]
-
-
-def runs_in_time(order: NDArray[np.int64], astray: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Slices astray that follow each other in time: two or more.
-
-    Args:
-        order: [K] slices of a stack in the order of their acquisition.
-        astray: [K] which are.
-    """
-    runs = np.split(order, np.flatnonzero(np.diff(astray[order].astype(int))) + 1)
-    return [run for run in runs if astray[run[0]] and len(run) > 1]
 
 
 def _volume_of_others(

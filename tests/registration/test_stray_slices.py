@@ -11,7 +11,7 @@ from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, stray_slices
 from g3r.registration.similarity import CORRELATION_AREA_MM2
 from g3r.registration.slice_rounds import refine_slices
-from g3r.registration.stray_slices import find_strays, runs_in_time
+from g3r.registration.stray_slices import find_strays
 from tests.registration.moving_heads import off_mm, with_jerk
 
 STACK = 1
@@ -80,11 +80,3 @@ def test_small_slices_are_not_searched(astray: tuple[Slices, np.ndarray], monkey
     n_samples = slices.planes.shape.prod(1) * slices.planes.spacing_mm.prod(1) / CORRELATION_AREA_MM2
     monkeypatch.setattr(stray_slices, "MIN_SAMPLES", 1.01 * n_samples[at].max())
     assert find_strays(slices, np.ones(len(slices)), weight, rng()) == (slices, 0)
-
-
-def test_slices_astray_that_follow_each_other_in_time_are_one_run() -> None:
-    order = np.array([0, 2, 4, 6, 1, 3, 5])
-    astray = np.zeros(7, bool)
-    astray[[2, 4, 1, 5]] = True
-    assert [run.tolist() for run in runs_in_time(order, astray)] == [[2, 4]]
-    assert runs_in_time(order, np.zeros(7, bool)) == []
