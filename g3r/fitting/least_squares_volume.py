@@ -17,6 +17,10 @@ SMOOTHNESS = 0.016
 """Weight of squared gradients over that of the pixels, lengths in units of what one pixel covers (the cube root of its
 area times the thickness); chosen on two simulated heads of 0.8 x 0.8 x 2.2 mm."""
 
+BRIGHTEST, CONTRADICTED = 0.999, 1.2
+"""Quantile of the pixels that see brain alone, and how many times as bright brain may be: pixels at the rim that
+would need more are of slices beside their place, where others saw none. They made a crust three times as bright."""
+
 N_ITERATIONS = 8
 """Conjugate-gradient steps; more change less than 0.1 dB."""
 
@@ -42,10 +46,14 @@ def least_squares_volume(
     slices, share = without_surroundings(volumes.slices, support, grid, gain, weight)
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     covered_mm3 = float(np.median(slices.planes.spacing_mm.prod(1) * slices.thickness_mm))
+    value, share = slices.masked_value / gain[slices.pixel_plane], share[slices.pixel_index]
+    of_brain = value[share == 1]
+    if len(of_brain):
+        share = np.where(value > CONTRADICTED * np.quantile(of_brain, BRIGHTEST), 0, share)
     return solve_volume(
         operator,
-        (slices.masked_value / gain[slices.pixel_plane]).astype(np.float32),
-        (weight[slices.pixel_plane] * share[slices.pixel_index]).astype(np.float32),
+        value.astype(np.float32),
+        (weight[slices.pixel_plane] * share).astype(np.float32),
         start=volumes.sharp * support,
         n_iterations=N_ITERATIONS,
         smoothness=SMOOTHNESS * (covered_mm3 / grid.voxel_volume_mm3) ** (2 / 3),

@@ -9,6 +9,7 @@ import pytest
 
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
+from g3r.fitting import least_squares_volume as least_squares
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.least_squares_volume import least_squares_volume
 
@@ -94,3 +95,20 @@ def test_units_and_gains_do_not_matter() -> None:
     np.testing.assert_allclose(
         least_squares_volume(by_gain, made.foreground.support(), gain.astype(float), ones), found, rtol=1e-3, atol=2e-3
     )
+
+
+def test_a_slice_beside_its_place_makes_no_bright_crust(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = volumes(0.0)
+    pose, away = made.slices.planes.pose, np.zeros((len(made.slices), 3))
+    away[np.flatnonzero(made.slices.stack_id == 2)[6], 0] = 7.0
+    moved = replace(made, slices=made.slices.with_pose(replace(pose, translation_mm=pose.translation_mm + away)))
+    support = shell_of(made, 0, RADIUS_MM + 1.0)  # as the other slices see it
+    ones = np.ones(len(made.slices))
+
+    def brightest_crust() -> float:
+        volume = least_squares_volume(moved, support, ones, ones) * made.scale
+        return float(volume[shell_of(made, RADIUS_MM, 40)].max())
+
+    assert brightest_crust() < 1.7
+    monkeypatch.setattr(least_squares, "CONTRADICTED", np.inf)
+    assert brightest_crust() > 2.0
