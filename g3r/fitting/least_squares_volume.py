@@ -19,7 +19,7 @@ area times the thickness); chosen on two simulated heads of 0.8 x 0.8 x 2.2 mm."
 
 BRIGHTEST, CONTRADICTED = 0.999, 1.2
 """Quantile of the pixels that see brain alone, and how many times as bright brain may be: pixels at the rim that
-would need more are of slices beside their place, where others saw none. They made a crust three times as bright."""
+would need more are of slices beside their place, where others saw none. They made a crust 2.6 times as bright."""
 
 N_ITERATIONS = 8
 """Conjugate-gradient steps; more change less than 0.1 dB."""

@@ -18,7 +18,8 @@ class RegistrationSettings:
         n_candidates: random motions tried at once for a stack in the search.
         attempts: at most this many searches with other random numbers while stacks do not predict each other.
         n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
-        stray_searches: after the rounds, at most so many searches for slices that went astray, with a round after each.
+        stray_searches: after the rounds, at most so many searches for slices that went astray, with more rounds after
+            each that found some.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
         finest_voxel_pixels: the same at least, in units of what a pixel covers (the cube root of its area times the
