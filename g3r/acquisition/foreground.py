@@ -225,7 +225,7 @@ def _sharpened(
         smooth_voxels: a length.
     """
     planes = replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * MASK_WIDTH**2)
-    operator = VoxelOperator(planes, grid)
+    operator = VoxelOperator(planes, grid, psf_points=(1, 1, 3))  # hardly wider than a voxel
     return solve_volume(
         operator,
         slices.mask.astype(np.float32),

@@ -27,6 +27,7 @@ from g3r.cli.terminal import PROGRAM, Terminal
 from g3r.cli.time_left import TimeLeft, expected_seconds
 from g3r.errors import InputError
 from g3r.report.stage_words import WRITING
+from g3r.run.ahead import import_ahead
 from g3r.run.idle_threads import let_threads_sleep
 from g3r.run.kernel_cache import needs_compiling
 from g3r.run.lean_import import import_lean, load_nibabel
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from g3r.run.output_folder import OutputFolder
     from g3r.run.reporter import Reporter
     from g3r.run.stage_store import StageStore
+
+NEEDED_LATER = ("SimpleITK", "g3r.output.sections", "g3r.output.mask_picture", "g3r.report.page")
+"""Modules that take a few tenths of a second to import, while slices are registered by code that holds no lock."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -137,6 +141,7 @@ def _reconstructed(
         _reporter(options, task, terminal) as reporter,
     ):
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
+        import_ahead(*NEEDED_LATER)
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, reporter=reporter)
         poses = task.slices.poses if task.slices else None
         result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, poses, plan=task.plan, run=run)

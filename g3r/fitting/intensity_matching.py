@@ -145,7 +145,8 @@ class _Pixels:
 
     def of(self, factors: _Factors) -> Array:
         """Their sum [P'] at each pixel."""
-        return factors.log_gain[self.plane] + (factors.coefficients[self.stack[self.plane]] * self.terms).sum(1)
+        own = factors.coefficients[self.stack[self.plane]]
+        return factors.log_gain[self.plane] + np.einsum("pi,pi->p", own, self.terms)
 
     def off(self, factors: _Factors) -> Array:
         """Log-intensities [P'] over those of the volume that pixels give with these factors."""

@@ -70,13 +70,13 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
             edge=edge,
             cutoff_sigma=settings.slice_stage.cutoff_sigma,
         )
-        volume, left_to_prior, seen = mixture.volume(cloud, grid), mixture.left_to_prior(grid), mixture.seen(grid)
+        volume, seen = mixture.volume(cloud, grid), mixture.seen(grid)
         if not np.isfinite(volume).all():
             raise NumericalError("the volume holds values that are not finite; lower the step sizes")
         check = checked(volume, mixture, found, fit) if settings.use_prior else None
         if check is not None and check.falls_back:
             mixture = replace(mixture, least_weight=1.0)
-            volume, left_to_prior = mixture.volume(cloud, grid), mixture.left_to_prior(grid)
+            volume = mixture.volume(cloud, grid)
         # errors are calibrated on what the fit gives; the correction takes a little of them away
         mixed, correction = volume, corrected(volume, cloud, mixture, found, settings, run)
         if correction is not None:
@@ -111,7 +111,8 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
                     cutoff_sigma=settings.slice_stage.cutoff_sigma,
                     projection_bytes=settings.slice_stage.projection_bytes,
                 )
-                prior_share = np.where(unseen, 1, left_to_prior + (1 - left_to_prior) * prior_share).astype(np.float32)
+                left = mixture.left_to_prior(grid)
+                prior_share = np.where(unseen, 1, left + (1 - left) * prior_share).astype(np.float32)
                 release_memory()
         with run.timed(Stage.UNCERTAINTY):
             estimated = estimate_uncertainty(

@@ -20,6 +20,9 @@ from g3r.geometry.grid import bounding_box, on_grid
 
 Kind = Literal["grey", "map", "mark"]
 
+REGIONS = frozenset({"mask", "unseen"})
+"""Images that say together where the head is."""
+
 MAX_VOXELS = 2_500_000
 """Of the cropped grid; above, voxels are joined two by two by two, so that the page stays below 10 MB."""
 
@@ -108,17 +111,18 @@ class ViewerImages:
             path = folder / f"{layer.name}.nii.gz"
             if layer.name not in found and path.is_file():
                 found[layer.name] = _canonical(load_volume(path))
-        data = {name: _on(one, volume.grid) for name, one in found.items()}
-        brain = (data["mask"] > 0) | (data["unseen"] > 0 if "unseen" in data else False)
+        everywhere = bounding_box(np.ones(volume.grid.shape, bool))
+        brain = np.logical_or.reduce([_on(found[name], volume.grid, everywhere) > 0 for name in REGIONS & found.keys()])
         if not brain.any():
             brain = np.ones(brain.shape, bool)
-        for layer in LAYERS:  # some images fill their whole grid
-            if layer.name in data and layer.kind != "mark":
-                data[layer.name] = data[layer.name] * (brain | (layer.kind == "grey") & (data["volume"] != 0))
-        center = volume.grid.world(np.argwhere(brain).mean(0))
+        center = volume.grid.world(_middle(brain))
         box = bounding_box(brain, MARGIN_VOXELS)
-        grid = volume.grid.cropped(box)
-        cropped = {name: np.nan_to_num(one[box]) for name, one in data.items()}
+        grid, brain = volume.grid.cropped(box), brain[box]
+        cropped = {name: np.nan_to_num(_on(one, volume.grid, box)) for name, one in found.items()}
+        shown_part = brain | (cropped["volume"] != 0)
+        for layer in LAYERS:  # some images fill their whole grid
+            if layer.name in cropped and layer.kind != "mark":
+                cropped[layer.name] = cropped[layer.name] * (shown_part if layer.kind == "grey" else brain)
         while np.prod(grid.shape) > MAX_VOXELS and min(grid.shape) > 1:
             cropped, grid = {name: _joined(one) for name, one in cropped.items()}, _joined_grid(grid)
         inside = cropped["mask"] > 0.5
@@ -172,10 +176,17 @@ def _canonical(volume: Volume) -> Volume:
     return Volume(np.asarray(image.dataobj, dtype=np.float32), image.affine, volume.name)
 
 
-def _on(image: Volume, grid: VolumeGrid) -> NDArray[np.float32]:
+def _on(image: Volume, grid: VolumeGrid, box: tuple[slice, ...]) -> NDArray[np.float32]:
+    """An image in a box of a grid."""
     if image.data.shape == grid.shape and np.allclose(image.affine, grid.affine, atol=1e-3):
-        return image.data
-    return on_grid(image.data, image.grid, grid, outside=0.0)
+        return image.data[box]
+    return on_grid(image.data, image.grid, grid.cropped(box), outside=0.0)
+
+
+def _middle(brain: NDArray[np.bool_]) -> list[float]:
+    """Mean index [3] of the voxels of a region."""
+    sums = [brain.sum(tuple(other for other in range(3) if other != axis)) for axis in range(3)]
+    return [float(np.average(np.arange(len(one)), weights=one)) for one in sums]
 
 
 def _joined(data: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from importlib import import_module
 from threading import Lock, Thread
 from typing import Generic, TypeVar
 
@@ -46,3 +47,12 @@ class Ahead(Generic[Value]):
             future.set_result(self._make())
         except BaseException as error:
             future.set_exception(error)
+
+
+def import_ahead(*modules: str) -> None:
+    """Begin to import modules that will be needed later, which hold Python's lock only in part.
+
+    Args:
+        modules: names; one that cannot be imported says so where it is used.
+    """
+    Ahead(lambda: [import_module(name) for name in modules]).start()

@@ -9,6 +9,7 @@ from data_synth.motion import MotionLevel
 from data_synth.phantom import Phantom
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
+from g3r.registration import held_out
 from g3r.registration.held_out import (
     best_initialisation,
     estimate_interleave,
@@ -135,3 +136,29 @@ def test_a_stack_of_which_others_saw_nothing_correlates_by_zero(still_slices: tu
     center = slices.planes.center_mm + np.array([0.0, 0.0, 500.0]) * (slices.stack_id == 2)[:, None]
     apart = slices.with_pose(RigidPose(slices.planes.rotation, center)).take(slices.stack_id != 1)
     assert fine_held_out_correlations(apart, np.ones(len(apart))) == [0.0, 0.0]
+
+
+def test_the_profile_of_thin_slices_is_left_out_of_coarse_volumes(
+    still_slices: tuple[Slices, RigidPose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interpolation between voxels blurs more. That of thick slices counts."""
+    slices, truth = still_slices
+    posed = slices.with_motion(truth)
+
+    def volumes(thickness_mm: float) -> list[np.ndarray]:
+        variance = posed.planes.psf_var_mm2.copy()
+        variance[:, 2] = (thickness_mm / 2.355) ** 2
+        profiled = replace(posed, planes=replace(posed.planes, psf_var_mm2=variance))
+        found = []
+        for least in (held_out.THIN_VARIANCE, 0.0, np.inf):
+            monkeypatch.setattr(held_out, "THIN_VARIANCE", least)
+            found.append(volume_without(profiled, 0, 3.2)[0])
+        monkeypatch.undo()
+        return found
+
+    chosen, with_profile, without = volumes(2.2)
+    assert np.array_equal(chosen, without)
+    assert np.corrcoef(with_profile.ravel(), without.ravel())[0, 1] > 0.99
+    chosen, with_profile, without = volumes(4.0)
+    assert np.array_equal(chosen, with_profile)
+    assert not np.array_equal(chosen, without)

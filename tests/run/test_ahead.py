@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 
-from g3r.run.ahead import Ahead
+from g3r.run.ahead import Ahead, import_ahead
 
 
 def test_made_once_when_it_is_asked_for() -> None:
@@ -48,3 +51,21 @@ def test_an_error_comes_out_where_the_value_is_asked_for() -> None:
     for _ in range(2):
         with pytest.raises(ValueError, match="no"):
             one.value()
+
+
+def test_modules_are_imported_beside_the_caller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What asks for one waits until it is there; one that cannot be imported stops nobody but who uses it."""
+    text = "import threading, time\ntime.sleep(0.1)\nby = threading.current_thread().name\n"
+    (tmp_path / "slow_module.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        import_ahead("slow_module", "no_module_of_this_name")
+        for _ in range(10_000):
+            if "slow_module" in sys.modules:
+                break
+            threading.Event().wait(0.001)
+        assert importlib.import_module("slow_module").by == "ahead"
+    finally:
+        sys.modules.pop("slow_module", None)
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("no_module_of_this_name")
