@@ -182,14 +182,14 @@ class GaussianReconstructor:
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         maker = self.networks.subject_prior(plan.settings)
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
-        # V_prior of several stacks is made anew after each round, the last time with all views
-        views = 1 if n_stacks > 1 and plan.settings.pose_rounds.n_rounds(n_stacks) else plan.settings.prior_views
+        # V_prior is made anew after each round, the last time with all views
+        views = 1 if adapted(plan.settings, n_stacks).pose_rounds.n_rounds(n_stacks) else plan.settings.prior_views
         prior = run.stage(Stage.PRIOR, lambda: maker.of(volumes, poses, views, tiling))
         if n_stacks > 1:
             return prior
         if plan.settings.use_prior and plan.settings.registration.segments:
-            moved = maker.with_slices_moved
-            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: moved(prior, poses, views, tiling))
+            moved, n_moves = maker.with_slices_moved, plan.settings.pose_rounds.moves_to_prior
+            prior = run.stage(Stage.SLICES_TO_PRIOR, lambda: moved(prior, poses, n_moves, views, tiling))
         run.notes.append(NOTE_ON_SINGLE[prior.accepted])
         return prior
 

@@ -43,6 +43,7 @@ class PoseRoundSettings:
     """How often poses and volume are found in turn.
 
     Args:
+        moves_to_prior: moves of the slices of one stack towards V_prior before its rounds, at most.
         single_stack: rounds with one stack, which nothing but the prior holds in place.
         two_stacks: with two stacks.
         more_stacks: with three or more, whose poses are nearer to the truth without one.
@@ -50,6 +51,7 @@ class PoseRoundSettings:
         newton_steps: Gauss-Newton steps of all slices against the fitted volume.
     """
 
+    moves_to_prior: int = 8
     single_stack: int = 1
     two_stacks: int = 2
     more_stacks: int = 0

@@ -100,22 +100,28 @@ class SubjectPrior:
         """
         return replace(self.of(self.volumes(poses), poses, n_views, tiling), accepted=before.accepted)
 
-    def with_slices_moved(self, prior: PriorVolume, poses: Registration, n_views: int, tiling: Tiling) -> PriorVolume:
+    def with_slices_moved(
+        self, prior: PriorVolume, poses: Registration, n_moves: int, n_views: int, tiling: Tiling
+    ) -> PriorVolume:
         """The slices of a single stack registered to the prior volume, and the prior volume that they give there.
 
         Args:
             prior: of the stack; its own slices come back where they do not fit it better after moving.
             poses: that it was made with.
+            n_moves: how often at most; the first that does not bring slices much nearer to their volume is not made.
             n_views: see `estimate_prior`.
             tiling: see `estimate_prior`.
         """
-        before = prior.volumes
-        slices, gain, accepted = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
-        if not accepted:
-            return replace(prior, gain=gain, accepted=False)
-        volumes = replace(self._volumes(slices, gain, poses, False), field_rms=before.field_rms)
-        after = self.of(volumes, poses, n_views, tiling)
-        return replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
+        prior = replace(prior, accepted=False)
+        for _ in range(n_moves):
+            before = prior.volumes
+            slices, gain, nearer = register_to_prior(before.slices, prior.gain, prior.values, before.grid)
+            if not nearer:
+                break
+            volumes = replace(self._volumes(slices, gain, poses, False), field_rms=before.field_rms)
+            after = self.of(volumes, poses, n_views, tiling)
+            prior = replace(after, gain=gain, scale=prior.scale * volumes.scale, accepted=True)
+        return prior
 
     def _volumes(
         self, slices: Slices, gain: NDArray[np.float64], poses: Registration, common_bias_field: bool

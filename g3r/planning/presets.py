@@ -132,7 +132,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
     ),
     "fast": replace(
         _BALANCED,
-        pose_rounds=PoseRoundSettings(two_stacks=1),
+        pose_rounds=PoseRoundSettings(moves_to_prior=4, two_stacks=1),
         held_out=None,
         voxel_correction=None,
         prior_views=1,

@@ -148,7 +148,8 @@ class TimeBudget:
         views = min(max(1, views), PRESETS["accurate"].prior_views)
         round_s = ROUND_OVER_COARSE * coarse_s + view_s * views + compiling_s()
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
-        pose_rounds = PRESETS["accurate"].pose_rounds.at_most(rounds)
+        careful = PRESETS["accurate"].pose_rounds
+        pose_rounds = replace(careful.at_most(rounds), moves_to_prior=min(max(1, rounds), careful.moves_to_prior))
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
         if not self.settings.use_prior:
             self.settings = replace(self.settings, prior_views=0)

@@ -1,7 +1,9 @@
 """Slices of a single stack registered to the prior volume that was made from them.
 
 A volume made of one stack repeats its errors, but the prior network has learned what heads look like: it
-smooths out jumps from slice to slice, and slices registered to it come nearer to each other.
+smooths out jumps from slice to slice, and slices registered to it come nearer to each other. Volume and slices move in
+turn, so that moves may be made longer. How long the head is along the stack neither knows well: left alone, slices go
+apart there, move by move.
 """
 
 from __future__ import annotations
@@ -13,21 +15,22 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
-from g3r.geometry import VolumeGrid
+from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.slice_registration import register_slices
+from g3r.registration.slice_rounds import OVER_RELAXATION, carried_on
 from g3r.registration.thresholds import MIN_PRIOR_LOSS_REMOVED
 
 logger = logging.getLogger(__name__)
 
 N_STEPS = 4
-"""Few on purpose, and not repeated: stacks without motion would drift by 0.1 mm each time."""
+"""Few on purpose: stacks without motion would drift by 0.1 mm each time."""
 
 
 def register_to_prior(
     slices: Slices, gain: NDArray[np.float64], prior: NDArray[np.float32], grid: VolumeGrid
 ) -> tuple[Slices, NDArray[np.float64], bool]:
-    """Move each slice a little towards where it fits the prior.
+    """Move each slice a little towards where it fits the prior, and a little further.
 
     Args:
         slices: of one stack, in the intensities of the prior.
@@ -45,4 +48,25 @@ def register_to_prior(
     size = before.moments[:, 0]
     removed = 1 - float(size @ after.loss) / max(float(size @ before.loss), 1e-30)
     logger.info("slices against the prior: %.0f %% of the loss removed", 100 * removed)
-    return (moved, new_gain, True) if removed > MIN_PRIOR_LOSS_REMOVED else (slices, gain, False)
+    if removed <= MIN_PRIOR_LOSS_REMOVED:
+        return slices, gain, False
+    return without_stretch(slices, carried_on(slices, moved, OVER_RELAXATION)), new_gain, True
+
+
+def without_stretch(before: Slices, after: Slices) -> Slices:
+    """Slices moved as they were, but for what would stretch or squeeze their stack along its normal.
+
+    Args:
+        before: slices of one stack at their poses before.
+        after: the same slices at their poses now.
+    """
+    move = before.planes.pose.inverse() @ after.planes.pose
+    along_mm = move.translation_mm[:, 2]
+    header = before.header_pose
+    place_mm = header.translation_mm @ header.rotation[0, :, 2]
+    n_pixels = np.bincount(before.pixel_plane, minlength=len(before)).astype(np.float64)
+    place_mm = place_mm - np.average(place_mm, weights=n_pixels)
+    spread = float(n_pixels @ place_mm**2)
+    stretch = float((n_pixels * place_mm) @ along_mm) / spread if spread > 0 else 0.0
+    kept = RigidPose(move.rotation, move.translation_mm - np.outer(stretch * place_mm, [0, 0, 1]))
+    return after.with_pose(before.planes.pose @ kept)
