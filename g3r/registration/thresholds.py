@@ -52,8 +52,8 @@ subject it is 0.05 (rightly oriented), 0.03 (rightly) and 0.02 (wrongly); for tw
 
 MIN_PRIOR_LOSS_REMOVED = 0.10
 """Share of the robust loss that registering a single stack to its prior volume must remove to be accepted: 0.06 and
-0.07 for two stacks without motion (gains and noise). In eight with motion moves that removed 0.11 or more brought 0.0
-to 2.3 dB each, and those that removed less from 0.4 dB more to 0.8 dB less."""
+0.07 for two stacks without motion (gains and noise). In eight with motion moves that removed 0.11 or more brought
+V_prior 0.0 to 2.4 dB each, and those that removed less from 0.4 dB more to 0.8 dB less (by hand)."""
 
 MIN_HELD_OUT = 0.65
 """A stack with a lower held-out correlation is reported as not registered."""
