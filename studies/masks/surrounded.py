@@ -134,6 +134,7 @@ def _in_scene(
     truth, _ = imaged(channels[1], np.zeros_like(behind))
     gain = _gain(stack, truth)
     truth *= _beyond(case.stacks[number], stack)
+    truth[:, :, unseen] = 0
     mask = stack.mask | ((truth > 0) & (brain > 0.5))
     return replace(stack, image=stack.image + gain * (truth + outside), mask=mask)
 

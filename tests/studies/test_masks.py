@@ -126,3 +126,15 @@ def test_beyond_a_stack_that_ends_within_the_brain_there_is_no_hollow_skull(subj
     assert whole[:, :, n].any()
     assert ends[:, :, n - 1].any()
     assert not ends[:, :, n].any()
+
+
+def test_beyond_the_last_slice_of_a_stack_that_ends_within_the_brain_nothing_is_shown(subject: Path) -> None:
+    case = load_case(subject)
+    stack = case.stacks[0]
+    n = stack.image.shape[2] // 2
+    short = replace(stack, image=stack.image[:, :, :n], mask=stack.mask[:, :, :n])
+    widened = surrounded(replace(case, stacks=(short, *case.stacks[1:])), seed=1)[0]
+    ends = slice(SLICES_BEYOND + n, None)
+    assert widened.image[:, :, SLICES_BEYOND + n - 1].any()
+    assert not widened.image[:, :, ends].any()
+    assert not widened.mask[:, :, ends].any()
