@@ -7,32 +7,55 @@ narrower.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from g3r.acquisition.planes import Slices
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
 
-WORKING_VOXEL_MM = 3.2
-"""N4 sees voxels of about this size: a coil's field is smooth."""
-
 CONTROL_POINTS = 4
 """Of the cubic B-spline along each axis, of which four are the fewest: about a quadratic over the head."""
-
-ITERATIONS = (100, 10)
-"""Largest numbers on one level of control points and on the next, twice as fine. Weak fields converge in 20 on the
-first level, strong ones need more; more on the second take anatomy for a field (heads of docs/stress.md)."""
 
 MIN_VOXELS = 200
 """Fewer working voxels have no histogram."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class N4Look:
+    """How N4 sees a volume.
+
+    Attributes:
+        blur_mm: standard deviation of a Gaussian that the volume is convolved with first.
+        depth_mm: voxels of the brain that are no further inside it are left out.
+        voxel_mm: about the size of the working voxels: a coil's field is smooth.
+        iterations: largest numbers on one level of control points and on the next, twice as fine.
+    """
+
+    blur_mm: float = 0.0
+    depth_mm: float = 0.0
+    voxel_mm: float
+    iterations: tuple[int, int]
+
+
+LOOKS = (
+    # weak fields converge in 20 on the first level, strong ones need more; more on the second take anatomy for a field
+    N4Look(voxel_mm=3.2, iterations=(100, 10)),
+    N4Look(blur_mm=2.0, depth_mm=2.4, voxel_mm=4.8, iterations=(50, 5)),
+)
+"""Sharp and blurred, which is less sure of tissues but knows no folds. The errors of both have little in common."""
+
+
 def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.float32]:
     """Logarithm [I, J, K] of the smooth intensity field of a volume, with zero mean over the brain.
+
+    N4 looks twice (`LOOKS`). The mean of both fields counts, less the more they differ beside its size: where there is
+    no field, N4 finds one of 1 to 2 % in the anatomy, another one each time.
 
     Outside the brain it keeps to the range that it has inside. Zero everywhere where the brain is too small or too
     flat to tell.
@@ -44,36 +67,62 @@ def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], gri
 
     Source: Tustison et al., IEEE TMI 29 (2010), as SimpleITK has it.
     """
+    usable = brain & (volume > 0)
+    if usable.sum() < MIN_VOXELS:
+        return np.zeros(volume.shape, np.float32)
+    box = bounding_box(usable)
+    seen, usable = volume[box].astype(np.float32, copy=False), usable[box]
+    with ThreadPoolExecutor(len(LOOKS)) as pool:  # N4 has one thread, and releases Python's lock
+        found = [
+            one for one in pool.map(lambda look: _n4(seen, usable, grid.spacing_mm, look), LOOKS) if one is not None
+        ]
+    field = _as_far_as_alike(found, usable) if found else np.zeros_like(seen)
+    wide = [(part.start, n - part.stop) for part, n in zip(box, volume.shape, strict=True)]
+    return np.pad(field, wide, mode="edge")
+
+
+def _as_far_as_alike(fields: Sequence[NDArray[np.float32]], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Mean of fields, times the share that it has in its own square and the variance of the fields."""
+    mean = np.mean(fields, axis=0)
+    mean -= mean[usable].mean()
+    if len(fields) == 1:
+        return mean
+    size = float(np.mean(mean[usable] ** 2, dtype=np.float64))
+    doubt = float(np.var([one[usable] for one in fields], axis=0, ddof=1, dtype=np.float64).mean())
+    return np.asarray(mean * np.float32(size / max(size + doubt, np.finfo(float).tiny)))
+
+
+def _n4(
+    volume: NDArray[np.float32], usable: NDArray[np.bool_], spacing_mm: NDArray[np.float64], look: N4Look
+) -> NDArray[np.float32] | None:
+    """What N4 finds with one look; None where the voxels are too few or too flat."""
     import SimpleITK as sitk
 
-    field = np.zeros(volume.shape, np.float32)
-    step = [max(1, round(WORKING_VOXEL_MM / mm)) for mm in grid.spacing_mm]
-    usable = brain & (volume > 0)
+    step = [max(1, round(look.voxel_mm / mm)) for mm in spacing_mm]
+    if look.depth_mm > 0:
+        usable = distance_transform_edt(np.pad(usable, 1), sampling=spacing_mm)[1:-1, 1:-1, 1:-1] > look.depth_mm
     coarse = tuple(slice(n // 2, None, n) for n in step)
     if usable[coarse].sum() < MIN_VOXELS or np.ptp(volume[usable]) == 0:
-        return field
-    box = bounding_box(usable)
-    if min(a.stop - a.start for a in box) < CONTROL_POINTS * max(step):
-        return field
-    image = sitk.GetImageFromArray(np.ascontiguousarray(volume[box].T, np.float32))
-    mask = sitk.GetImageFromArray(np.ascontiguousarray(usable[box].T.astype(np.uint8)))
+        return None
+    if min(volume.shape) < CONTROL_POINTS * max(step):
+        return None
+    seen = gaussian_filter(volume, look.blur_mm / spacing_mm) if look.blur_mm > 0 else volume
+    image = sitk.GetImageFromArray(np.ascontiguousarray(seen.T))
+    mask = sitk.GetImageFromArray(np.ascontiguousarray(usable.T.astype(np.uint8)))
     for item in (image, mask):
-        item.SetSpacing(grid.spacing_mm.tolist())
+        item.SetSpacing(spacing_mm.tolist())
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
-    n4.SetMaximumNumberOfIterations(list(ITERATIONS))
+    n4.SetMaximumNumberOfIterations(list(look.iterations))
     n4.SetNumberOfControlPoints([CONTROL_POINTS] * 3)
     n4.SetMaskLabel(1)
     n4.SetNumberOfThreads(1)  # the same sums on every machine
     n4.Execute(sitk.Shrink(image, step), sitk.Shrink(mask, step))
-    found = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(image)).T
-    inside = found[usable[box]]
+    field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(image)).T
+    inside = field[usable]
     if not np.isfinite(inside).all():
-        return field
-    low, high, mean = float(inside.min()), float(inside.max()), float(inside.mean())
+        return None
     # the spline is an extrapolation beyond the brain
-    wide = [(a.start, n - a.stop) for a, n in zip(box, volume.shape, strict=True)]
-    field[:] = np.pad(np.nan_to_num(found).clip(low, high) - mean, wide, mode="edge")
-    return field
+    return np.asarray(np.nan_to_num(field).clip(inside.min(), inside.max()) - inside.mean(), np.float32)
 
 
 def without_field(slices: Slices, log_field: NDArray[np.float32], grid: VolumeGrid) -> Slices:
