@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from g3r.acquisition import common_bias_field
 from g3r.acquisition.common_bias_field import common_log_field, without_field
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.geometry import VolumeGrid
+from g3r.geometry.grid import bounding_box
 
 GRID = VolumeGrid.isotropic(np.full(3, -38.4), np.full(3, 38.4), 1.6)
 WORLD = GRID.world(np.moveaxis(np.indices(GRID.shape), 0, -1))
@@ -71,6 +73,25 @@ def test_where_nothing_can_be_told_there_is_no_field(case: str) -> None:
     else:
         volume = -volume
     assert not common_log_field(volume, brain, GRID).any()
+
+
+@pytest.mark.parametrize(("second", "kept"), [(1.0, 1.0), (-1.0, 0.0), (0.5, 0.5625 / (0.5625 + 0.125))])
+def test_what_two_looks_differ_in_counts_against_both(
+    monkeypatch: pytest.MonkeyPatch, second: float, kept: float
+) -> None:
+    box = bounding_box(BRAIN)
+    one = field(0.1)[box].astype(np.float32)
+    answers = dict(zip(common_bias_field.LOOKS, (one, second * one), strict=True))
+    monkeypatch.setattr(common_bias_field, "_n4", lambda volume, usable, spacing_mm, look: answers[look])
+    result = common_log_field(tissues(), BRAIN, GRID)
+    np.testing.assert_allclose(result[BRAIN], kept * (1 + second) / 2 * field(0.1)[BRAIN], atol=1e-6)
+
+
+def test_one_look_that_finds_something_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = field(0.1)[bounding_box(BRAIN)].astype(np.float32)
+    answers = dict(zip(common_bias_field.LOOKS, (one, None), strict=True))
+    monkeypatch.setattr(common_bias_field, "_n4", lambda volume, usable, spacing_mm, look: answers[look])
+    np.testing.assert_allclose(common_log_field(tissues(), BRAIN, GRID)[BRAIN], field(0.1)[BRAIN], atol=1e-6)
 
 
 def test_slices_lose_the_field_where_they_are() -> None:
