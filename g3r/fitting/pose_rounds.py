@@ -194,7 +194,7 @@ def _registered_to_fit(
     model = SamplingModel(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
     gain: NDArray[np.float64] = fit.gain
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
-    weight = slice_weights(model.losses(slices.planes, gain, width), gain)
+    weight = slice_weights(model.losses(slices.planes, gain, width), gain, slices.n_stacks)
     # the slices of a single stack have no others to be found in
     slices, n_found = find_strays(slices, gain, weight, rng) if slices.n_stacks > 1 else (slices, 0)
     slices, n_moved = try_neighbours(model, slices, gain, width=width)
@@ -203,7 +203,7 @@ def _registered_to_fit(
         registration,
         slices=without_excess_shear(registration.slices.with_pose(slices.planes.pose), registration.interleave),
         gain=gain,
-        weight=slice_weights(at_end.loss, gain),
+        weight=slice_weights(at_end.loss, gain, slices.n_stacks),
         ncc=at_end.ncc,
     )
     return moved, n_moved + n_found

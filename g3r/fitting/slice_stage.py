@@ -213,7 +213,7 @@ class SliceLoss:
         settings: SliceStageSettings,
         pixel_weight: NDArray[np.float32] | None = None,
     ) -> None:
-        self.settings, self.slice_weight = settings, slice_weight
+        self.settings, self.slice_weight, self.n_stacks = settings, slice_weight, slices.n_stacks
         self.origin_mm = parameters.origin_mm
         self.unknowns = SliceParameters(slices, gain, parameters)
         self.term = ImageTerm.of(
@@ -278,5 +278,6 @@ class SliceLoss:
         residual = self.turns.residual
         before = self.term.mean(residual, self.slice_weight)
         typical = residual / np.maximum(self.term.total_weight, 1)
-        self.slice_weight = slice_weights(typical, self.state().gain).astype(np.float32).astype(np.float64)
+        weight = slice_weights(typical, self.state().gain, self.n_stacks)
+        self.slice_weight = weight.astype(np.float32).astype(np.float64)
         return self.term.mean(residual, self.slice_weight) / before if before > 0 else 1.0

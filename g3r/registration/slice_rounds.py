@@ -146,7 +146,7 @@ class _Rounds:
         self.slices, self.gain, fit = register_slices(
             model, self.slices, self.gain, n_steps=settings.steps_per_round, width=width, normal_tie=self.normal_tie
         )
-        self.weight = slice_weights(fit.loss, self.gain)
+        self.weight = slice_weights(fit.loss, self.gain, self.slices.n_stacks)
         if fraction >= FINEST_FROM:
             self.slices = carried_on(before, self.slices, OVER_RELAXATION)
         number, median_ncc = len(self.history), float(np.median(fit.ncc))
@@ -199,7 +199,7 @@ def fitted_in_place(
         log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE))
         gain = np.exp(log_gain - log_gain.mean())
         fit = model.evaluate(slices.planes, gain, width)
-        weight = slice_weights(fit.loss, gain)
+        weight = slice_weights(fit.loss, gain, slices.n_stacks)
         ncc = float(np.median(fit.ncc))
         history.append({"round": number, "voxel_mm": voxel, "residual": width / 2, "median_ncc": ncc, "moved": 0})
         logger.info("slices in place, round %d: residual %.4f", number + 1, width / 2)

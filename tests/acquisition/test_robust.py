@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 def weights(loss: Array) -> Array:
     """Of slices that are equally bright."""
-    return slice_weights(loss, np.full(len(loss), 1.3))
+    return slice_weights(loss, np.full(len(loss), 1.3), n_stacks=3)
 
 
 def test_slice_weights_are_smooth_and_never_zero() -> None:
@@ -54,19 +54,29 @@ def test_at_most_a_share_of_the_slices_is_dropped(n: int, bad_share: float) -> N
     assert weight[bad].max() < np.delete(weight, bad).min()
 
 
+def test_no_slice_of_a_single_stack_is_dropped_but_dark_ones() -> None:
+    """A volume that does not follow a slice fits it badly, and nothing else saw what it shows."""
+    loss, gain = np.append(np.linspace(0.9, 1.1, 30), [20.0, 15.0, 0.0]), np.append(np.ones(32), 0.03)
+    assert (slice_weights(loss, gain, 2)[[-3, -2, -1]] < 0.01).all()
+    weight = slice_weights(loss, gain, 1)
+    np.testing.assert_array_equal(weight[-3:-1], DROPPED_WEIGHT)
+    assert weight[-1] < 0.01
+    assert (weight[:-3] == 1).all()
+
+
 def test_a_slice_without_signal_counts_for_nothing() -> None:
     """Explained by a gain near zero whatever the volume, it has the least residual of all."""
     loss, gain = np.full(9, 1.0), np.full(9, 1.2)
     loss[4], gain[4] = 0.0, 0.03
-    weight = slice_weights(loss, gain)
+    weight = slice_weights(loss, gain, 3)
     assert weight[4] < 0.01
     assert (np.delete(weight, 4) == 1).all()
     steps = np.geomspace(1e-6, 1.0, 200)
-    falling = [slice_weights(np.ones(9), np.append(np.ones(8), one))[-1] for one in steps]
+    falling = [slice_weights(np.ones(9), np.append(np.ones(8), one), 3)[-1] for one in steps]
     assert min(falling) > 0
     assert (np.diff(falling) >= 0).all()
-    assert slice_weights(np.ones(9), np.append(np.ones(8), DARK))[-1] == 1.0
-    np.testing.assert_allclose(slice_weights(loss, 1e3 * gain), weight)  # gains have no unit
+    assert slice_weights(np.ones(9), np.append(np.ones(8), DARK), 3)[-1] == 1.0
+    np.testing.assert_allclose(slice_weights(loss, 1e3 * gain, 3), weight)  # gains have no unit
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 2.0, 3.0])

@@ -73,8 +73,8 @@ def test_ten_metres_make_no_difference(tally: Tally) -> None:
 @pytest.mark.parametrize("loss", [0.0, 1e-30, 1.0, 1e30])
 def test_equal_slices_are_trusted_alike(loss: float, tally: Tally) -> None:
     with tally.case():
-        assert (slice_weights(np.full(9, loss), np.ones(9)) == 1).all()
-        one_bad = slice_weights(np.array([loss] * 9 + [loss * 100 + 1e-3]), np.ones(10))
+        assert (slice_weights(np.full(9, loss), np.ones(9), 3) == 1).all()
+        one_bad = slice_weights(np.array([loss] * 9 + [loss * 100 + 1e-3]), np.ones(10), 3)
         assert np.isfinite(one_bad).all()
         assert (one_bad > 0).all()
         assert (one_bad[:9] == 1).all()
