@@ -1,4 +1,8 @@
-"""`python -m studies.tradeoff.intensities`: gains and fields of slices against the truth, and what they are worth."""
+"""`python -m studies.tradeoff.intensities`: gains and fields of slices against the truth, and what they are worth.
+
+What all slices have in common their errors do not show. It shades the volume, with the common bias field (N4) and
+without.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from g3r.acquisition.images import Volume
 from g3r.acquisition.planes import Slices
@@ -44,6 +48,9 @@ SURPRISE = 0.3
 LENGTH_MM = 40.0
 """Unit of place in the fit of a line to a slice."""
 
+SHADING_MM = 10.0
+"""Standard deviation of the Gaussian over which a volume and the truth are compared for shading."""
+
 MASKS = ("as simulated", "in surroundings", "with a rim")
 
 
@@ -73,14 +80,37 @@ def measure(folder: Path, seed: int, masks: str, options: argparse.Namespace) ->
     beyond = 0 if masks == MASKS[0] else SLICES_BEYOND
     expected = ExpectedPixels.of(case, registered.slices, beyond)
     row: Row = {"case": case.name, "masks": masks, "n_stacks": registered.slices.n_stacks}
-    for name, poses in (("registered", registered), ("matched", matched)):
-        volumes = maker.volumes(poses)
+    without_n4 = replace(maker, common_bias_field=False)
+    for name, poses, made in (
+        ("registered", registered, maker),
+        ("matched", matched, maker),
+        ("without_n4", matched, without_n4),
+    ):
+        volumes = made.volumes(poses)
         moved = replace(poses.slices, slice_index=poses.slices.slice_index - beyond)
         place = volumes.grid.moved(case.pose_error(moved).common)
         depth_mm = distance_transform_edt(case.truth_mask, sampling=case.truth.grid.spacing_mm)
         found = compare(Volume(volumes.sharp, place.affine, case.name), case.truth, depth_mm > EDGE_MM, align=True)
-        row[name] = {"error": expected.error(poses), "inner_psnr_db": round(found.scores.psnr_db, 3)}
+        row[name] = {
+            "error": expected.error(poses),
+            "inner_psnr_db": round(found.scores.psnr_db, 3),
+            "shading": round(shading(found.volume, case.truth, depth_mm > DEEP_MM), 5),
+        }
     return row
+
+
+def shading(volume: NDArray[np.floating], truth: Volume, inside: NDArray[np.bool_]) -> float:
+    """Deviation of the log of the smooth factor between a volume and the truth, over voxels deep in the brain.
+
+    Args:
+        volume: [I, J, K] on the grid of the truth.
+        truth: to compare with.
+        inside: [I, J, K] voxels that count.
+    """
+    width = SHADING_MM / truth.grid.spacing_mm
+    shared = gaussian_filter(np.where(inside, volume * truth.data, 0.0), width)
+    own = gaussian_filter(np.where(inside, np.square(volume, dtype=np.float64), 0.0), width)
+    return float(np.log(shared[inside] / own[inside]).std())
 
 
 def stacks_with(case: SimulatedCase, seed: int, masks: str) -> Sequence[Stack]:
@@ -176,6 +206,9 @@ def tables(record: Record) -> dict[str, str]:
         "matched": lambda row: f"{row['matched']['error']:.1%}",
         "V_sharp as registered, dB": "{registered[inner_psnr_db]:.2f}",
         "matched, dB": "{matched[inner_psnr_db]:.2f}",
+        "without N4, dB": "{without_n4[inner_psnr_db]:.2f}",
+        "shading": lambda row: f"{row['matched']['shading']:.2%}",
+        "without N4": lambda row: f"{row['without_n4']['shading']:.2%}",
     }
     return {"intensities": f"Preset `{record['preset']}`.\n\n{table(list(record['rows'].values()), columns)}"}
 

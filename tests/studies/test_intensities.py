@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from g3r.acquisition.images import Volume
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.bench.record import machine
 from g3r.evaluation.case import load_case
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose
 from studies.tradeoff import intensities
-from studies.tradeoff.intensities import ExpectedPixels
+from studies.tradeoff.intensities import ExpectedPixels, shading
 
 N_SLICES, N_PIXELS = 20, 400
 
@@ -69,15 +70,29 @@ def test_expected_pixels_are_those_of_the_true_poses(subject: Path) -> None:
     assert np.corrcoef(moved.value, slices.value[moved.index])[0, 1] < right - 0.2
 
 
+def test_shading_is_the_smooth_factor_between_a_volume_and_the_truth() -> None:
+    shape = (40, 40, 40)
+    rng = np.random.default_rng(0)
+    truth = Volume(rng.uniform(0.5, 1.0, shape).astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0]), "truth")
+    inside = np.ones(shape, bool)
+    assert shading(3 * truth.data, truth, inside) < 1e-6  # a common factor is no shading
+    slope = np.linspace(-0.1, 0.1, 40)[:, None, None]
+    found = shading(truth.data * np.exp(slope), truth, inside)
+    assert 0.7 * slope.std() < found < slope.std()  # blurred, so a little less
+    noisy = truth.data * rng.uniform(0.95, 1.05, shape)
+    assert shading(noisy, truth, inside) < 0.1 * slope.std()
+
+
 def test_the_table_has_both_errors_and_both_volumes() -> None:
     row = {
         "case": "one",
         "masks": "with a rim",
         "n_stacks": 3,
-        "registered": {"error": 0.034, "inner_psnr_db": 30.0},
-        "matched": {"error": 0.019, "inner_psnr_db": 31.5},
+        "registered": {"error": 0.034, "inner_psnr_db": 30.0, "shading": 0.021},
+        "matched": {"error": 0.019, "inner_psnr_db": 31.5, "shading": 0.007},
+        "without_n4": {"error": 0.019, "inner_psnr_db": 30.9, "shading": 0.0147},
     }
     record = {"preset": "balanced", "weights": "ab", "machine": machine(), "rows": {"one, with a rim": row}}
     found = intensities.tables(record)["intensities"]
-    assert "| one | with a rim | 3 | 3.4% | 1.9% | 30.00 | 31.50 |" in found
+    assert "| one | with a rim | 3 | 3.4% | 1.9% | 30.00 | 31.50 | 30.90 | 0.70% | 1.47% |" in found
     assert "31.50 dB" in intensities.line("one", row)
