@@ -208,16 +208,3 @@ def _resampled(
     result[:3, 3] = affine[:3, :3] @ start + affine[:3, 3]
     logger.debug("resampled from %s to %.2f mm", np.round(spacing, 3), spacing_mm)
     return new.astype(np.float32), inside, labels, result
-
-
-def padded(volume: TruthVolume, smallest: int) -> TruthVolume:
-    """The volume with zeros on both sides of each axis shorter than `smallest` voxels."""
-    missing = np.maximum(smallest - np.array(volume.data.shape), 0)
-    if not missing.any():
-        return volume
-    width = [(int(n) // 2, int(n) - int(n) // 2) for n in missing]
-    affine = volume.affine.copy()
-    affine[:3, 3] -= affine[:3, :3] @ [before for before, _ in width]
-    return TruthVolume(
-        name=volume.name, data=np.pad(volume.data, width), mask=np.pad(volume.mask, width), affine=affine
-    )

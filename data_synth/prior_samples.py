@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from data_synth.artefacts import with_artefacts
-from data_synth.atlas import TruthVolume, cropped, padded
+from data_synth.atlas import TruthVolume, cropped
 from data_synth.augment import augmentation, augmented
 from data_synth.heads import USUAL_WEEKS, Subject, load_volume_of, weeks_of
-from data_synth.mask_errors import SMALL_MASK_SHARE, SURROUNDED_SHARE, in_surroundings, with_mask_errors
+from data_synth.mask_errors import SKULL_RIM_SHARE, SMALL_MASK_SHARE, with_mask_errors, with_skull_rim
 from data_synth.protocol_sampling import draw_settings
 from data_synth.registration_errors import ResidualKind, draw_residual_kind, mean_motion, residual_errors
 from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
@@ -40,8 +40,6 @@ MARGIN_VOXELS = 6
 """Background kept around a head: the network must learn that nothing is there."""
 MAX_VALIDATION_STACKS = 3
 """Validation volumes are of 1, 2, 3 stacks in turn."""
-REACH_VOXELS = 8
-"""Of the slices: masks reach 4 mm beyond the head, and a pixel's profile a little further."""
 UNKNOWN_MOTION_SHARE = 0.6
 """How often nothing is known of how the slices of a single stack moved against each other."""
 NOTICED_SHARE = 0.7
@@ -135,7 +133,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         truth = self.volume(which)
         if self.augmentation is not None:
             truth = augmented(truth, self.augmentation, rng)
-        truth = padded(cropped(truth, MARGIN_VOXELS), self.patch_size)
+        truth = _padded(cropped(truth, MARGIN_VOXELS), self.patch_size)
         n_stacks = 1 + index % MAX_VALIDATION_STACKS if self.in_order else None
         head = self._template_head(weeks_of(self.subjects[which], USUAL_WEEKS), rng)
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
@@ -198,13 +196,12 @@ def synthesise(
     residual = draw_residual_kind(rng)
     settings = draw_settings(residual, rng, n_stacks)
     kind = rng.random()
-    surrounded = kind < SURROUNDED_SHARE
-    seen = in_surroundings(truth, rng) if surrounded else truth
-    stacks = simulate_stacks(seen.data, seen.mask, seen.affine, settings, rng, reach_voxels=REACH_VOXELS)
+    seen = with_skull_rim(truth, rng) if kind < SKULL_RIM_SHARE else truth
+    stacks = simulate_stacks(seen.data, seen.mask, seen.affine, settings, rng)
     if artefact_share > 0:
         stacks = with_artefacts(stacks, artefact_share, rng.spawn(1)[0])
-    if kind < SURROUNDED_SHARE + SMALL_MASK_SHARE:
-        stacks = with_mask_errors(stacks, rng, grow=surrounded)
+    if kind < SKULL_RIM_SHARE + SMALL_MASK_SHARE:
+        stacks = with_mask_errors(stacks, rng, grow=kind < SKULL_RIM_SHARE)
     stacks = with_uneven_coverage(stacks, rng)
     slices = slices_from_stacks([one.stack for one in stacks])
     grid = VolumeGrid(truth.data.shape, truth.affine)
@@ -287,4 +284,17 @@ def _per_slice(
     return RigidPose(
         np.stack([stacks[s].true_pose.rotation[k] for s, k in pairs]),
         np.stack([stacks[s].true_pose.translation_mm[k] for s, k in pairs]),
+    )
+
+
+def _padded(volume: TruthVolume, smallest: int) -> TruthVolume:
+    """The volume with zeros on both sides of each axis shorter than `smallest` voxels."""
+    missing = np.maximum(smallest - np.array(volume.data.shape), 0)
+    if not missing.any():
+        return volume
+    width = [(int(n) // 2, int(n) - int(n) // 2) for n in missing]
+    affine = volume.affine.copy()
+    affine[:3, 3] -= affine[:3, :3] @ [before for before, _ in width]
+    return TruthVolume(
+        name=volume.name, data=np.pad(volume.data, width), mask=np.pad(volume.mask, width), affine=affine
     )

@@ -38,7 +38,7 @@ FIELD_OF_VIEW_MARGIN_MM = 5.0
 """Around the head at rest; motion may carry a part of it out of view, as it does in a scanner."""
 
 SIGNAL_REACH_VOXELS = 4
-"""Of heads before black: a slice's profile reaches no further."""
+"""Pixels further than this from the mask show nothing but noise and are not computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,19 +122,17 @@ def simulate_stacks(
     rng: np.random.Generator,
     *,
     fine: bool = False,
-    reach_voxels: int = SIGNAL_REACH_VOXELS,
 ) -> list[SimulatedStack]:
     """Take stacks of a volume.
 
     Args:
-        volume: [I, J, K] intensities; anything further than `reach_voxels` from the mask is not seen.
+        volume: [I, J, K] intensities; anything further than 4 voxels from the mask is not seen.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
         settings: one entry per stack.
         rng: source of randomness; each stack draws from a child of its own.
         fine: first put the volume on a grid of half the voxel size by cubic splines. Seconds slower; keeps
             the finest detail of a volume that is hardly finer than the stacks.
-        reach_voxels: pixels further from the mask show nothing but noise and are not computed.
 
     Raises:
         InputError: an empty mask, or a stack that would see nothing of the head.
@@ -142,12 +140,12 @@ def simulate_stacks(
     if not mask.any():
         raise InputError("simulation: the mask is empty; expected the head to be marked")
     inside = np.argwhere(mask)
-    low = np.maximum(inside.min(0) - reach_voxels - 1, 0)
-    high = np.minimum(inside.max(0) + reach_voxels + 2, mask.shape)
+    low = np.maximum(inside.min(0) - SIGNAL_REACH_VOXELS - 1, 0)
+    high = np.minimum(inside.max(0) + SIGNAL_REACH_VOXELS + 2, mask.shape)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     local = affine.copy()
     local[:3, 3] = affine[:3, :3] @ low + affine[:3, 3]
-    head = _Head.of(np.asarray(volume[box], np.float32), mask[box], local, fine, reach_voxels)
+    head = _Head.of(np.asarray(volume[box], np.float32), mask[box], local, fine)
     return [
         _simulate_stack(head, one, child, f"stack-{number}")
         for number, (one, child) in enumerate(zip(settings, rng.spawn(len(settings)), strict=True))
@@ -168,16 +166,9 @@ class _Head:
     bright: float
 
     @classmethod
-    def of(
-        cls,
-        volume: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        affine: NDArray[np.float64],
-        fine: bool,
-        reach_voxels: int,
-    ) -> _Head:
+    def of(cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool) -> _Head:
         grid = VolumeGrid(mask.shape, affine)
-        reach = binary_dilation(mask, iterations=reach_voxels)
+        reach = binary_dilation(mask, iterations=SIGNAL_REACH_VOXELS)
         shell = np.argwhere(mask & ~np.roll(mask, 1, 0) | mask & ~np.roll(mask, -1, 0))
         points = grid.world(shell[:: max(1, len(shell) // 4000)])
         extent = grid.world(np.argwhere(mask)[::7])
