@@ -14,20 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
+from g3r.acquisition.planes import Slices
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import Comparison, compare
 from g3r.evaluation.metrics import Scores
-from g3r.evaluation.pose_error import PoseError
+from g3r.evaluation.pose_error import PoseError, SliceKey
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
 from g3r.registration.quality import pose_warnings, stack_qualities
+from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from studies.harness import Row
 from studies.subjects import read_case
 
 BAD_MEDIAN_MM = 1.0
 """A subject whose median slice is further off than this counts as not registered."""
+
+OFF_MM, BAD_OFF_SHARE = 2.0, 0.05
+"""A volume is not to be relied on where more than this share of what it is made of is further off."""
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -44,8 +49,9 @@ def run(
         full: whether the whole reconstruction is run.
 
     Returns:
-        Errors of the poses, and all figures as `pose_row` has them; `orientation_deg` is the angle between the
-        frame of the poses and that of the atlas, `stage_seconds` wall time of each stage of a reconstruction.
+        Errors of the poses, and all figures as `pose_row` has them; `off_share` is that of `off_share`,
+        `orientation_deg` the angle between the frame of the poses and that of the atlas, `stage_seconds` wall time of
+        each stage of a reconstruction.
     """
     reconstructor = GaussianReconstructor(options.ckpt, changed(PRESETS[options.preset], changes))
     start = time.perf_counter(), time.process_time()
@@ -54,12 +60,15 @@ def run(
     seconds = time.perf_counter() - start[0], time.process_time() - start[1]
     if result is not None:
         error, warnings = case.pose_error(result.slices), result.record.warnings
+        slices, weight = result.slices, result.weight
         scores = aligned(case, result.volume, result.grid, error.common).scores
         more = {"psnr_db": scores.psnr_db, "ssim": scores.ssim, "stage_seconds": result.record.seconds}
     else:
         assert motion is not None
         warnings = pose_warnings(motion, stack_qualities(motion, len(case.stacks)), case.stacks)
-        error, more = case.pose_error(motion.slices), {}
+        slices, weight = motion.slices, motion.weight
+        error, more = case.pose_error(slices), {}
+    more["off_share"] = round(off_share(error.per_slice_mm, slices, weight), 4)
     return error, pose_row(error, warnings, *seconds) | {"orientation_deg": orientation_deg(case, error.common)} | more
 
 
@@ -75,6 +84,7 @@ def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seco
     return {
         **error.figures(),
         "worst_mm": max(error.per_slice_mm.values()),
+        "off_share": None,
         "orientation_deg": None,
         "seconds": round(seconds, 2),
         "cpu_seconds": round(cpu_seconds, 2),
@@ -82,6 +92,21 @@ def pose_row(error: PoseError, warnings: Sequence[str], seconds: float, cpu_seco
         "bad": not error.median_mm < BAD_MEDIAN_MM,
         "warnings": list(warnings),
     }
+
+
+def off_share(error_mm: Mapping[SliceKey, float], slices: Slices, weight: NDArray[np.float64]) -> float:
+    """Share of the brain in slices that are used and whose place is known, that is further off than `OFF_MM`.
+
+    Args:
+        error_mm: of the slices whose place is known.
+        slices: K slices.
+        weight: [K] of the slices; those of `DOWNWEIGHTED_BELOW` or more are used.
+    """
+    keys = list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
+    area = np.bincount(slices.pixel_plane, minlength=len(keys)) * (weight >= DOWNWEIGHTED_BELOW)
+    known = np.array([key in error_mm for key in keys])
+    off = np.array([error_mm.get(key, 0.0) > OFF_MM for key in keys])
+    return float(area[known & off].sum() / max(area[known].sum(), 1))
 
 
 def aligned(

@@ -6,11 +6,11 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from statistics import median
+from statistics import mean, median
 
 from g3r.errors import G3RError
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.runs import pose_row, run
+from studies.runs import BAD_OFF_SHARE, OFF_MM, pose_row, run
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, details, table
 
@@ -109,7 +109,9 @@ def sweep_text(record: Record, rows: dict[str, Row]) -> str:
         [
             f"Preset `{record['preset']}`, {what}; {record['jobs']} at a time, {record['threads']} threads each. "
             "TRE in mm; seconds, headers and PSNR are medians over subjects; bad: median TRE not under 1 mm; "
-            f"upright: the result is within {UPRIGHT_DEG:g} degrees of the atlas.",
+            f"used, off: mean share of the brain in slices that are used which is more than {OFF_MM:g} mm off; silent, "
+            f"off: subjects with more than {BAD_OFF_SHARE:.0%} of it, and no warning; upright: the result is within "
+            f"{UPRIGHT_DEG:g} degrees of the atlas.",
             table(summary, SUMMARY | summary_psnr),
             details("Every subject", table(({"name": name, **row} for name, row in rows.items()), EACH | each_psnr)),
         ]
@@ -122,6 +124,15 @@ def _middle(key: str, digits: int) -> Callable[[Row], str]:
 
 def _count(warned: bool, bad: bool) -> Callable[[Row], int]:
     return lambda row: sum(one["warned"] is warned and one["bad"] is bad for one in row["of"])
+
+
+def _off(group: Sequence[Row], *, silent: bool = False) -> list[float]:
+    """Shares of what volumes are made of that are in a wrong place; of those without a warning alone, if asked."""
+    return [one["off_share"] for one in group if one["off_share"] is not None and not (silent and one["warned"])]
+
+
+def _percent(shares: Sequence[float]) -> str:
+    return f"{mean(shares):.1%}" if shares else "none"
 
 
 def _psnr(group: Sequence[Row], digits: int = 1) -> str:
@@ -146,6 +157,8 @@ SUMMARY: dict[str, Cell] = {
     "wanted": lambda row: f"{WANTED_SHARE[row['level']]:.0%}",
     "median of medians": _middle("median_mm", 2),
     "median of p90": _middle("p90_mm", 2),
+    "used, off": lambda row: _percent(_off(row["of"])),
+    "silent, off": lambda row: sum(one > BAD_OFF_SHARE for one in _off(row["of"], silent=True)),
     "warned, bad": _count(warned=True, bad=True),
     "warned, good": _count(warned=True, bad=False),
     "silent, bad": _count(warned=False, bad=True),
@@ -159,6 +172,7 @@ EACH: dict[str, Cell] = {
     "median": "{median_mm:.2f}",
     "p90": "{p90_mm:.2f}",
     "worst slice": "{worst_mm:.1f}",
+    "used, off": lambda row: _percent(_off([row])),
     "warned": lambda row: "yes" if row["warned"] else "-",
     "degrees": lambda row: "-" if row["orientation_deg"] is None else f"{row['orientation_deg']:.1f}",
     "wall s": "{seconds:.0f}",

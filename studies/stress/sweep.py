@@ -14,14 +14,11 @@ import numpy as np
 from data_synth.simulator import StackSettings
 from g3r.errors import G3RError
 from g3r.evaluation.case import SimulatedCase
-from g3r.evaluation.pose_error import SliceKey
-from g3r.output.result import ReconstructionResult
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
-from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from g3r.report.verdict import DO_NOT_USE, USE, verdict_of
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.runs import aligned
+from studies.runs import BAD_OFF_SHARE, aligned, off_share
 from studies.stress import damage
 from studies.stress.damage import Damage
 from studies.subjects import SubjectSpec, simulated_case
@@ -33,8 +30,8 @@ VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
 FIRST_SEED = 91_000
 """Seeds from here on belong to this study."""
 
-BAD_MM, BAD_SHARE, BAD_PSNR_DB = 2.0, 0.05, 20.0
-"""A result is bad if more than this share of the brain in its slices is further off, or if the volume is worse."""
+BAD_PSNR_DB = 20.0
+"""A result is bad if its volume is worse, or if more than `BAD_OFF_SHARE` of the brain in its slices is off."""
 
 LAST = "stack-2.nii.gz"
 """The stack that is spoilt where one is."""
@@ -159,24 +156,15 @@ def _scores(case: SimulatedCase, options: argparse.Namespace) -> Row:
     result = GaussianReconstructor(options.ckpt, PRESETS[options.preset]).reconstruct(case.stacks)
     error, verdict = case.pose_error(result.slices), verdict_of(result.record)
     psnr_db = aligned(case, result.volume, result.grid, error.common).scores.psnr_db
-    off = _off_share(error.per_slice_mm, result)
+    off = off_share(error.per_slice_mm, result.slices, result.weight)
     return {
         "psnr_db": round(psnr_db, 3),
         "median_mm": round(error.median_mm, 4),
         "off_share": round(off, 4),
         "word": verdict.word,
         "reason": verdict.line(),
-        "bad": off > BAD_SHARE or psnr_db < BAD_PSNR_DB,
+        "bad": off > BAD_OFF_SHARE or psnr_db < BAD_PSNR_DB,
     }
-
-
-def _off_share(error_mm: Mapping[SliceKey, float], result: ReconstructionResult) -> float:
-    """Share of the brain in slices that are used and whose place is known, that is further off than `BAD_MM`."""
-    keys = list(zip(result.slices.stack_id.tolist(), result.slices.slice_index.tolist(), strict=True))
-    area = np.bincount(result.slices.pixel_plane, minlength=len(keys)) * (result.weight >= DOWNWEIGHTED_BELOW)
-    known = np.array([key in error_mm for key in keys])
-    off = np.array([error_mm.get(key, 0.0) > BAD_MM for key in keys])
-    return float(area[known & off].sum() / max(area[known].sum(), 1))
 
 
 def line(key: str, row: Row) -> str:

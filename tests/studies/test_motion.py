@@ -25,10 +25,18 @@ def test_every_subject_has_a_seed_of_its_own() -> None:
 
 
 def subject(
-    level: str, median: float, p90: float, *, warned: bool, psnr: float | None = None, turned: bool = False
+    level: str,
+    median: float,
+    p90: float,
+    *,
+    warned: bool,
+    off: float | None = 0.01,
+    psnr: float | None = None,
+    turned: bool = False,
 ) -> dict[str, Any]:
     row = {"level": level, "seed": 1, "header_mm": 9.0, "median_mm": median, "p90_mm": p90, "worst_mm": 2 * p90}
     row |= {"bad": median >= 1, "warned": warned, "seconds": 20.0, "cpu_seconds": 35.0, "turned": turned}
+    row["off_share"] = off
     row["orientation_deg"] = 2.0 if median < 1 else None if level == "mild" else 90.0
     return row if psnr is None else {**row, "psnr_db": psnr}
 
@@ -36,19 +44,19 @@ def subject(
 def test_sweep_counts_who_was_warned() -> None:
     rows = {
         "a": subject("severe", 0.4, 1.0, warned=False),
-        "b": subject("severe", 0.6, 2.0, warned=True),
-        "c": subject("severe", 8.0, 20.0, warned=True),
-        "d": subject("severe", 1.0, 3.0, warned=False),  # not under a millimetre
+        "b": subject("severe", 0.6, 2.0, warned=True, off=0.2),
+        "c": subject("severe", 8.0, 20.0, warned=True, off=None),  # refused
+        "d": subject("severe", 1.0, 3.0, warned=False, off=0.06),  # not under a millimetre
         "e": subject("mild", 0.3, 0.5, warned=False),
-        "f": subject("mild", 5.0, 7.0, warned=True, turned=True),
+        "f": subject("mild", 5.0, 7.0, warned=True, off=None, turned=True),
     }
     found = sweep.tables(SETTINGS | {"full": False, "rows": rows})
     text = found["sweep"]
-    assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 0 | 0 | 0 | 100% | 20 | 35 |" in text
-    assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 1 | 1 | 1 | 50% | 20 | 35 |" in text
-    assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | yes | 90.0 | 20 | 35 |" in text
+    assert "| mild | 1 | 9.0 | 100% | 95% | 0.30 | 0.50 | 1.0% | 0 | 0 | 0 | 0 | 100% | 20 | 35 |" in text
+    assert "| severe | 4 | 9.0 | 50% | 60% | 0.80 | 2.50 | 9.0% | 1 | 1 | 1 | 1 | 50% | 20 | 35 |" in text
+    assert "| c | 9.0 | 8.00 | 20.00 | 40.0 | none | yes | 90.0 | 20 | 35 |" in text
     assert "moderate" not in text
-    assert "| mild | 1 | 9.0 | 0% | 95% | 5.00 |" in found["sweep-turned"]
+    assert "| mild | 1 | 9.0 | 0% | 95% | 5.00 | 7.00 | none | 0 |" in found["sweep-turned"]
 
 
 def test_sweep_with_volumes() -> None:

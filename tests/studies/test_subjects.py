@@ -11,11 +11,12 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from g3r.acquisition.images import Volume, save_volume
+from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase, load_case, read_true_poses
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose, VolumeGrid
-from studies.runs import aligned, orientation_deg
+from studies.runs import aligned, off_share, orientation_deg
 from studies.subjects import SubjectSpec, case_folders, data_folder, simulated_subject
 
 SPEC = SubjectSpec(name="tiny", volume="week", motion="moderate", seed=1)
@@ -91,6 +92,15 @@ def test_error_of_a_hand_made_case(tmp_path: Path) -> None:
     assert error.per_slice_mm[0, 4] == pytest.approx(3.0, abs=0.1)
     points = case.points_mm[1, 7][:, :2]
     assert error.per_slice_mm[1, 7] == pytest.approx(np.linalg.norm(points, axis=1).mean() * 2**0.5, rel=0.02)
+
+    slices = slices_from_stacks(case.stacks)
+    weight = np.ones(20)
+    keys = list(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
+    assert off_share(error.per_slice_mm, slices, weight) == pytest.approx(2 / 20)
+    weight[keys.index((0, 4))] = 0.4  # not used
+    assert off_share(error.per_slice_mm, slices, weight) == pytest.approx(1 / 19)
+    place_unknown = {key: mm for key, mm in error.per_slice_mm.items() if key != (1, 7)}
+    assert off_share(place_unknown, slices, weight) == 0.0
 
 
 def test_a_folder_without_poses(tmp_path: Path) -> None:
