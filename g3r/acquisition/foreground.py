@@ -33,7 +33,7 @@ CORE_SHARE = 1 / 2
 EDGE = (0.03, 0.15)
 """Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
 
-SINGLE_RIM_MM = 1.6
+SINGLE_RIM_MM = 2.4
 """Beyond the support the volume of a single stack is shown so far: its slices may lie a millimetre off, and no other
 stack says where the brain ends."""
 
@@ -81,15 +81,21 @@ class Foreground:
     thin: NDArray[np.bool_]
     rim_voxels: int = 1
 
-    def edge(self, support: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.float16]:
+    def edge(
+        self, support: NDArray[np.bool_], mask: NDArray[np.bool_], brain_probability: NDArray[np.floating] | None = None
+    ) -> NDArray[np.float16]:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
 
         Args:
             support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full.
             mask: [I, J, K] the brain, holes that were filled included: shown in full.
+            brain_probability: see `mask`; taken for the share of brain where slices hardly looked.
         """
         low, high = EDGE
-        faded = np.clip((self.share - low) / (high - low), 0, 1)
+        share = self.share
+        if brain_probability is not None:
+            share = np.where(self.unseen | self.thin, np.maximum(share, brain_probability), share)
+        faded = np.clip((share - low) / (high - low), 0, 1)
         near = binary_dilation(mask | support, iterations=self.rim_voxels)
         return np.maximum(faded * near, mask | ((self.unseen | self.thin) & support)).astype(np.float16)
 

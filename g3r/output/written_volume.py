@@ -29,21 +29,21 @@ def masks_on(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float16]]:
     """Brain mask, support and edge on the output grid; on another than the prior's as the fit left the slices."""
     if grid is prior.volumes.grid:
-        return prior.mask, prior.support, prior.volumes.foreground.edge(prior.support, prior.mask)
+        return prior.mask, prior.support, prior.volumes.foreground.edge(prior.support, prior.mask, prior.brain)
     if not len(fit.cloud):
         # as registration left the slices: what they say on the prior's grid holds on this one
         mask, support = (
             on_grid(one.astype(np.float32), prior.volumes.grid, grid, outside=0.0) >= INSIDE
             for one in (prior.mask, prior.support)
         )
-        faded = prior.volumes.foreground.edge(prior.support, prior.mask)
+        faded = prior.volumes.foreground.edge(prior.support, prior.mask, prior.brain)
         edge = on_grid(faded, prior.volumes.grid, grid, outside=0.0)
         return mask, support, np.maximum(edge, mask).astype(np.float16)
     brain = prior.brain
     likely = None if brain is None else on_grid(brain, prior.volumes.grid, grid, outside=0.0)
     found = foreground(fit.slices, grid, fit.weight)
     mask, support = found.mask(likely), found.support(likely)
-    return mask, support, found.edge(support, mask)
+    return mask, support, found.edge(support, mask, likely)
 
 
 def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:

@@ -118,7 +118,7 @@ def test_the_edge_fades_from_the_brain_outwards() -> None:
 
 def test_a_single_stack_is_shown_in_full_up_to_a_rim() -> None:
     found = foreground(slices_from_stacks([ellipsoid_stack()]), GRID.respaced(0.8))
-    shown = binary_dilation(support := found.support(), iterations=2)  # 1.6 mm
+    shown = binary_dilation(support := found.support(), iterations=3)  # 2.4 mm
     np.testing.assert_array_equal(found.edge(support, found.mask()), support | (shown & ~found.unseen))
 
 
@@ -128,6 +128,17 @@ def test_what_no_slice_saw_is_shown_in_full_where_there_is_brain(n_stacks: int) 
     likely = (depth(WORLD) > 0).astype(np.float32)
     edge = found.edge(support := found.support(likely), found.mask(likely))
     np.testing.assert_array_equal(edge[found.unseen], support[found.unseen])
+
+
+def test_what_no_slice_saw_fades_with_the_probability_of_brain() -> None:
+    found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)]), GRID)
+    likely = (depth(WORLD) > 0).astype(np.float32)
+    support, mask = found.support(likely), found.mask(likely)
+    rim = found.unseen & ~support & binary_dilation(support)
+    assert rim.any()
+    for probability, shown in ((0.0, 0.0), (0.02, 0.0), (0.09, 0.5), (0.2, 1.0)):
+        edge = found.edge(support, mask, np.where(rim, np.float32(probability), likely))
+        np.testing.assert_allclose(edge[rim], shown, atol=1e-3)
 
 
 def test_a_left_handed_header_ends_where_a_right_handed_one_does() -> None:
