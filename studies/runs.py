@@ -23,7 +23,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
-from g3r.registration.quality import pose_warnings, stack_qualities
+from g3r.registration.quality import parallel_warnings, pose_warnings, stack_qualities
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from studies.harness import Row
 from studies.subjects import read_case
@@ -66,6 +66,7 @@ def run(
     else:
         assert motion is not None
         warnings = pose_warnings(motion, stack_qualities(motion, len(case.stacks)), case.stacks)
+        warnings += parallel_warnings(motion.slices)
         slices, weight = motion.slices, motion.weight
         error, more = case.pose_error(slices), {}
     more["off_share"] = round(off_share(error.per_slice_mm, slices, weight), 4)

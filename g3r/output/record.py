@@ -26,6 +26,7 @@ from g3r.planning.memory_limit import MemoryRecord
 from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
 from g3r.registration import Registration
+from g3r.registration.open_strain import crossing_deg
 from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
@@ -52,6 +53,7 @@ class RegistrationRecord:
         standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
             robust mean, and near the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.
+        crossing_deg: the largest angle between slices of two stacks in the head; None for a single stack.
     """
 
     reliable: bool | None
@@ -64,6 +66,7 @@ class RegistrationRecord:
     rounds: list[dict[str, float]]
     correlation_of_rival: float | None = None
     orientation_doubtful: bool = False
+    crossing_deg: float | None = None
 
     @classmethod
     def of(cls, registration: Registration, qualities: Sequence[StackQuality], slices: Slices) -> RegistrationRecord:
@@ -86,6 +89,7 @@ class RegistrationRecord:
             rounds=registration.history,
             correlation_of_rival=None if orientation is None else orientation.rival,
             orientation_doubtful=orientation is not None and orientation.is_doubtful,
+            crossing_deg=crossing_deg(registration.slices),
         )
 
 

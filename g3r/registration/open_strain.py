@@ -28,6 +28,19 @@ def mean_normals(slices: Slices) -> NDArray[np.float64]:
     return np.stack([normal[slices.stack_id == stack].mean(0) for stack in np.unique(slices.stack_id)])
 
 
+def crossing_deg(slices: Slices) -> float | None:
+    """The largest angle between slices of two stacks, by their mean normals, 0 to 90.
+
+    None for a single stack, and where the slices of a stack have no orientation in common.
+    """
+    normals = mean_normals(slices)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if len(normals) < 2 or length.min() < MIN_LENGTH:
+        return None
+    normals = normals / length
+    return float(np.rad2deg(np.arccos(np.clip(np.abs(normals @ normals.T), 0, 1))).max())
+
+
 def open_strain(normals: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """The strain [3, 3] that no stack sees in plane; None where there is not exactly one.
 

@@ -12,18 +12,23 @@ from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.registration.estimate import Registration
+from g3r.registration.open_strain import crossing_deg
 from g3r.registration.thresholds import (
     DOWNWEIGHTED_BELOW,
     IN_PLACE_NCC,
     IN_PLACE_SHARE,
     LEEWAY,
     MAX_DOWNWEIGHTED_SHARE,
+    MIN_CROSSING_DEG,
     MIN_HELD_OUT,
     MIN_NCC,
     MIN_OVERLAP_CORRELATION,
     MIN_OVERLAP_SHARE,
     MIRRORED_BELOW,
 )
+
+PARALLEL = "all stacks: their slices are nearly parallel in the head"
+"""How the warning about it begins."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,23 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
         if one.reliable is None and one.is_cut:
             lines.append(f"{stack.name}: the field of view cuts the head; what lies beyond was seen by no stack")
     return lines
+
+
+def nearly_parallel(angle_deg: float | None) -> bool:
+    """Whether stacks cross at so small an angle (`crossing_deg`) that they do not check each other."""
+    return angle_deg is not None and angle_deg < MIN_CROSSING_DEG
+
+
+def parallel_warnings(slices: Slices) -> list[str]:
+    """A line where the slices of all stacks are nearly parallel in the head; none where they are not.
+
+    Args:
+        slices: of all stacks, in place.
+    """
+    angle_deg = crossing_deg(slices)
+    if angle_deg is None or not nearly_parallel(angle_deg):
+        return []
+    return [f"{PARALLEL} ({angle_deg:.0f} degrees between them; good is {MIN_CROSSING_DEG:.0f} and above)"]
 
 
 def _overlap_text(one: StackQuality) -> str:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.planning.anatomy import NAME_OF
-from g3r.registration.quality import is_mirrored, shortfalls
-from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.registration.quality import PARALLEL, is_mirrored, nearly_parallel, shortfalls
+from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
@@ -82,6 +82,13 @@ MESSAGES = {
         CHECK,
         "there is a single stack: nothing checks where its slices were put, nor which way the head lies",
         "Compare the volume with the stack; two more stacks in other planes make it far safer.",
+    ),
+    "stacks parallel": Message(
+        CHECK,
+        "the slices of all stacks are nearly parallel in the head ({angle} degrees between them; good is {good:.0f} "
+        "and above): across their slices the stacks do not check each other, though they agree",
+        "The head may have turned between stacks. Lengths and shapes across the slices may be wrong by millimetres; "
+        "add a stack in another plane.",
     ),
     "orientation doubtful": Message(
         CHECK,
@@ -198,6 +205,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if len(record.stacks) == 1:
         yield "single stack", {}
     found = record.registration
+    if found and nearly_parallel(found.crossing_deg):
+        yield "stacks parallel", {"angle": f"{found.crossing_deg:.0f}", "good": MIN_CROSSING_DEG}
     if found and found.orientation_doubtful:
         best, rival = found.correlation_with_template, found.correlation_of_rival
         yield "orientation doubtful", {"best": f"{best:.2f}", "rival": f"{rival:.2f}"}
@@ -262,5 +271,7 @@ def _is_said_otherwise(line: str, record: RunRecord) -> bool:
     """Whether a warning of the run has a message of its own in the table."""
     if line.startswith("the loss of the fit rose: "):
         return record.n_rollbacks > 0
+    if line.startswith(PARALLEL):
+        return True
     ends = ("registration probably failed", "probably a mirror image of", "no slice with enough masked pixels")
     return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)

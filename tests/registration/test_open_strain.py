@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from g3r.registration.open_strain import open_strain
+from g3r.registration.open_strain import crossing_deg, open_strain
+from g3r.registration.quality import PARALLEL, parallel_warnings
+from g3r.registration.thresholds import MIN_CROSSING_DEG
 
 X, Y, Z = np.eye(3)
 
@@ -35,3 +41,43 @@ def test_further_stacks_of_the_same_two_orientations_leave_it_open(third: np.nda
 )
 def test_one_and_three_orientations_do_not_leave_one_strain(normals: list[np.ndarray]) -> None:
     assert open_strain(np.stack(normals)) is None
+
+
+def slices_along(*normals: np.ndarray, wobble_deg: float = 0.0) -> Any:
+    """Stacks of 40 slices each, of which only the orientation is known; slices tilt either way about the mean."""
+    rotation, stack_id = [], []
+    for stack, normal in enumerate(normals):
+        turn = Rotation.align_vectors(normal[None], Z[None])[0]
+        for sign in (1, -1):
+            own = turn * Rotation.from_rotvec(sign * np.deg2rad(wobble_deg) * X)
+            rotation += [own.as_matrix()] * 20
+        stack_id += [stack] * 40
+    return SimpleNamespace(stack_id=np.array(stack_id), planes=SimpleNamespace(rotation=np.array(rotation)))
+
+
+@pytest.mark.parametrize(
+    ("normals", "expected"),
+    [
+        ([Z, X], 90),
+        ([Z, tilted(Z, X, 25)], 25),
+        ([Z, -tilted(Z, X, 25)], 25),
+        ([Z, tilted(Z, X, 15), tilted(Z, X, -20)], 35),
+        ([X, Y, Z], 90),
+    ],
+)
+@pytest.mark.parametrize("wobble_deg", [0.0, 20.0])
+def test_stacks_cross_at_the_largest_angle_between_two(
+    normals: list[np.ndarray], expected: float, wobble_deg: float
+) -> None:
+    slices = slices_along(*normals, wobble_deg=wobble_deg)
+    assert crossing_deg(slices) == pytest.approx(expected, abs=1e-4)
+    lines = parallel_warnings(slices)
+    assert len(lines) == (expected < MIN_CROSSING_DEG)
+    assert all(line.startswith(f"{PARALLEL} ({expected:.0f} degrees") for line in lines)
+
+
+@pytest.mark.parametrize(("normals", "wobble_deg"), [([Z], 0.0), ([Z, tilted(Z, Y, 10)], 70.0)])
+def test_nothing_is_said_of_one_stack_and_of_slices_all_about(normals: list[np.ndarray], wobble_deg: float) -> None:
+    slices = slices_along(*normals, wobble_deg=wobble_deg)
+    assert crossing_deg(slices) is None
+    assert parallel_warnings(slices) == []

@@ -26,6 +26,7 @@ FILLED_IN = {
     "rival": "N",
     "what": "brain",
     "handedness": "N",
+    "angle": "N",
     "shortfalls": "what is bad of it, and what is good",
 }
 

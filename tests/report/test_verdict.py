@@ -10,7 +10,7 @@ import pytest
 from g3r.bids.outcome import TRUSTED, _verdict
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
-from g3r.registration.quality import StackQuality
+from g3r.registration.quality import PARALLEL, StackQuality
 from g3r.report.verdict import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE, verdict_of
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import to_plain
@@ -45,6 +45,14 @@ def oriented(best: float, rival: float) -> RunRecord:
     return replace(found, registration=registration)
 
 
+def crossing(angle_deg: float) -> RunRecord:
+    """Two stacks whose slices cross at that angle, with the warning that a run would have."""
+    found = record(stack("a.nii"), stack("b.nii"))
+    assert found.registration is not None
+    registration = replace(found.registration, crossing_deg=angle_deg)
+    return replace(found, registration=registration, warnings=[f"{PARALLEL} (...)"])
+
+
 CASES: dict[str, tuple[RunRecord, str, str]] = {
     "failed": (
         stacks_with(stack("c.nii", quality(False, 0.31))),
@@ -62,6 +70,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         stacks_with(stack("c.nii", StackQuality(True, 0.81, 0.82, 0.0))),
         CHECK,
         "the slices of c.nii agree with the volume by 0.82, those of another stack by 0.95",
+    ),
+    "parallel": (
+        crossing(13.2),
+        CHECK,
+        "the slices of all stacks are nearly parallel in the head (13 degrees between them; good is 30 and above)",
     ),
     "single": (record(stack("a.nii", quality(None, None))), CHECK, "single stack"),
     "orientation": (
