@@ -7,71 +7,21 @@ import pytest
 from scipy.ndimage import binary_dilation, label
 
 from g3r.acquisition.foreground import Foreground, foreground
-from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slices_from_stacks
-from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.geometry import RigidPose, VolumeGrid
-
-RADII_MM = np.array([27.0, 32.0, 24.0])
-TRUE_MM3 = 4 / 3 * np.pi * RADII_MM.prod()
-GRID = VolumeGrid.isotropic([-42] * 3, [42] * 3, 1.5)
-WORLD = GRID.world(np.stack(np.meshgrid(*[np.arange(n) for n in GRID.shape], indexing="ij"), -1))
-TURNS = (np.eye(3), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]))
-
-
-def depth(world: np.ndarray) -> np.ndarray:
-    """1 at the ellipsoid's middle, 0 on its surface."""
-    return 1 - np.linalg.norm(world / RADII_MM, axis=-1)
-
-
-def ellipsoid_stack(
-    turn: np.ndarray = TURNS[0],
-    *,
-    thickness_mm: float = 3.0,
-    gap_mm: float = 0.0,
-    left_handed: bool = False,
-    low_mm: float = -44.0,
-    hole: bool = False,
-) -> Stack:
-    """A stack that covers the ellipsoid from `low_mm` upwards along its third axis."""
-    spacing = np.array([1.2, 1.2, thickness_mm + gap_mm])
-    n = np.append(np.full(2, 74), int((44 - low_mm) / spacing[2]))
-    axes = turn * ([1, 1, -1] if left_handed else [1, 1, 1])
-    affine = np.eye(4)
-    affine[:3, :3] = axes * spacing
-    corner = np.array([-43.8, -43.8, -44.0 if left_handed else low_mm])
-    affine[:3, 3] = axes @ corner
-    index = np.stack(np.meshgrid(*[np.arange(k) for k in n], indexing="ij"), -1)
-    world = VolumeGrid(tuple(n), affine).world(index)
-    mask = depth(world) > 0
-    if hole:
-        mask &= np.linalg.norm(world, axis=-1) > 5
-    image = (100 + index.sum(-1)).astype(np.float32)
-    return Stack(image=image, mask=mask, affine=affine, thickness_mm=thickness_mm)
-
-
-def without(stack: Stack, low_mm: float, high_mm: float) -> Stack:
-    """The stack with blank slices between two heights along its third axis."""
-    height = (
-        stack.affine[:3, 2]
-        / stack.spacing_mm[2]
-        @ (stack.affine[:3, 3, None] + stack.affine[:3, 2, None] * np.arange(stack.image.shape[2]))
-    )
-    image, mask = stack.image.copy(), stack.mask.copy()
-    missing = (height > low_mm) & (height < high_mm)
-    assert missing.any()
-    image[:, :, missing], mask[:, :, missing] = 0, False
-    return replace(stack, image=image, mask=mask)
-
-
-def foreground_mask(slices: Slices, weight: np.ndarray | None = None) -> np.ndarray:
-    """The brain mask where no network tells of unseen voxels."""
-    return foreground(slices, GRID, weight).support()
-
-
-def volume_of(mask: np.ndarray) -> float:
-    return float(mask.sum() * GRID.voxel_volume_mm3)
+from tests.acquisition.ellipsoids import (
+    GRID,
+    RADII_MM,
+    TRUE_MM3,
+    TURNS,
+    WORLD,
+    depth,
+    ellipsoid_stack,
+    foreground_mask,
+    volume_of,
+    without,
+)
 
 
 @pytest.mark.parametrize("n_stacks", [1, 2, 3])
@@ -91,54 +41,6 @@ def test_the_volume_is_the_heads(n_stacks: int, thickness_mm: float, gap_mm: flo
     assert mask[depth(WORLD) > 0.05].all()  # gaps are closed
     assert not mask[depth(WORLD) < -0.2].any()
     assert label(mask)[1] == 1
-
-
-@pytest.mark.parametrize("n_stacks", [2, 3])
-def test_less_is_shown_beyond_the_head_and_nothing_of_it_is_lost(n_stacks: int) -> None:
-    found = foreground(slices_from_stacks([ellipsoid_stack(turn) for turn in TURNS[:n_stacks]]), GRID)
-    inside, in_full = depth(WORLD) > 0, binary_dilation(support := found.support())
-    edge = found.edge(support, found.mask())
-    assert edge[inside].mean(dtype=float) > 0.99
-    assert edge[~inside].sum(dtype=float) < 0.75 * in_full[~inside].sum()
-
-
-def test_the_edge_fades_from_the_brain_outwards() -> None:
-    found = foreground(slices_from_stacks([ellipsoid_stack(turn) for turn in TURNS]), GRID)
-    edge = found.edge(support := found.support(), found.mask())
-    assert edge.dtype == np.float16
-    assert (edge[depth(WORLD) > 0.05] == 1).all()
-    assert not edge[~binary_dilation(support)].any()
-    assert ((edge > 0) & (edge < 1)).any()
-    rings = [
-        edge[(low < -depth(WORLD)) & (-depth(WORLD) <= low + 0.03)].mean() for low in (0.0, 0.03, 0.06, 0.09, 0.12)
-    ]
-    assert rings == sorted(rings, reverse=True)
-    assert not edge[depth(WORLD) < -0.15].any()
-
-
-def test_a_single_stack_is_shown_in_full_up_to_a_rim() -> None:
-    found = foreground(slices_from_stacks([ellipsoid_stack()]), GRID.respaced(0.8))
-    shown = binary_dilation(support := found.support(), iterations=3)  # 2.4 mm
-    np.testing.assert_array_equal(found.edge(support, found.mask()), support | (shown & ~found.unseen))
-
-
-@pytest.mark.parametrize("n_stacks", [1, 2])
-def test_what_no_slice_saw_is_shown_in_full_where_there_is_brain(n_stacks: int) -> None:
-    found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)] * n_stacks), GRID)
-    likely = (depth(WORLD) > 0).astype(np.float32)
-    edge = found.edge(support := found.support(likely), found.mask(likely))
-    np.testing.assert_array_equal(edge[found.unseen], support[found.unseen])
-
-
-def test_what_no_slice_saw_fades_with_the_probability_of_brain() -> None:
-    found = foreground(slices_from_stacks([ellipsoid_stack(low_mm=0.0, thickness_mm=4.0)]), GRID)
-    likely = (depth(WORLD) > 0).astype(np.float32)
-    support, mask = found.support(likely), found.mask(likely)
-    rim = found.unseen & ~support & binary_dilation(support)
-    assert rim.any()
-    for probability, shown in ((0.0, 0.0), (0.02, 0.0), (0.09, 0.5), (0.2, 1.0)):
-        edge = found.edge(support, mask, np.where(rim, np.float32(probability), likely))
-        np.testing.assert_allclose(edge[rim], shown, atol=1e-3)
 
 
 def test_a_left_handed_header_ends_where_a_right_handed_one_does() -> None:
