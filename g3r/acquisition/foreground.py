@@ -33,7 +33,7 @@ CORE_SHARE = 1 / 2
 EDGE = (0.03, 0.15)
 """Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
 
-SINGLE_RIM_MM = 2.4
+SINGLE_RIM_MM = 1.6
 """Beyond the support the volume of a single stack is shown so far: its slices may lie a millimetre off, and no other
 stack says where the brain ends."""
 

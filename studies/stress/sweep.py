@@ -201,9 +201,11 @@ def _says_unseen(row: Row) -> bool:
 
 
 def _warning(row: Row) -> str:
-    """Whether a warning names a fault that the stacks have; empty where there is none."""
+    """Whether a warning is about a bad result or names a fault that the stacks have; empty where there is none."""
     if _is_use(row):
         return ""
+    if row["bad"]:
+        return TRUE
     fault = next(one.fault for one in CONDITIONS if one.name == f"{row['what']}: {row['level']}")
     return TRUE if _says_unseen(row) or (fault and fault in row["reason"]) else FALSE
 
