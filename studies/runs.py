@@ -23,6 +23,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.planning.presets import PRESETS, changed
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration
+from g3r.registration.open_strain import crossing_deg
 from g3r.registration.quality import parallel_warnings, pose_warnings, stack_qualities
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from studies.harness import Row
@@ -49,9 +50,9 @@ def run(
         full: whether the whole reconstruction is run.
 
     Returns:
-        Errors of the poses, and all figures as `pose_row` has them; `off_share` is that of `off_share`,
-        `orientation_deg` the angle between the frame of the poses and that of the atlas, `stage_seconds` wall time of
-        each stage of a reconstruction.
+        Errors of the poses, and all figures as `pose_row` has them; `off_share` and `crossing_deg` are those of the
+        functions of these names, `orientation_deg` the angle between the frame of the poses and that of the atlas,
+        `stage_seconds` wall time of each stage of a reconstruction.
     """
     reconstructor = GaussianReconstructor(options.ckpt, changed(PRESETS[options.preset], changes))
     start = time.perf_counter(), time.process_time()
@@ -69,6 +70,7 @@ def run(
         warnings += parallel_warnings(motion.slices)
         slices, weight = motion.slices, motion.weight
         error, more = case.pose_error(slices), {}
+    more["crossing_deg"] = crossing_deg(slices)
     more["off_share"] = round(off_share(error.per_slice_mm, slices, weight), 4)
     return error, pose_row(error, warnings, *seconds) | {"orientation_deg": orientation_deg(case, error.common)} | more
 

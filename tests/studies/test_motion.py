@@ -11,7 +11,7 @@ import pytest
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose
 from g3r.planning.presets import PRESETS, changed
-from studies.motion import bias, layers, sweep
+from studies.motion import bias, crossing, layers, sweep
 from studies.motion.figure import draw_slice_errors, jerk_slices, places_in_time
 
 SETTINGS = {"preset": "balanced", "jobs": 1, "threads": 2}
@@ -114,3 +114,19 @@ def test_figure_of_layers_known_and_new(tmp_path: Path) -> None:
     case = {"layers": shown, "n_slices": [10], "jerks": [[0, 4]]}
     draw_slice_errors({"a": case, "b": case, "c": case}, tmp_path / "made" / "figure.png")
     assert [path.name for path in (tmp_path / "made").iterdir()] == ["figure.png"]
+
+
+def test_pairs_are_counted_by_their_crossing_angle_and_by_what_warns() -> None:
+    assert len({spec.seed for spec in crossing.specs()}) == len(crossing.specs()) == 45
+    assert all(len({one.oblique_deg for one in spec.acquisition(3)}) == 1 for spec in crossing.specs())
+    common = {"level": "mild", "tilt_deg": 12.0, "p90_mm": 2.0}
+    angle = [f"{crossing.PARALLEL} (11 degrees ...)"]
+    rows = {
+        "a": {"crossing_deg": 11.0, "median_mm": 3.0, "off_share": 0.6, "warned": True, "warnings": angle},
+        "b": {"crossing_deg": 14.9, "median_mm": 1.0, "off_share": 0.0, "warned": True, "warnings": angle},
+        "c": {"crossing_deg": 90.0, "median_mm": 0.2, "off_share": 0.06, "warned": True, "warnings": ["x: failed"]},
+    }
+    text = crossing.tables({"preset": "fast", "rows": {name: common | row for name, row in rows.items()}})["crossing"]
+    assert "| 0 to 15 | 2 | 2.00 | 3.00 | 1 | 1 | 0 |" in text
+    assert "| 45 to 90 | 1 | 0.20 | 0.20 | 1 | 1 | 1 |" in text
+    assert "| 15 to 30 |" not in text
