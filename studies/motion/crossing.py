@@ -1,4 +1,4 @@
-"""`python -m studies.motion.crossing`: two stacks at any angle to each other, registered and compared with the truth."""
+"""`python -m studies.motion.crossing`: two stacks at any angle, registered and compared with the truth."""
 
 from __future__ import annotations
 
