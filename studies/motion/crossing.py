@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import median
 
 from data_synth.simulator import StackSettings
@@ -43,7 +44,7 @@ class TiltedSubject(SubjectSpec):
 
 def specs() -> list[TiltedSubject]:
     """Every tilt of every head at every level of motion; each with a seed of its own."""
-    chosen = []
+    chosen: list[TiltedSubject] = []
     for level in LEVELS:
         for tilt_deg in TILTS_DEG:
             for volume in VOLUMES:
@@ -67,9 +68,8 @@ def measure(spec: TiltedSubject, options: argparse.Namespace) -> Row:
 
 def line(name: str, row: Row) -> str:
     """A finished subject."""
-    return (
-        f"{name}: {row['crossing_deg']:.0f} degrees, TRE median {row['median_mm']:.2f} mm, off {row['off_share']:.1%}"
-    )
+    angle = f"{row['crossing_deg']:.0f} degrees"
+    return f"{name}: {angle}, TRE median {row['median_mm']:.2f} mm, off {row['off_share']:.1%}"
 
 
 def tables(record: Record) -> dict[str, str]:
@@ -77,7 +77,7 @@ def tables(record: Record) -> dict[str, str]:
     rows = [{"name": name, **row} for name, row in record["rows"].items()]
     ranges = [
         {"low": low, "high": high, "of": [row for row in rows if low <= row["crossing_deg"] < high]}
-        for low, high in zip(EDGES_DEG, EDGES_DEG[1:], strict=False)
+        for low, high in pairwise(EDGES_DEG)
     ]
     text = (
         f"Preset `{record['preset']}`, registration alone. TRE in mm; bad: more than {BAD_OFF_SHARE:.0%} of the brain "
