@@ -74,7 +74,7 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
     "parallel": (
         crossing(13.2),
         CHECK,
-        "the slices of all stacks are nearly parallel in the head (13 degrees between them; good is 30 and above)",
+        "the slices of all stacks are nearly parallel in the head (13 degrees between them; good is 45 and above)",
     ),
     "single": (record(stack("a.nii", quality(None, None))), CHECK, "single stack"),
     "orientation": (
