@@ -27,7 +27,7 @@ from g3r.output.stage_results import StageResults
 from g3r.planning.plan import FixedPlan, Plan
 from g3r.planning.presets import ReconstructionSettings, adapted, settings_of
 from g3r.planning.stages import Stage, stage_rng
-from g3r.registration import GivenPoses, Registration, RegistrationSettings, register
+from g3r.registration import GivenPoses, Registration, RegistrationSettings, register_robustly
 from g3r.registration.atlas_search import template_fits
 from g3r.registration.given import measure
 from g3r.registration.quality import unknown_orientation_note
@@ -143,7 +143,7 @@ class GaussianReconstructor:
         spare = settings.network_as_reserve and template is not None and template_fits(slices, template)
         if settings.network and not spare and (proposed := self.networks.proposed_motion(slices)) is not None:
             proposals["network"] = proposed
-        return register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
+        return register_robustly(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
 
     def _poses(
         self, slices: Slices, given: Registration | GivenPoses | None, plan: Plan, run: RunContext

@@ -19,6 +19,7 @@ DEFAULTS = {
     "preset": "balanced",
     "space": "standard",
     "unseen": "fill",
+    "misfits": "leave-out",
     "resolution": 0.8,
     "seed": 0,
 }
@@ -105,6 +106,11 @@ def _add_result(parser: argparse.ArgumentParser) -> None:
         "--unseen",
         choices=("fill", "blank"),
         help="what to show of the brain where no slice looked: an estimate, or zeros (default: fill)",
+    )
+    result.add_argument(
+        "--misfits",
+        choices=("leave-out", "keep"),
+        help="stacks that do not fit the others, where most do (default: leave-out; --preset preview keeps them)",
     )
     result.add_argument(
         "--keep-header-text",

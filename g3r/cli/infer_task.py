@@ -197,7 +197,12 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
     preset = PRESETS[options.preset]
     if options.time_budget is not None:
         preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
-    registration = replace(preset.registration, standard_orientation=options.space == "standard", seed=options.seed)
+    registration = replace(
+        preset.registration,
+        standard_orientation=options.space == "standard",
+        leave_out_misfits=preset.registration.leave_out_misfits and options.misfits == "leave-out",
+        seed=options.seed,
+    )
     settings = replace(
         preset,
         registration=registration,

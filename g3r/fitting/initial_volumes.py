@@ -157,6 +157,7 @@ def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
         InputError: the two are not about the same slices.
     """
     found = registration.slices
+    slices = slices.take(~np.isin(slices.stack_id, [n for n, _ in registration.left_out]))
     if not (np.array_equal(found.stack_id, slices.stack_id) and np.array_equal(found.slice_index, slices.slice_index)):
         raise InputError(
             f"registration of {len(found)} slices; expected {len(slices)} slices of these stacks in their order; "

@@ -26,12 +26,13 @@ from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
 from g3r.registration.quality import (
-    StackQuality,
+    left_out_notes,
     parallel_warnings,
     pose_warnings,
     registration_reliable,
     stack_qualities,
 )
+from g3r.registration.stack_quality import StackQuality
 from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
@@ -59,6 +60,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     """
     settings, volumes = plan.settings, found.prior.volumes
     qualities = stack_qualities(found.registration, len(found.stacks))
+    run.notes += left_out_notes(qualities, found.stacks)
     run.warnings += pose_warnings(found.registration, qualities, found.stacks)
     run.warnings += parallel_warnings(found.registration.slices)
     grid = volumes.grid.respaced(settings.resolution_mm)

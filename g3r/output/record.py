@@ -27,7 +27,8 @@ from g3r.planning.plan import BudgetRecord
 from g3r.planning.presets import ReconstructionSettings
 from g3r.registration import Registration
 from g3r.registration.open_strain import crossing_deg
-from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
+from g3r.registration.quality import registration_reliable, registration_summary
+from g3r.registration.stack_quality import StackQuality
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import from_plain, to_plain
 from g3r.run.provenance import FileHash

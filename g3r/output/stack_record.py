@@ -16,7 +16,8 @@ from g3r.acquisition.stacks import Stack
 from g3r.errors import InputError
 from g3r.registration import Registration
 from g3r.registration.atlas_frame import motion_to_headers
-from g3r.registration.quality import DOWNWEIGHTED_BELOW, StackQuality
+from g3r.registration.stack_quality import StackQuality
+from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,8 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.output.mixture import FinishedVolume
 from g3r.registration import Registration
 from g3r.registration.atlas_frame import centred_on_headers
-from g3r.registration.quality import DOWNWEIGHTED_BELOW, stack_qualities
+from g3r.registration.quality import stack_qualities
+from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from g3r.uncertainty.unseen import MENTIONED_ABOVE
 
 Told = tuple[str, dict[str, Any]]
@@ -39,7 +40,8 @@ def told_of(found: object) -> Iterator[Told]:
 @told_of.register
 def _(found: Registration) -> Iterator[Told]:
     slices = found.slices
-    qualities = stack_qualities(found, int(slices.stack_id.max()) + 1)
+    asked = stack_qualities(found, int(slices.stack_id.max()) + 1)
+    qualities = [one for one in asked if not one.left_out]
     if found.held_out is None:
         yield "head alone", {}
     else:

@@ -15,11 +15,13 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration import Registration
 from g3r.registration.atlas_frame import Orientation
 from g3r.registration.overlap import Overlap
+from g3r.registration.stack_quality import StackQuality
 
 STORED_RECORDS = (
     Registration,
     AreaProfile,
     Overlap,
+    StackQuality,
     InitialVolumes,
     PriorVolume,
     RefinedPoses,

@@ -128,6 +128,7 @@ PRESETS: dict[str, ReconstructionSettings] = {
             finest_voxel_pixels=0.9,
             max_pixels=400_000,
             check_handedness=False,
+            leave_out_misfits=False,
         ),
     ),
     "fast": replace(

@@ -1,6 +1,7 @@
 """Poses of stacks and slices by classical registration, in the order of the data.
 
-`estimate.register` is the whole of it, `settings` chooses its layers, `thresholds` holds its tuned decisions.
+`misfits.register_robustly` is the whole of it, `estimate.register` that with all stacks, `settings` chooses its
+layers, `thresholds` holds its tuned decisions.
 
 1. `bias_correction` removes the slow trend of intensity from each stack.
 2. `global_search` tries several initialisations of all poses: the headers; `stack_registration` (stack to
@@ -12,7 +13,7 @@
 4. `slice_rounds` alternates between a volume of all slices and `slice_registration`, Gauss-Newton steps of
    every slice by the `normal_equations` of the slice model.
 5. `atlas_frame` moves the result into the standard orientation or keeps the frame of the scanner; `quality`
-   says which stacks are registered.
+   says which stacks are registered, and `misfits` leaves those out that do not fit the others.
 
 Where stacks lack slices (`acquisition.area_profile` says which), the template stands for what other stacks did not
 see (`unseen`), and `overlap` measures how far stacks prove each other's poses.
@@ -24,6 +25,7 @@ Where poses come from elsewhere, `given` takes the place of steps 2 to 4 and mea
 
 from g3r.registration.estimate import Registration, register
 from g3r.registration.given import GivenPoses
+from g3r.registration.misfits import register_robustly
 from g3r.registration.settings import RegistrationSettings
 
-__all__ = ["GivenPoses", "Registration", "RegistrationSettings", "register"]
+__all__ = ["GivenPoses", "Registration", "RegistrationSettings", "register", "register_robustly"]

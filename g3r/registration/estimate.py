@@ -26,6 +26,7 @@ from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, refine_slices
+from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
 from g3r.registration.unseen import TemplateFill
 from g3r.run.deadline import Deadline
@@ -57,6 +58,8 @@ class Registration:
         profiles: of each stack, missing slices included.
         overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
         handedness: of each stack, see `registration.handedness`; None where it was not asked for.
+        left_out: numbers of stacks that are not among the slices since they do not fit the others, and their quality
+            beside these.
     """
 
     slices: Slices
@@ -73,6 +76,7 @@ class Registration:
     profiles: list[AreaProfile] = field(default_factory=list)
     overlap: Overlap | None = None
     handedness: list[float | None] | None = None
+    left_out: list[tuple[int, StackQuality]] = field(default_factory=list)
 
     def __repr__(self) -> str:
         frame = "scanner frame" if self.orientation is None else "atlas frame"

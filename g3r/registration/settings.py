@@ -27,6 +27,7 @@ class RegistrationSettings:
         max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
         check_handedness: ask whether a stack is a mirror image of the others, where an atlas template fits.
+        leave_out_misfits: leave stacks out that do not fit the others, where most do, and register those anew.
         seed: of the random search.
     """
 
@@ -45,4 +46,5 @@ class RegistrationSettings:
     max_pixels: int = 400_000
     standard_orientation: bool = True
     check_handedness: bool = True
+    leave_out_misfits: bool = True
     seed: int = 0

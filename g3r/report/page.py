@@ -75,6 +75,7 @@ def report_html(folder: Path, slices: Slices | None = None) -> str:
         verdict=verdict_of(record),
         record=record,
         stacks=stack_rows(record),
+        n_stacks_used=sum(not (stack.quality and stack.quality.left_out) for stack in record.stacks),
         scale=scale_ends(),
         good=RETRY_BELOW_CORRELATION,
         bad=MIN_HELD_OUT,

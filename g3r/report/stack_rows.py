@@ -38,7 +38,7 @@ class StackRow:
         used, n_slices: slices of at least half the full weight, and all.
         agreement: with the other stacks, as text.
         place: of the agreement on the scale, 0 to 1; None where nothing was compared.
-        judgement: "good", "doubtful", "bad" or "not checked".
+        judgement: "good", "doubtful", "bad", "left out" or "not checked".
         segments: how often the head jumped while it was acquired, in words.
     """
 
@@ -94,6 +94,8 @@ def _jumps(n: int) -> str:
 
 
 def _judgement(stack: StackRecord, found: float | None) -> str:
+    if stack.quality and stack.quality.left_out:
+        return "left out"
     if stack.quality and stack.quality.reliable is False:
         return "bad"
     if found is None:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from g3r.planning.anatomy import NAME_OF
-from g3r.registration.quality import PARALLEL, is_mirrored, nearly_parallel, shortfalls
-from g3r.registration.thresholds import MAX_NCC_BELOW_OTHERS, MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.registration.quality import LEFT_OUT, PARALLEL, misfit, nearly_parallel
+from g3r.registration.stack_quality import is_mirrored, shortfalls, unlike_others
+from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
@@ -54,6 +55,12 @@ MESSAGES = {
         "{good:g})",
         "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
         "as left may be right. Find out which one is wrong, leave it out, and run again.",
+    ),
+    "mirrored left out": Message(
+        CHECK,
+        "{stack} was left out: {why}",
+        "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
+        "as left may be right. Find out which one is wrong.",
     ),
     "stack not used": Message(
         DO_NOT_USE,
@@ -127,7 +134,14 @@ MESSAGES = {
         CHECK, "this is a preview: {what}, without uncertainty", "Run again with another --preset before reading it."
     ),
     "warning": Message(CHECK, "{line}", ""),
-    "all agree": Message(USE, "{n} of {n} stacks agree with each other ({agreement}; good is {good:g} and above)", ""),
+    "left out": Message(
+        USE,
+        "{stack} was left out: {why}",
+        "Nothing of it is in the volume. Check that it shows the same head, and that its mask is right.",
+    ),
+    "all agree": Message(
+        USE, "{n} of {all} stacks agree with each other ({agreement}; good is {good:g} and above)", ""
+    ),
     "all seen": Message(USE, "slices saw the whole {what}", ""),
 }
 """By name: what terminal and report may say."""
@@ -176,12 +190,13 @@ class Verdict:
 
 def verdict_of(record: RunRecord) -> Verdict:
     """Judge a result by its run.json."""
-    bad = sorted((_reason(*one) for one in _faults(record)), key=lambda one: -MILDEST_FIRST.index(one.word))
-    if bad:
-        return Verdict(bad[0].word, tuple(bad))
-    agreement = ", ".join(_agreement(stack) for stack in record.stacks)
-    good = [_reason("all agree", {"n": len(record.stacks), "agreement": agreement, "good": RETRY_BELOW_CORRELATION})]
-    return Verdict(USE, (*good, _reason("all seen", {"what": NAME_OF[record.settings.anatomy]})))
+    told = sorted((_reason(*one) for one in _faults(record)), key=lambda one: -MILDEST_FIRST.index(one.word))
+    if told and told[0].word != USE:
+        return Verdict(told[0].word, tuple(told))
+    used = [stack for stack in record.stacks if not (stack.quality and stack.quality.left_out)]
+    facts = {"n": len(used), "all": len(record.stacks), "agreement": ", ".join(map(_agreement, used))}
+    good = _reason("all agree", facts | {"good": RETRY_BELOW_CORRELATION})
+    return Verdict(USE, (good, *told, _reason("all seen", {"what": NAME_OF[record.settings.anatomy]})))
 
 
 def _reason(name: str, facts: dict[str, object]) -> Reason:
@@ -231,9 +246,12 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
 
 
 def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
+    quality = stack.quality
+    if quality and quality.left_out:
+        yield "mirrored left out" if is_mirrored(quality) else "left out", {"stack": stack.name, "why": misfit(quality)}
+        return
     if stack.left_out_share:
         yield "mask too small", {"stack": stack.name, "share": f"{100 * stack.left_out_share:.0f} %"}
-    quality = stack.quality
     if quality is None:
         return
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
@@ -250,12 +268,10 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
 
 def _unlike_others(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     """Stacks that passed every test of their own, but agree less with the volume than the best one does."""
-    ncc = [stack.quality.median_slice_ncc if stack.quality else None for stack in record.stacks]
-    best = max((one for one in ncc if one is not None), default=0.0)
-    for stack, own in zip(record.stacks, ncc, strict=True):
-        failed = stack.quality is not None and stack.quality.reliable is False
-        if own is not None and not failed and own < best - MAX_NCC_BELOW_OTHERS:
-            yield "stack unlike others", {"stack": stack.name, "ncc": f"{own:.2f}", "best": f"{best:.2f}"}
+    found = [(stack.name, stack.quality) for stack in record.stacks if stack.quality]
+    ncc = [0.0 if one.left_out else one.median_slice_ncc or 0.0 for _, one in found]
+    for n in unlike_others([one for _, one in found]):
+        yield "stack unlike others", {"stack": found[n][0], "ncc": f"{ncc[n]:.2f}", "best": f"{max(ncc):.2f}"}
 
 
 def _agreement(stack: StackRecord) -> str:
@@ -273,5 +289,10 @@ def _is_said_otherwise(line: str, record: RunRecord) -> bool:
         return record.n_rollbacks > 0
     if line.startswith(PARALLEL):
         return True
-    ends = ("registration probably failed", "probably a mirror image of", "no slice with enough masked pixels")
+    ends = (
+        LEFT_OUT,
+        "registration probably failed",
+        "probably a mirror image of",
+        "no slice with enough masked pixels",
+    )
     return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)

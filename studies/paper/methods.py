@@ -115,7 +115,8 @@ class Posed:
             found: poses, gains and weights of its slices.
             atlas: whether it comes from an atlas.
         """
-        slices = normalised_slices(case.stacks)[0].with_pose(found.slices.planes.pose)
+        slices = normalised_slices(case.stacks)[0]
+        slices = slices.take(np.isin(slices.stack_id, found.slices.stack_id)).with_pose(found.slices.planes.pose)
         volumes = InitialVolumes.of(slices, found.gain, found.weight, VOXEL_MM)
         return cls(
             volumes=volumes,

@@ -148,7 +148,8 @@ def volumes_of(result: ReconstructionResult, stacks: Sequence[Stack]) -> dict[st
         result: of the stacks.
         stacks: that it was made of.
     """
-    slices = normalised_slices(stacks)[0].with_pose(result.slices.planes.pose)
+    slices = normalised_slices(stacks)[0]
+    slices = slices.take(np.isin(slices.stack_id, result.slices.stack_id)).with_pose(result.slices.planes.pose)
     own = InitialVolumes.of(slices, result.gain, result.weight, VOXEL_MM)
     made = {SCATTER: own.coarse}
     # as strong as is best for atlas volumes: those are brains, phantoms are not

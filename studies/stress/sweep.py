@@ -33,6 +33,9 @@ FIRST_SEED = 91_000
 BAD_PSNR_DB = 20.0
 """A result is bad if its volume is worse, or if more than `BAD_OFF_SHARE` of the brain in its slices is off."""
 
+ONE_STACK = "one stack"
+"""What is wrong where the others are as they should be."""
+
 LAST = "stack-2.nii.gz"
 """The stack that is spoilt where one is."""
 
@@ -91,10 +94,10 @@ def _conditions() -> Iterator[Condition]:
     yield Condition(what="severe motion and", level="SNR 8", motion="severe", taken={"snr": 8.0})
     yield Condition(what="severe motion and", level="4.4 mm", motion="severe", taken={"thickness_mm": 4.4})
     yield Condition(what="severe motion and", level="two stacks", motion="severe", damage=damage.first_stacks(2))
-    yield Condition(what="one stack", level="of another contrast", damage=damage.other_contrast(), fault=LAST)
-    yield Condition(what="one stack", level="slices in reverse order", damage=damage.slices_reversed(), fault=LAST)
-    yield Condition(what="one stack", level="slices sorted by time", damage=damage.halves_swapped(), fault=LAST)
-    yield Condition(what="one stack", level="of another head", damage=damage.stack_of_another(), fault=LAST)
+    yield Condition(what=ONE_STACK, level="of another contrast", damage=damage.other_contrast(), fault=LAST)
+    yield Condition(what=ONE_STACK, level="slices in reverse order", damage=damage.slices_reversed(), fault=LAST)
+    yield Condition(what=ONE_STACK, level="slices sorted by time", damage=damage.halves_swapped(), fault=LAST)
+    yield Condition(what=ONE_STACK, level="of another head", damage=damage.stack_of_another(), fault=LAST)
 
 
 CONDITIONS = tuple(_conditions())
@@ -163,6 +166,7 @@ def _scores(case: SimulatedCase, options: argparse.Namespace) -> Row:
         "off_share": round(off, 4),
         "word": verdict.word,
         "reason": verdict.line(),
+        "left_out": [stack.name for stack in result.record.stacks if stack.quality and stack.quality.left_out],
         "bad": off > BAD_OFF_SHARE or psnr_db < BAD_PSNR_DB,
     }
 
@@ -186,13 +190,20 @@ def tables(record: Record) -> dict[str, str]:
         f"{_count(good, _is_check)} and *do not use* in {_count(good, _is_refused)}; in "
         f"{_count(good, _says_unseen)} of these because a part of the brain was not seen. Of the warnings about good "
         f"ones {_count(good, lambda row: _warning(row) == TRUE)} name what is wrong with the stacks, "
-        f"{_count(good, lambda row: _warning(row) == FALSE)} are false alarms."
+        f"{_count(good, lambda row: _warning(row) == FALSE)} are false alarms. In "
+        f"{_count(rows, _lacks_a_stack)} runs a stack was left out, in "
+        f"{_count(rows, lambda row: _lacks_a_stack(row) and row['what'] == ONE_STACK)} of these where one was wrong."
     )
     return {"stress-sweep": "\n\n".join([text, table(summary, SUMMARY), details("Every run", table(rows, EACH))])}
 
 
 def _is_use(row: Row) -> bool:
     return row["word"] == USE
+
+
+def _lacks_a_stack(row: Row) -> bool:
+    """Whether the volume was made without a stack that was given."""
+    return bool(row.get("left_out"))
 
 
 def _says_unseen(row: Row) -> bool:

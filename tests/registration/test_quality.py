@@ -12,7 +12,14 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.robust import DROPPED_WEIGHT, MAX_DROPPED_SHARE
 from g3r.registration import Registration, RegistrationSettings, register
 from g3r.registration.overlap import Overlap
-from g3r.registration.quality import StackQuality, pose_warnings, registration_summary, stack_qualities
+from g3r.registration.quality import (
+    left_out_notes,
+    pose_warnings,
+    registration_reliable,
+    registration_summary,
+    stack_qualities,
+)
+from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import (
     IN_PLACE_NCC,
     LEEWAY,
@@ -88,6 +95,7 @@ def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[f
         profiles=[],
         overlap=None,
         handedness=None,
+        left_out=[],
         slices=SimpleNamespace(stack_id=np.array(ids)),
         held_out=held_out,
         ncc=np.array(ncc),
@@ -122,6 +130,7 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "overlap_share": None,
         "overlap_correlation": None,
         "handedness": None,
+        "left_out": False,
     }
 
 
@@ -158,6 +167,26 @@ def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[Simulated
     assert registration_summary(found) == (
         "2 of 3 stacks are registered; correlation with the others: 0.70, none, 0.90"
     )
+
+
+def test_a_stack_that_was_left_out_does_not_make_the_others_unreliable(still: list[SimulatedStack]) -> None:
+    estimate = estimate_with([0.7, 0.9], [0.95] * 4, [1.0] * 4, [0, 0, 2, 2])
+    estimate.left_out = [(1, StackQuality(False, 0.31, 0.8, 0.0, left_out=True))]
+    found = stack_qualities(estimate, 3)
+    assert registration_reliable(found)
+    assert registration_summary(found).startswith(
+        "2 of 3 stacks are registered; 1 left out; correlation with the others: 0.70, 0.31"
+    )
+    stacks = [one.stack for one in still]
+    assert pose_warnings(estimate, found, stacks) == []
+    (line,) = left_out_notes(found, stacks)
+    assert line.startswith(
+        f"{still[1].stack.name}: left out of the volume, it does not fit the other stacks (agreement 0.31"
+    )
+    mirrored = [one if n != 1 else replace(one, handedness=MIRRORED_BELOW - 0.1) for n, one in enumerate(found)]
+    (line,) = pose_warnings(estimate, mirrored, stacks)
+    assert line.startswith(f"{still[1].stack.name}: left out of the volume, it is probably a mirror image")
+    assert left_out_notes(mirrored, stacks) == []
 
 
 def test_the_estimates_own_weights_keep_to_it(moving: Moving) -> None:

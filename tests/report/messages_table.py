@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from g3r.bench.record import markdown_table, put_between_markers
-from g3r.registration.thresholds import MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict import CHECK, DO_NOT_USE, MESSAGES, USE
 from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
 from tests.rooms import REPOSITORY
@@ -19,6 +19,7 @@ FILLED_IN = {
     "were": "was",
     "mm": "N",
     "n": "N",
+    "all": "N",
     "where": "interrupted",
     "share": "N %",
     "ncc": "N",
@@ -30,11 +31,16 @@ FILLED_IN = {
     "shortfalls": "what is bad of it, and what is good",
 }
 
+GOOD = {"stack mirrored": MIRRORED_BELOW, "stacks parallel": MIN_CROSSING_DEG}
+"""Limits; of the others that of the agreement."""
+
 LINES = {
     "unseen too much": f"N % of the brain was not seen by any slice (N ml) ..., above {100 * DO_NOT_USE_ABOVE:.0f} %",
     "unseen": f"N % of the brain was not seen by any slice (N ml): it is shown as an estimate from other brains; from "
     f"{100 * MENTIONED_ABOVE:g} % on",
     "volume check": "the fit made the volume worse ..., or: the mean of the slices explains them better ...",
+    "mirrored left out": "it is probably a mirror image of what the other stacks show (handedness N)",
+    "left out": "it does not fit the other stacks (what is bad of it, and what is good)",
     "warning": "any other warning of the run, as `run.json` has it",
 }
 """Of messages whose text comes from elsewhere."""
@@ -46,8 +52,11 @@ def table() -> str:
     for word in (DO_NOT_USE, CHECK, USE):
         for name, message in MESSAGES.items():
             if message.word == word:
-                good = MIRRORED_BELOW if name == "stack mirrored" else RETRY_BELOW_CORRELATION
-                facts = FILLED_IN | {"good": good, "line": LINES.get(name, "")}
+                facts = FILLED_IN | {
+                    "good": GOOD.get(name, RETRY_BELOW_CORRELATION),
+                    "line": (line := LINES.get(name, "")),
+                    "why": line,
+                }
                 rows.append([word, message.text.format(**facts), message.advice])
     return markdown_table(["verdict", "what it says", "what it advises"], rows).replace("---:", "---")
 

@@ -9,7 +9,8 @@ from g3r.acquisition.slice_profile import ThicknessSource
 from g3r.output.record import RegistrationRecord, RunRecord
 from g3r.output.stack_record import StackRecord
 from g3r.planning.presets import PRESETS
-from g3r.registration.quality import StackQuality, registration_reliable, registration_summary
+from g3r.registration.quality import registration_reliable, registration_summary
+from g3r.registration.stack_quality import StackQuality
 from g3r.uncertainty.unseen import UnseenPart
 
 

@@ -10,7 +10,8 @@ import pytest
 from g3r.bids.outcome import TRUSTED, _verdict
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
-from g3r.registration.quality import PARALLEL, StackQuality
+from g3r.registration.quality import PARALLEL
+from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE, verdict_of
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import to_plain
@@ -63,6 +64,16 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         stacks_with(stack("c.nii", replace(quality(False), handedness=-0.13))),
         DO_NOT_USE,
         "c.nii seems to be a mirror image of what the other stacks show (handedness -0.13; good is above -0.02)",
+    ),
+    "misfit left out": (
+        stacks_with(stack("c.nii", replace(quality(False, 0.31), left_out=True))),
+        USE,
+        "c.nii was left out: it does not fit the other stacks (agreement 0.31; good is 0.65 and above)",
+    ),
+    "mirrored left out": (
+        stacks_with(stack("c.nii", replace(quality(False), handedness=-0.13, left_out=True))),
+        CHECK,
+        "c.nii was left out: it is probably a mirror image of what the other stacks show (handedness -0.13)",
     ),
     "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
@@ -123,7 +134,7 @@ def test_each_fault_is_said_and_decides(name: str) -> None:
     assert verdict.word == word
     assert words in verdict.line()
     assert verdict.headline == HEADLINES[verdict.word]
-    assert all(reason.advice for reason in verdict.reasons) or name == "left out"
+    assert all(reason.advice for reason in verdict.reasons) or name == "left out" or word == USE
     assert "\n" not in verdict.line()
 
 
@@ -164,6 +175,18 @@ def test_stacks_that_agree_about_as_well_as_each_other_are_not_mentioned() -> No
     assert verdict_of(stacks_with(stack("c.nii", StackQuality(True, 0.8, 0.9, 0.0)))).word == USE
     failed = verdict_of(stacks_with(stack("c.nii", StackQuality(False, 0.4, 0.5, 0.0))))
     assert len(failed.reasons) == 1
+
+
+def test_what_speaks_for_a_volume_is_said_of_the_stacks_in_it() -> None:
+    found = CASES["misfit left out"][0]
+    verdict = verdict_of(found)
+    n_stacks = len(found.stacks)
+    assert f"{n_stacks - 1} of {n_stacks} stacks agree with each other" in verdict.line()
+    assert len(verdict.reasons) == 3
+    mirrored = replace(
+        CASES["mirrored left out"][0], warnings=["c.nii: left out of the volume, it is probably a mirror"]
+    )
+    assert len(verdict_of(mirrored).reasons) == 1
 
 
 def test_slivers_are_not_mentioned() -> None:

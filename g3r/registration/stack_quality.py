@@ -1,0 +1,106 @@
+"""How well one stack is registered, and what is wrong with one that is not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from g3r.registration.thresholds import (
+    IN_PLACE_NCC,
+    IN_PLACE_SHARE,
+    LEEWAY,
+    MAX_DOWNWEIGHTED_SHARE,
+    MAX_NCC_BELOW_OTHERS,
+    MIN_HELD_OUT,
+    MIN_NCC,
+    MIN_OVERLAP_CORRELATION,
+    MIN_OVERLAP_SHARE,
+    MIRRORED_BELOW,
+)
+
+
+@dataclass(frozen=True)
+class StackQuality:
+    """How well the slices of one stack are registered.
+
+    Args:
+        reliable: whether every figure is in the range of registered stacks; None for a single stack, which
+            nothing checks.
+        held_out_correlation: with a volume of the other stacks; None for a single stack.
+        median_slice_ncc: of its slices with the volume of all; None without slices.
+        downweighted_share: share of slices with a weight below one half.
+        n_missing: slices that are missing between others.
+        longest_gap_mm: the longest span without a slice between others.
+        is_cut: whether the field of view cut the head.
+        overlap_share: share of its pixels that other stacks saw; None for a single stack, and where no stack
+            lacks slices.
+        overlap_correlation: with the other stacks over those pixels.
+        handedness: whether it shows the asymmetry of the head as the others do (`registration.handedness`); None where
+            that was not asked for or cannot be said.
+        left_out: whether the volume was made without it, since it does not fit the others (`registration.misfits`);
+            then the figures are those that it had beside them.
+    """
+
+    reliable: bool | None
+    held_out_correlation: float | None
+    median_slice_ncc: float | None
+    downweighted_share: float
+    n_missing: int = 0
+    longest_gap_mm: float = 0.0
+    is_cut: bool = False
+    overlap_share: float | None = None
+    overlap_correlation: float | None = None
+    handedness: float | None = None
+    left_out: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """For run.json."""
+        return asdict(self)
+
+
+def is_mirrored(one: StackQuality) -> bool:
+    """Whether the stack seems to be a mirror image of what the others show."""
+    return one.handedness is not None and one.handedness < MIRRORED_BELOW
+
+
+def shortfalls(one: StackQuality) -> list[str]:
+    """What is worse of a stack than of registered ones, each with what is good; empty where nothing is."""
+    found = []
+    leeway = LEEWAY if _in_place(one) else 0.0
+    least, least_overlap = MIN_HELD_OUT - leeway, MIN_OVERLAP_CORRELATION - leeway
+    if one.held_out_correlation is not None and one.held_out_correlation < least:
+        found.append(f"agreement {one.held_out_correlation:.3g}; good is {MIN_HELD_OUT:g} and above")
+    if one.median_slice_ncc is not None and one.median_slice_ncc < MIN_NCC:
+        found.append(f"its slices agree with the volume by {one.median_slice_ncc:.3g}; good is {MIN_NCC:g} and above")
+    if one.downweighted_share > MAX_DOWNWEIGHTED_SHARE:
+        good = f"good is {MAX_DOWNWEIGHTED_SHARE:.0%} or fewer"
+        found.append(f"{100 * one.downweighted_share:.3g}% of its slices fit badly; {good}")
+    # the template that stood for what others did not see agrees with any head
+    if one.overlap_share is not None and one.overlap_share < MIN_OVERLAP_SHARE:
+        found.append(f"others saw {100 * one.overlap_share:.3g}% of it; good is {MIN_OVERLAP_SHARE:.0%} and above")
+    if one.overlap_correlation is not None and one.overlap_correlation < least_overlap:
+        good = f"good is {MIN_OVERLAP_CORRELATION:g} and above"
+        found.append(f"agreement {one.overlap_correlation:.3g} where others saw it; {good}")
+    return found
+
+
+def _in_place(one: StackQuality) -> bool:
+    """Whether slices fit a volume that others made, too, as only those of stacks in place do."""
+    seen_by_others = one.overlap_share is None or one.overlap_share >= IN_PLACE_SHARE
+    return one.median_slice_ncc is not None and one.median_slice_ncc >= IN_PLACE_NCC and seen_by_others
+
+
+def unlike_others(qualities: Sequence[StackQuality]) -> list[int]:
+    """Places of stacks that passed every test of their own, but whose slices fit the volume less than the best ones do.
+
+    Args:
+        qualities: of stacks; those that were left out, had no slices, or failed are not asked.
+    """
+    ncc = [None if one.left_out else one.median_slice_ncc for one in qualities]
+    best = max((one for one in ncc if one is not None), default=0.0)
+    return [
+        n
+        for n, (own, one) in enumerate(zip(ncc, qualities, strict=True))
+        if own is not None and one.reliable is not False and own < best - MAX_NCC_BELOW_OTHERS
+    ]

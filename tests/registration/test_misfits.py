@@ -1,0 +1,100 @@
+"""A stack that does not fit the others is left out, and only then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.simulator import SimulatedStack
+from g3r.errors import InputError
+from g3r.fitting.initial_volumes import with_pixels_of
+from g3r.registration import Registration, register, register_robustly
+from g3r.registration.misfits import misfits
+from g3r.registration.stack_quality import StackQuality, unlike_others
+from g3r.run.stage_file import as_stored
+from tests.registration.moving_heads import as_slices
+from tests.registration.test_quality import QUICK, noise_instead
+
+GOOD, FAILED = StackQuality(True, 0.8, 0.95, 0.0), StackQuality(False, 0.3, 0.8, 0.0)
+UNLIKE = StackQuality(True, 0.8, 0.85, 0.0)
+
+
+def with_noise(still: list[SimulatedStack], place: int) -> list[SimulatedStack]:
+    return [noise_instead(one) if n == place else one for n, one in enumerate(still)]
+
+
+def same(a: Registration, b: Registration) -> bool:
+    return np.array_equal(a.slices.planes.pose.translation_mm, b.slices.planes.pose.translation_mm)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_stack_of_noise_is_left_out_wherever_it_stands(still: list[SimulatedStack], place: int) -> None:
+    slices, _ = as_slices(with_noise(still, place))
+    found = register_robustly(slices, QUICK)
+    ((number, quality),) = found.left_out
+    assert number == place
+    assert quality.left_out
+    assert quality.reliable is False
+    others = slices.stack_id != place
+    assert set(found.slices.stack_id) == {0, 1, 2} - {place}
+    assert same(found, register(slices.take(others), QUICK))
+    assert as_stored(found).left_out == found.left_out
+
+
+def test_stacks_that_fit_all_stay(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(still)
+    found = register_robustly(slices, QUICK)
+    assert found.left_out == []
+    assert same(found, register(slices, QUICK))
+
+
+def test_it_can_be_switched_off(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(with_noise(still, 1))
+    assert register_robustly(slices, replace(QUICK, leave_out_misfits=False)).left_out == []
+
+
+def test_of_two_stacks_nobody_says_which_is_wrong(still: list[SimulatedStack]) -> None:
+    slices, _ = as_slices(with_noise(still, 1)[:2])
+    assert register_robustly(slices, QUICK).left_out == []
+
+
+@pytest.mark.parametrize(
+    ("qualities", "expected"),
+    [
+        ([GOOD, GOOD, GOOD], []),
+        ([GOOD, FAILED, GOOD], [1]),
+        ([UNLIKE, GOOD, GOOD], [0]),
+        ([GOOD, FAILED, FAILED], []),
+        ([GOOD, FAILED], []),
+        ([GOOD, FAILED, GOOD, UNLIKE], []),
+        ([GOOD, FAILED, GOOD, UNLIKE, GOOD], [1, 3]),
+    ],
+)
+def test_most_stacks_decide(qualities: list[StackQuality], expected: list[int]) -> None:
+    assert misfits(qualities) == expected
+
+
+def test_a_failed_stack_is_not_called_unlike_the_others_as_well() -> None:
+    assert unlike_others([GOOD, FAILED, UNLIKE]) == [2]
+    assert unlike_others([GOOD, replace(UNLIKE, left_out=True)]) == []
+
+
+def test_all_stay_where_the_others_do_not_fit_without_it_either(
+    still: list[SimulatedStack], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slices, _ = as_slices(with_noise(still, 1))
+    monkeypatch.setattr("g3r.registration.stack_quality.MIN_HELD_OUT", 0.99)
+    monkeypatch.setattr("g3r.registration.stack_quality.LEEWAY", 0.0)
+    monkeypatch.setattr("g3r.registration.misfits.misfits", lambda qualities: [1])
+    assert register_robustly(slices, QUICK).left_out == []
+
+
+def test_the_registration_serves_for_all_stacks_again(still: list[SimulatedStack]) -> None:
+    """As `reconstruct(stacks, registration)` has it: the slices of the stack that was left out are not expected."""
+    slices, _ = as_slices(with_noise(still, 2))
+    found = register_robustly(slices, QUICK)
+    assert len(with_pixels_of(slices, found).slices) == len(found.slices)
+    with pytest.raises(InputError, match="register the same stacks"):
+        with_pixels_of(slices, replace(found, left_out=[]))
