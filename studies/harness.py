@@ -264,8 +264,12 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn, initializer=use_up_to, initargs=(threads or 1,)) as pool:
         waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
+        try:
+            for done in as_completed(waiting):
+                yield waiting[done], done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # what is left would be measured for nothing
+            raise
 
 
 def weights(checkpoint: str | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatch
@@ -181,7 +182,15 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
     settings = spec.acquisition(3)
     stacks = simulate_stacks(truth.data, truth.mask, truth.affine, settings, rng, fine=True)
     extra = {"thickness_mm": settings[0].thickness_mm, "interleave": settings[0].interleave}
-    save_simulation(folder, truth, stacks, {"spec": record, **extra})
+    # studies with several processes may want the same subject at the same time: the first to end has made it
+    made = cache / f".{spec.name}-{os.getpid()}"
+    save_simulation(made, truth, stacks, {"spec": record, **extra})
+    try:
+        made.rename(folder)
+    except OSError:
+        if not folder.is_dir():
+            raise
+        shutil.rmtree(made)
     logger.info("%s: simulated", spec.name)
     return folder
 

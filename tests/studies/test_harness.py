@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from importlib import import_module
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from g3r.bench.record import machine_line
 from g3r.errors import InputError
-from studies.harness import Study, Task, resumed, stated
+from studies.harness import Study, Task, results, resumed, stated
 from studies.tables import details, spread, table
 
 FOLDER = Path(__file__).resolve().parents[2] / "studies"
@@ -92,6 +93,21 @@ def test_jobs_run_in_processes_of_their_own(tmp_path: Path) -> None:
     rows = json.loads((tmp_path / "out" / "squares.json").read_text())["rows"]
     assert [row["square"] for row in rows.values()] == [4, 9]
     assert os.getpid() not in {row["process"] for row in rows.values()}
+
+
+def failing(n: int, folder: Path) -> dict[str, int]:
+    if n == 0:
+        raise ValueError("of the first one")
+    (folder / f"measured-{n}").touch()
+    time.sleep(0.1)
+    return {}
+
+
+def test_nothing_more_is_measured_once_a_job_failed(tmp_path: Path) -> None:
+    tasks = [Task(str(n), failing, (n, tmp_path)) for n in range(100)]
+    with pytest.raises(ValueError, match="of the first one"):
+        list(results(tasks, 2, 1))
+    assert len(list(tmp_path.iterdir())) < 50
 
 
 def test_subjects_that_were_looked_at_are_not_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

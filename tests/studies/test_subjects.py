@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import Volume, save_volume
 from g3r.acquisition.slicing import slices_from_stacks
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase, load_case, read_true_poses
 from g3r.evaluation.pose_error import PoseTable
 from g3r.geometry import RigidPose, VolumeGrid
+from studies import subjects
 from studies.runs import aligned, off_share, orientation_deg
 from studies.subjects import SubjectSpec, case_folders, data_folder, simulated_subject
 
@@ -33,6 +36,26 @@ def atlas(tmp_path: Path, rng: np.random.Generator) -> Path:
     save_volume(folder / "t2.nii.gz", data, np.diag([2.0, 2.0, 2.0, 1.0]))
     save_volume(folder / "mask.nii.gz", mask, np.diag([2.0, 2.0, 2.0, 1.0]))
     return tmp_path / "atlas"
+
+
+def test_a_subject_that_another_process_made_meanwhile_is_taken(
+    atlas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As two jobs of a study do that want the same one at its start."""
+    cache = tmp_path / "cache"
+    simulate = subjects.simulate_stacks
+
+    def slower(*arguments: Any, **options: Any) -> list[SimulatedStack]:
+        monkeypatch.setattr(subjects, "simulate_stacks", simulate)
+        other = simulated_subject(SPEC, atlas, cache)
+        written.append((other / "poses.tsv").stat().st_mtime_ns)
+        return simulate(*arguments, **options)
+
+    written: list[int] = []
+    monkeypatch.setattr(subjects, "simulate_stacks", slower)
+    folder = simulated_subject(SPEC, atlas, cache)
+    assert [(folder / "poses.tsv").stat().st_mtime_ns] == written
+    assert [path.name for path in cache.iterdir()] == [SPEC.name]
 
 
 def test_subject_is_simulated_once_and_read_back(atlas: Path, tmp_path: Path) -> None:
