@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -185,8 +186,11 @@ def test_a_dry_run_shows_the_table_and_writes_nothing(
     assert not list(tmp_path.iterdir())  # the private folder is gone
 
 
-@pytest.mark.usefixtures("quick")
-def test_stacks_and_a_reference(examination: Examination, tmp_path: Path) -> None:
+def test_stacks_and_a_reference(examination: Examination, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stack that does not fit and is kept nevertheless, so that there is something to remark."""
+    settings = quick_settings()
+    settings = replace(settings, registration=replace(settings.registration, leave_out_misfits=False))
+    monkeypatch.setattr("g3r.cli.infer_task._settings", lambda options: settings)
     inputs = ["--stacks", *examination.stacks, "--masks", *examination.masks, "--threads", "1", "--quiet"]
     outputs = ["--dicom-reference", examination.dicom, "--dicom-out", tmp_path / "series", "--output", tmp_path / "out"]
     assert main([str(word) for word in (*inputs, *outputs)]) == 0
