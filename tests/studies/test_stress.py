@@ -78,10 +78,13 @@ def test_the_table_counts_words_by_what_they_were_said_of() -> None:
     words = [("use", False), ("use", False), ("check", False), ("do not use", True), ("refused", True), ("use", True)]
     rows = {str(n): row(*one) for n, one in enumerate(words)}
     rows["5"]["left_out"] = [sweep.LAST]
+    rows["7"] = rows["5"] | {"what": sweep.ONE_STACK, "level": "of another head", "left_out": ["stack-0.nii.gz"]}
     rows["6"] = rows["5"] | {"what": sweep.ONE_STACK, "level": "of another head", "bad": False}
     text = sweep.tables({"preset": "fast", "rows": rows})["stress-sweep"]
-    assert "Of 3 bad ones the verdict was *do not use*, or a refusal, in 2, *check* in 0 and *use* in 1." in text
-    assert text.partition("|")[0].strip().endswith("In 2 runs a stack was left out, in 1 of these where one was wrong.")
+    assert "Of 4 bad ones the verdict was *do not use*, or a refusal, in 2, *check* in 0 and *use* in 2." in text
+    assert (
+        text.partition("|")[0].strip().endswith("In 3 runs a stack was left out, in 1 of these the one that was wrong.")
+    )
     assert "Of 4 good ones it was *use* in 3, *check* in 1 and *do not use* in 0; " in text
     assert "0 name what is wrong with the stacks, 1 are false alarms." in text
 
