@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from g3r.registration.estimate import Registration, register
 from g3r.registration.quality import stack_qualities
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.stack_quality import StackQuality, unlike_others
+from g3r.registration.thresholds import IN_PLACE_CORRELATION
 from g3r.run.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -33,45 +35,75 @@ def register_robustly(
 
     A stack of another head or contrast, or one whose slices went astray, draws its errors into the volume, and the
     slices of good stacks towards them. It is left out where most stacks fit, and all of these once they are registered
-    without it. Otherwise all stay: it cannot be said which ones are right.
+    without it. Where half of the stacks or more fail, one may have drawn the others with it: each is left out in its
+    turn, and the one without which all others agree beyond doubt stays out, if there is only one such. Otherwise all
+    stay: it cannot be said which ones are right.
 
     Args:
         slices: see `register`.
         settings: see `register`; `leave_out_misfits` is asked here.
-        progress: see `register`; called once more from the start where stacks are left out.
+        progress: see `register`; called once more from the start for each registration without stacks.
         template: see `register`.
         proposals: see `register`.
-        deadline: see `register`.
+        deadline: see `register`; stacks are left out in turn only while there is time for what the first one took.
     """
+
+    def without(out: Sequence[int]) -> Registration:
+        kept = np.flatnonzero(~np.isin(slices.stack_id, out))
+        return register(
+            slices.take(kept),
+            settings,
+            progress,
+            template=template,
+            proposals={name: motion.take(kept) for name, motion in (proposals or {}).items()},
+            deadline=deadline,
+        )
+
+    begun = time.monotonic()
     found = register(slices, settings, progress, template=template, proposals=proposals, deadline=deadline)
+    took_s = time.monotonic() - begun
     if not settings.leave_out_misfits:
         return found
     numbers, qualities = _present(found)
-    out = [numbers[place] for place in misfits(qualities)]
-    if not out:
-        return found
-    kept = np.flatnonzero(~np.isin(slices.stack_id, out))
-    logger.info("stacks %s do not fit the others: registration without them", out)
-    others = register(
-        slices.take(kept),
-        settings,
-        progress,
-        template=template,
-        proposals={name: motion.take(kept) for name, motion in (proposals or {}).items()},
-        deadline=deadline,
-    )
-    _, without = _present(others)
-    if not all(one.reliable for one in without) or unlike_others(without):
-        return found
     beside = dict(zip(numbers, qualities, strict=True))
+    believed: list[tuple[list[int], Registration]] = []
+    if out := [numbers[place] for place in misfits(qualities)]:
+        logger.info("stacks %s do not fit the others: registration without them", out)
+        others = without(out)
+        believed += [(out, others)] if _fits(others) else []
+    elif most_failed(qualities):
+        for number in numbers:
+            if deadline is not None and deadline.part(1.0, reserve_s=took_s).has_passed():
+                return found
+            logger.info("most stacks do not fit: registration without stack %d", number)
+            others = without([number])
+            believed += [([number], others)] if _fits(others, IN_PLACE_CORRELATION) else []
+    if len(believed) != 1:
+        return found
+    ((out, others),) = believed
     return replace(others, left_out=[(n, replace(beside[n], left_out=True)) for n in out])
 
 
 def misfits(qualities: Sequence[StackQuality]) -> list[int]:
     """Places of stacks that failed or are unlike the others; none where half of all or more are."""
-    failed = [n for n, one in enumerate(qualities) if one.reliable is False]
-    found = sorted(failed + unlike_others(qualities))
+    found = sorted(_failed(qualities) + unlike_others(qualities))
     return found if 2 * len(found) < len(qualities) else []
+
+
+def most_failed(qualities: Sequence[StackQuality]) -> bool:
+    """Whether half of the stacks or more failed, of enough that others are left to agree without one."""
+    return len(qualities) > 2 and 2 * len(_failed(qualities)) >= len(qualities)
+
+
+def _failed(qualities: Sequence[StackQuality]) -> list[int]:
+    return [n for n, one in enumerate(qualities) if one.reliable is False]
+
+
+def _fits(registration: Registration, least_correlation: float = 0.0) -> bool:
+    """Whether all stacks fit each other, and a volume of the others by at least so much."""
+    _, qualities = _present(registration)
+    agree = all((one.held_out_correlation or 0.0) >= least_correlation for one in qualities)
+    return agree and all(one.reliable for one in qualities) and not unlike_others(qualities)
 
 
 def _present(registration: Registration) -> tuple[list[int], list[StackQuality]]:

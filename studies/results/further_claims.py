@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from g3r.report.verdict import USE
 from studies.results.blocks import Block
 from studies.results.findings import FEW, NOTICEABLE_DB, Claim, Finding, column, paired, shares, table_after, value
-from studies.stress.sweep import FALSE
+from studies.stress.outcome import FALSE
 
 MEANS = "mean gain over the quicker one"
 """The last row of the table of presets, where each is compared with the one before it."""
@@ -17,11 +17,23 @@ SEEDS = 3
 """Trainings of a variant that show more than their own chance."""
 
 
-def warned(bad: bool) -> Claim:
-    """What the verdict says of bad runs, or of good ones."""
+EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject"}
+"""Title of the table of all runs, by the block of the study."""
+
+AT_ONCE = {"stress-sweep": "", "stress-drawn": ", everything drawn at once"}
+"""What claims about a study say of it."""
+
+
+def warned(bad: bool, study: str) -> Claim:
+    """What the verdict says of bad runs, or of good ones.
+
+    Args:
+        bad: which.
+        study: its block.
+    """
 
     def find(block: Block) -> Finding | None:
-        table = table_after(block, "Every run")
+        table = table_after(block, EVERY[study])
         runs = [row for row in table.rows if (row["bad"] == "bad") == bad] if table else []
         said = sum(not row["verdict"].startswith(f"{USE}:") for row in runs)
         if not runs:
@@ -30,34 +42,37 @@ def warned(bad: bool) -> Claim:
 
     kind = "bad" if bad else "good"
     what = "is warned about" if bad else "gets no warning"
+    means = " (more than 5 % of the brain off by more than 2 mm, or under 20 dB)" if bad else ""
     return Claim(
-        text=f"A {kind} run (more than 5 % of the brain off by more than 2 mm, or under 20 dB) {what}"
-        if bad
-        else f"A {kind} run {what}",
+        text=f"A {kind} run{means} {what}{AT_ONCE[study]}",
         asked="at least 95 %, asked for" if bad else "at least 95 %, asked for: at most 5 % warned",
-        block="stress-sweep",
+        block=study,
         find=find,
-        yes=f"The verdict is right about {kind} runs: {{figure}}.",
-        no=f"The verdict is wrong about {kind} runs too often: it is right about {{figure}}.",
+        yes=f"The verdict is right about {kind} runs{AT_ONCE[study]}: {{figure}}.",
+        no=f"The verdict is wrong about {kind} runs too often{AT_ONCE[study]}: it is right about {{figure}}.",
     )
 
 
-def false_alarms() -> Claim:
-    """How many good runs are warned about although nothing is wrong with their stacks."""
+def false_alarms(study: str) -> Claim:
+    """How many good runs are warned about although nothing is wrong with their stacks.
+
+    Args:
+        study: its block.
+    """
 
     def find(block: Block) -> Finding | None:
-        table = table_after(block, "Every run")
+        table = table_after(block, EVERY[study])
         runs = [row for row in table.rows if row["bad"] != "bad"] if table else []
         said = sum(row["warning"] == FALSE for row in runs)
         return shares(len(runs) - said, len(runs), 0.95, "runs") if runs else None
 
     return Claim(
-        text="A good run gets no false alarm: a warning that names nothing that is wrong with its stacks",
+        text=f"A good run gets no false alarm{AT_ONCE[study]}: a warning that names nothing that is wrong with its stacks",
         asked="at least 95 %",
-        block="stress-sweep",
+        block=study,
         find=find,
-        yes="False alarms are rare: {figure} of the good runs have none.",
-        no="False alarms are too frequent: only {figure} of the good runs have none.",
+        yes=f"False alarms are rare{AT_ONCE[study]}: {{figure}} of the good runs have none.",
+        no=f"False alarms are too frequent{AT_ONCE[study]}: only {{figure}} of the good runs have none.",
     )
 
 
@@ -240,9 +255,10 @@ def gate(head: str, where: str) -> Claim:
 
 def verdicts() -> Iterator[Claim]:
     """Whether g3r says when a volume may not be used."""
-    yield warned(bad=True)
-    yield warned(bad=False)
-    yield false_alarms()
+    for study in EVERY:
+        yield warned(True, study)
+        yield warned(False, study)
+        yield false_alarms(study)
 
 
 def presets() -> Iterator[Claim]:

@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 
 from data_synth.simulator import StackSettings
-from g3r.errors import G3RError
-from g3r.evaluation.case import SimulatedCase
-from g3r.planning.presets import PRESETS
-from g3r.reconstruct import GaussianReconstructor
-from g3r.report.verdict import DO_NOT_USE, USE, verdict_of
 from studies.harness import FITS, Record, Row, Study, Task
-from studies.runs import BAD_OFF_SHARE, aligned, off_share
 from studies.stress import damage
 from studies.stress.damage import Damage
+from studies.stress.outcome import (
+    FALSE,
+    TRUE,
+    count,
+    is_check,
+    is_refused,
+    is_use,
+    lacks_a_stack,
+    outcome,
+    says_unseen,
+    verdicts,
+)
 from studies.subjects import SubjectSpec, simulated_case
 from studies.tables import Cell, details, table
 
@@ -30,17 +36,11 @@ VOLUMES = ("crl-sta/sta24", "crl-sta/sta30", "crl-sta/sta34")
 FIRST_SEED = 91_000
 """Seeds from here on belong to this study."""
 
-BAD_PSNR_DB = 20.0
-"""A result is bad if its volume is worse, or if more than `BAD_OFF_SHARE` of the brain in its slices is off."""
-
 ONE_STACK = "one stack"
 """What is wrong where the others are as they should be."""
 
 LAST = "stack-2.nii.gz"
 """The stack that is spoilt where one is."""
-
-TRUE, FALSE = "true", "false alarm"
-"""What a warning is: it names a fault of the stacks, or nothing that is wrong with them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,28 +147,8 @@ def measure(name: str, n: int, options: argparse.Namespace) -> Row:
     rng = np.random.default_rng([FIRST_SEED, n])
     stacks = damage.applied(condition.damage, case.stacks, other.stacks, rng)
     known = {key: at for key, at in case.points_mm.items() if key[0] not in condition.damage.without_truth}
-    row: Row = {"what": condition.what, "level": condition.level}
-    try:
-        found = _scores(replace(case, stacks=stacks, points_mm=known), options)
-    except G3RError as error:
-        return row | {"word": "refused", "reason": str(error), "bad": True}
-    return row | found
-
-
-def _scores(case: SimulatedCase, options: argparse.Namespace) -> Row:
-    result = GaussianReconstructor(options.ckpt, PRESETS[options.preset]).reconstruct(case.stacks)
-    error, verdict = case.pose_error(result.slices), verdict_of(result.record)
-    psnr_db = aligned(case, result.volume, result.grid, error.common).scores.psnr_db
-    off = off_share(error.per_slice_mm, result.slices, result.weight)
-    return {
-        "psnr_db": round(psnr_db, 3),
-        "median_mm": round(error.median_mm, 4),
-        "off_share": round(off, 4),
-        "word": verdict.word,
-        "reason": verdict.line(),
-        "left_out": [stack.name for stack in result.record.stacks if stack.quality and stack.quality.left_out],
-        "bad": off > BAD_OFF_SHARE or psnr_db < BAD_PSNR_DB,
-    }
+    found = outcome(replace(case, stacks=stacks, points_mm=known), options)
+    return {"what": condition.what, "level": condition.level} | found
 
 
 def line(key: str, row: Row) -> str:
@@ -182,28 +162,12 @@ def tables(record: Record) -> dict[str, str]:
     rows = [{"name": name, **row} for name, row in record["rows"].items()]
     groups = [[row for row in rows if f"{row['what']}: {row['level']}" == one.name] for one in CONDITIONS]
     summary = [{"what": group[0]["what"], "level": group[0]["level"], "of": group} for group in groups if group]
-    bad, good = [row for row in rows if row["bad"]], [row for row in rows if not row["bad"]]
+    out, right = count(rows, lacks_a_stack), count(rows, _lacks_the_wrong_one)
     text = (
-        f"Preset `{record['preset']}`, {len(rows)} runs. Of {len(bad)} bad ones the verdict was *do not use*, or a "
-        f"refusal, in {_count(bad, _is_refused)}, *check* in {_count(bad, _is_check)} and *use* in "
-        f"{_count(bad, _is_use)}. Of {len(good)} good ones it was *use* in {_count(good, _is_use)}, *check* in "
-        f"{_count(good, _is_check)} and *do not use* in {_count(good, _is_refused)}; in "
-        f"{_count(good, _says_unseen)} of these because a part of the brain was not seen. Of the warnings about good "
-        f"ones {_count(good, lambda row: _warning(row) == TRUE)} name what is wrong with the stacks, "
-        f"{_count(good, lambda row: _warning(row) == FALSE)} are false alarms. In "
-        f"{_count(rows, _lacks_a_stack)} runs a stack was left out, in {_count(rows, _lacks_the_wrong_one)} of these "
-        f"the one that was wrong."
+        f"Preset `{record['preset']}`, {len(rows)} runs. {verdicts(rows, _warning)} In {out} runs a stack was left "
+        f"out, in {right} of these the one that was wrong."
     )
     return {"stress-sweep": "\n\n".join([text, table(summary, SUMMARY), details("Every run", table(rows, EACH))])}
-
-
-def _is_use(row: Row) -> bool:
-    return row["word"] == USE
-
-
-def _lacks_a_stack(row: Row) -> bool:
-    """Whether the volume was made without a stack that was given."""
-    return bool(row.get("left_out"))
 
 
 def _lacks_the_wrong_one(row: Row) -> bool:
@@ -211,31 +175,14 @@ def _lacks_the_wrong_one(row: Row) -> bool:
     return row["what"] == ONE_STACK and row.get("left_out") == [LAST]
 
 
-def _says_unseen(row: Row) -> bool:
-    """Whether the verdict says that the volume is incomplete, which pose errors and PSNR do not count as bad."""
-    return not _is_use(row) and "not seen by any slice" in row["reason"]
-
-
 def _warning(row: Row) -> str:
     """Whether a warning is about a bad result or names a fault that the stacks have; empty where there is none."""
-    if _is_use(row):
+    if is_use(row):
         return ""
     if row["bad"]:
         return TRUE
     fault = next(one.fault for one in CONDITIONS if one.name == f"{row['what']}: {row['level']}")
-    return TRUE if _says_unseen(row) or (fault and fault in row["reason"]) else FALSE
-
-
-def _is_refused(row: Row) -> bool:
-    return row["word"] in (DO_NOT_USE, "refused")
-
-
-def _is_check(row: Row) -> bool:
-    return not _is_use(row) and not _is_refused(row)
-
-
-def _count(rows: Sequence[Row], holds: Callable[[Row], bool]) -> int:
-    return sum(map(holds, rows))
+    return TRUE if says_unseen(row) or (fault and fault in row["reason"]) else FALSE
 
 
 def _over(key: str, digits: int, of: Callable[[Sequence[float]], float]) -> Callable[[Row], str]:
@@ -252,10 +199,10 @@ SUMMARY: dict[str, Cell] = {
     "PSNR dB": _over("psnr_db", 2, mean),
     "poses mm": _over("median_mm", 2, median),
     "runs": lambda row: len(row["of"]),
-    "bad": lambda row: _count(row["of"], lambda one: one["bad"]),
-    "use": lambda row: _count(row["of"], _is_use),
-    "check": lambda row: _count(row["of"], _is_check),
-    "do not use": lambda row: _count(row["of"], _is_refused),
+    "bad": lambda row: count(row["of"], lambda one: one["bad"]),
+    "use": lambda row: count(row["of"], is_use),
+    "check": lambda row: count(row["of"], is_check),
+    "do not use": lambda row: count(row["of"], is_refused),
 }
 EACH: dict[str, Cell] = {
     "run": "{name}",

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from data_synth.simulator import SimulatedStack
+from g3r.acquisition.planes import Slices
 from g3r.errors import InputError
 from g3r.fitting.initial_volumes import with_pixels_of
 from g3r.registration import Registration, register, register_robustly
 from g3r.registration.misfits import misfits
 from g3r.registration.stack_quality import StackQuality, unlike_others
+from g3r.run.deadline import Deadline
 from g3r.run.stage_file import as_stored
-from tests.registration.moving_heads import as_slices
+from tests.registration.moving_heads import Moving, as_slices
 from tests.registration.test_quality import QUICK, noise_instead
 
 GOOD, FAILED = StackQuality(True, 0.8, 0.95, 0.0), StackQuality(False, 0.3, 0.8, 0.0)
@@ -98,3 +102,56 @@ def test_the_registration_serves_for_all_stacks_again(still: list[SimulatedStack
     assert len(with_pixels_of(slices, found).slices) == len(found.slices)
     with pytest.raises(InputError, match="register the same stacks"):
         with_pixels_of(slices, replace(found, left_out=[]))
+
+
+def as_registered(moving: Moving, calls: list[int] | None = None) -> Callable[..., Registration]:
+    """Registration that takes no time: any slices are where they are."""
+
+    def register_(slices: Slices, *others: Any, **options: Any) -> Registration:
+        if calls is not None:
+            calls.append(len(slices))
+        return replace(moving.estimate, slices=slices)
+
+    return register_
+
+
+def agreeing(correlation: float, *, fits: bool = True) -> list[StackQuality]:
+    return [replace(GOOD, held_out_correlation=correlation, reliable=fits)] * 2
+
+
+@pytest.mark.parametrize(
+    ("without", "expected"),
+    [
+        ({0: agreeing(0.5, fits=False), 1: agreeing(0.8), 2: agreeing(0.6, fits=False)}, 1),
+        ({0: agreeing(0.8), 1: agreeing(0.8), 2: agreeing(0.6, fits=False)}, None),
+        ({0: agreeing(0.5, fits=False), 1: agreeing(0.5, fits=False), 2: agreeing(0.6, fits=False)}, None),
+        ({0: agreeing(0.5, fits=False), 1: agreeing(0.7), 2: agreeing(0.6, fits=False)}, None),
+        ({0: agreeing(0.5, fits=False), 1: [GOOD, UNLIKE], 2: agreeing(0.6, fits=False)}, None),
+    ],
+    ids=["one fits without", "two do", "none does", "only just", "unlike each other"],
+)
+def test_where_all_failed_each_is_left_out_in_its_turn(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch, without: dict[int, list[StackQuality]], expected: int | None
+) -> None:
+    def qualities(found: Registration, n_stacks: int) -> list[StackQuality]:
+        present = set(found.slices.stack_id.tolist())
+        absent = {0, 1, 2} - present
+        left = iter(without[absent.pop()] if absent else [FAILED] * 3)
+        return [next(left) if n in present else GOOD for n in range(n_stacks)]
+
+    monkeypatch.setattr("g3r.registration.misfits.stack_qualities", qualities)
+    monkeypatch.setattr("g3r.registration.misfits.register", as_registered(moving))
+    found = register_robustly(moving.slices, QUICK)
+    assert [n for n, _ in found.left_out] == ([] if expected is None else [expected])
+    assert set(found.slices.stack_id) == {0, 1, 2} - {expected}
+    assert all(one == replace(FAILED, left_out=True) for _, one in found.left_out)
+
+
+def test_there_is_no_turn_without_time_for_it(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr("g3r.registration.misfits.register", as_registered(moving, calls))
+    monkeypatch.setattr("g3r.registration.misfits.stack_qualities", lambda found, n_stacks: [FAILED] * n_stacks)
+    assert register_robustly(moving.slices, QUICK, deadline=Deadline.after(0.0)).left_out == []
+    assert len(calls) == 1
+    register_robustly(moving.slices, QUICK, deadline=Deadline.after(600.0))
+    assert len(calls) == 5

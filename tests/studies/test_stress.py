@@ -9,7 +9,7 @@ import pytest
 
 from g3r.acquisition.stacks import Stack, load_stack
 from studies.harness import Row
-from studies.stress import damage, sweep
+from studies.stress import damage, drawn, outcome, sweep
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +94,55 @@ def test_a_warning_that_names_the_fault_is_no_false_alarm() -> None:
         row = {"what": what, "level": level, "word": word, "reason": reason, "bad": False}
         return sweep.table([row], {"warning": sweep.EACH["warning"]}).splitlines()[-1].strip("| ")
 
-    assert warning("masks", "-2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == sweep.TRUE
-    assert warning("masks", "+2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == sweep.FALSE
-    assert warning("one stack", "of another head", "do not use: stack-2.nii.gz does not fit") == sweep.TRUE
-    assert warning("one stack", "of another head", "do not use: stack-0.nii.gz does not fit") == sweep.FALSE
-    assert warning("gap", "2.2 mm", "check: 3 % of the brain was not seen by any slice (4 ml)") == sweep.TRUE
+    assert warning("masks", "-2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == outcome.TRUE
+    assert warning("masks", "+2 pixels", "check: the mask of stack-0.nii.gz leaves out 14 %") == outcome.FALSE
+    assert warning("one stack", "of another head", "do not use: stack-2.nii.gz does not fit") == outcome.TRUE
+    assert warning("one stack", "of another head", "do not use: stack-0.nii.gz does not fit") == outcome.FALSE
+    assert warning("gap", "2.2 mm", "check: 3 % of the brain was not seen by any slice (4 ml)") == outcome.TRUE
     assert warning("nothing", sweep.CONDITIONS[0].level, "use: all is well", "use") == "-"
+
+
+def test_what_is_drawn_is_told_and_can_be_done(stacks: tuple[Stack, ...]) -> None:
+    draws = [drawn.drawn(n) for n in range(80)]
+    assert draws[:3] == [drawn.drawn(n) for n in range(3)]
+    assert {one.n_stacks for one in draws} == {2, 3}
+    assert {one.spoilt for one in draws} == {"", *drawn.SPOILT}
+    for one in draws:
+        assert one.other.volume != one.subject.volume
+        assert one.other.acquisition(3)[0].thickness_mm == one.subject.acquisition(3)[0].thickness_mm
+        left = stacks
+        for each in one.damages():
+            left = damage.applied(each, left, stacks, np.random.default_rng(0))
+        assert len(left) == one.n_stacks
+        assert left[0].thickness_mm == pytest.approx(4.0 * one.stated)
+        assert (f"one {one.spoilt}" in one.text()) == bool(one.spoilt)
+    specs = [spec for one in draws for spec in (one.subject, one.other)]
+    assert len({spec.name for spec in specs}) == len(specs)
+
+
+def test_the_table_of_draws_counts_stacks_that_were_spoilt() -> None:
+    good = {
+        "drawn": "",
+        "spoilt": "",
+        "psnr_db": 30.0,
+        "median_mm": 0.1,
+        "off_share": 0.0,
+        "bad": False,
+        "left_out": [],
+    }
+    use, warned = {"word": "use", "reason": "use: all is well"}, {"word": "check", "reason": "check: b does not fit"}
+    rows = [
+        good | use,
+        good | warned,
+        good | warned | {"spoilt": "b"},
+        good | use | {"spoilt": "b", "left_out": ["b"]},
+        good | use | {"left_out": ["a"]},
+        good | use | {"spoilt": "b", "bad": True, "psnr_db": 19.0},
+        {"drawn": "", "spoilt": "b", "word": "refused", "reason": "no", "bad": True},
+    ]
+    text = drawn.tables({"preset": "fast", "rows": {str(n): row for n, row in enumerate(rows)}})["stress-drawn"]
+    assert "7 subjects, 30.00 dB in the median. Of 2 bad ones" in text
+    assert "or a refusal, in 1, *check* in 0 and *use* in 1. Of 5 good ones it was *use* in 3, *check* in 2" in text
+    assert "1 name what is wrong with the stacks, 1 are false alarms" in text
+    assert "Of 4 stacks that do not belong 1 were left out; of 3 sets without one 1 lost a stack." in text
+    assert "Where it stayed the verdict was *use* in 1 of 3." in text
