@@ -20,7 +20,7 @@ SEEDS = 3
 EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject"}
 """Title of the table of all runs, by the block of the study."""
 
-AT_ONCE = {"stress-sweep": "", "stress-drawn": ", everything drawn at once"}
+AT_ONCE = {"stress-sweep": "", "stress-drawn": " with all drawn at once"}
 """What claims about a study say of it."""
 
 
@@ -44,7 +44,7 @@ def warned(bad: bool, study: str) -> Claim:
     what = "is warned about" if bad else "gets no warning"
     means = " (more than 5 % of the brain off by more than 2 mm, or under 20 dB)" if bad else ""
     return Claim(
-        text=f"A {kind} run{means} {what}{AT_ONCE[study]}",
+        text=f"A {kind} run{AT_ONCE[study]}{means} {what}",
         asked="at least 95 %, asked for" if bad else "at least 95 %, asked for: at most 5 % warned",
         block=study,
         find=find,
@@ -67,7 +67,7 @@ def false_alarms(study: str) -> Claim:
         return shares(len(runs) - said, len(runs), 0.95, "runs") if runs else None
 
     return Claim(
-        text=f"A good run gets no false alarm{AT_ONCE[study]}: a warning that names nothing that is wrong with its stacks",
+        text=f"A good run{AT_ONCE[study]} gets no false alarm: a warning that names nothing that is wrong with its stacks",
         asked="at least 95 %",
         block=study,
         find=find,
