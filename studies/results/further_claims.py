@@ -20,7 +20,7 @@ SEEDS = 3
 EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject"}
 """Title of the table of all runs, by the block of the study."""
 
-AT_ONCE = {"stress-sweep": "", "stress-drawn": " with all drawn at once"}
+AT_ONCE = {"stress-sweep": "", "stress-drawn": ", all drawn at once"}
 """What claims about a study say of it."""
 
 
@@ -66,13 +66,14 @@ def false_alarms(study: str) -> Claim:
         said = sum(row["warning"] == FALSE for row in runs)
         return shares(len(runs) - said, len(runs), 0.95, "runs") if runs else None
 
+    drawn = AT_ONCE[study]
     return Claim(
-        text=f"A good run{AT_ONCE[study]} gets no false alarm: a warning that names nothing that is wrong with its stacks",
+        text=f"A good run{drawn} gets no false alarm: a warning that names nothing that is wrong with its stacks",
         asked="at least 95 %",
         block=study,
         find=find,
-        yes=f"False alarms are rare{AT_ONCE[study]}: {{figure}} of the good runs have none.",
-        no=f"False alarms are too frequent{AT_ONCE[study]}: only {{figure}} of the good runs have none.",
+        yes=f"False alarms are rare{drawn}: {{figure}} of the good runs have none.",
+        no=f"False alarms are too frequent{drawn}: only {{figure}} of the good runs have none.",
     )
 
 
