@@ -9,7 +9,9 @@ a volume of the other stacks and its mirror image.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import mean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ from g3r.registration.normal_equations import SliceModel
 from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity import SearchPixels, correlation
 from g3r.registration.slice_registration import register_slices
-from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW
+from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_OUT
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +47,24 @@ MIN_CORRELATION = 0.5
 """Of pixels with the symmetric part of the volume; below, the stack shows something else, and nothing is said."""
 
 
+@dataclass(frozen=True)
+class Asymmetry:
+    """How far a stack shows what is not symmetric in the head as the other stacks show it.
+
+    Args:
+        correlation: of its pixels with the antisymmetric part of the head.
+        error: its standard error.
+    """
+
+    correlation: float
+    error: float
+
+    @property
+    def highest(self) -> float:
+        """What the correlation may be: one standard error more."""
+        return self.correlation + self.error
+
+
 def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list[float | None]:
     """Whether each stack shows the asymmetry of the head as the others do.
 
@@ -56,27 +76,41 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
     Returns:
         For each stack the correlation of its masked pixels with the antisymmetric part of the head, after the symmetric
         part was taken out of both, plus its standard error: above zero for the same head, near zero for a symmetric
-        one, and below `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said.
+        one, and below `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said. Of three or more
+        stacks one is called a mirror image only where the others show that the head has sides (`_stands_out`); two
+        have nobody to ask, and a symmetric head may be below the limit by shading alone.
     """
     value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
     evened, rng = replace(slices, value=value), np.random.default_rng(seed)
-    found = _of_all(evened, rng)
-    logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found.values()))
-    return list(found.values())
-
-
-def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, float | None]:
-    """By number of the stack; where one of more than two is mirrored, the others are asked again without it."""
-    stacks = np.unique(slices.stack_id).tolist()
-    found = {stack: _of_stack(slices, stack, rng) for stack in stacks}
-    known = {stack: one for stack, one in found.items() if one is not None}
-    if len(stacks) > 2 and known and min(known.values()) < MIRRORED_BELOW:
-        lowest = min(known, key=lambda stack: known[stack])
-        found |= _of_all(slices.take(slices.stack_id != lowest), rng)
+    found = [None if one is None else one.highest for one in _of_all(evened, rng).values()]
+    logger.info("handedness: %s", " ".join("unknown" if one is None else f"{one:.2f}" for one in found))
     return found
 
 
-def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | None:
+def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, Asymmetry | None]:
+    """By number of the stack; where one of more than two may be mirrored, the others are asked again without it."""
+    stacks = np.unique(slices.stack_id).tolist()
+    found = {stack: _of_stack(slices, stack, rng) for stack in stacks}
+    low = {stack: one for stack, one in found.items() if one is not None and one.highest < MIRRORED_BELOW}
+    if len(stacks) > 2 and low:
+        lowest = min(low, key=lambda stack: low[stack].highest)
+        others = _of_all(slices.take(slices.stack_id != lowest), rng)
+        if _stands_out(low[lowest], [one for one in others.values() if one is not None]):
+            return {**found, **others}
+        found |= dict.fromkeys(low)
+    return found
+
+
+def _stands_out(one: Asymmetry, others: Sequence[Asymmetry]) -> bool:
+    """Whether other stacks show without it that the head has sides, and it shows them the other way round."""
+    if not others:
+        return False
+    usual = mean(other.correlation for other in others)
+    error = sum(other.error**2 for other in others) ** 0.5 / len(others)
+    return usual > error and one.correlation < usual - STANDS_OUT * np.hypot(one.error, error)
+
+
+def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:
     volume, share, grid = fine_volume_without(slices, stack)
     own = slices.take(slices.stack_id == stack)
     mirrored = VolumeGrid(grid.shape, MIRROR @ grid.affine)
@@ -89,7 +123,7 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> float | N
     first = antisymmetric_correlation(
         value, here.operator.forward(volume)[seen], there.operator.forward(volume)[seen], plane
     )
-    if first is None or first >= MIRROR_SUSPECTED_BELOW:
+    if first is None or first.highest >= MIRROR_SUSPECTED_BELOW:
         return first
     return antisymmetric_correlation(value, _registered(here, own)[seen], _registered(there, moved)[seen], plane)
 
@@ -115,10 +149,10 @@ def _registered(model: SliceModel, slices: Slices) -> NDArray[np.float32]:
 
 def antisymmetric_correlation(
     value: NDArray[np.float32], here: NDArray[np.float32], mirrored: NDArray[np.float32], plane: NDArray[np.int64]
-) -> float | None:
+) -> Asymmetry | None:
     """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both.
 
-    Its standard error is added, by the jackknife over slices: a stack is not called mirrored for what a few slices say.
+    The standard error is that of the jackknife over slices: a stack is not called mirrored for what a few slices say.
 
     Args:
         value: [P] pixels.
@@ -127,7 +161,7 @@ def antisymmetric_correlation(
         plane: [P] slice of each pixel.
 
     Returns:
-        The sum; None where there is too little to correlate, or the pixels show something else.
+        None where there is too little to correlate, or the pixels show something else.
     """
     both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
     targets = np.stack([value, here - mirrored], 1).astype(np.float64)
@@ -145,4 +179,4 @@ def antisymmetric_correlation(
         return None
     n, correlations = sums.shape[1], without_one[2] / np.sqrt(without_one[0] * without_one[1])
     error = float(np.sqrt((n - 1) * correlations.var()))
-    return float(sums[2].sum() / np.sqrt(sums[0].sum() * sums[1].sum())) + error
+    return Asymmetry(float(sums[2].sum() / np.sqrt(sums[0].sum() * sums[1].sum())), error)

@@ -65,7 +65,9 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             handedness=None if registration.handedness is None else registration.handedness[present.index(n)],
             **missing,
         )
-        found.append(one if held_out is None else replace(one, reliable=not (shortfalls(one) or is_mirrored(one))))
+        # two stacks have no third that shows whether the head has sides: the verdict asks to look
+        fails = bool(shortfalls(one)) or (is_mirrored(one) and len(present) > 2)
+        found.append(one if held_out is None else replace(one, reliable=not fails))
     return found
 
 
@@ -84,6 +86,11 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
         elif one.left_out:
             # one that merely does not fit harms nothing any more: `left_out_notes`
             lines += [f"{stack.name}: {LEFT_OUT}, {misfit(one)}"] if is_mirrored(one) else []
+        elif is_mirrored(one) and one.reliable:
+            lines.append(
+                f"{stack.name}: may be a mirror image of what the other stack shows (handedness {one.handedness:.2f}); "
+                "compare both where the head is not symmetric"
+            )
         elif is_mirrored(one) and not shortfalls(one):
             lines.append(
                 f"{stack.name}: probably a mirror image of what the other stacks show (handedness "

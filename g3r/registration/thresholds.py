@@ -103,3 +103,10 @@ simulated, a real one 0.16), but one of 24 weeks in severe motion with slices as
 stack in reverse order that one had -0.06 to -0.23 (9 of 9 below the limit), with slices of 4.4 mm -0.06 to 0.00 (8 of
 9), with gaps as wide as slices -0.10 to 0.00 (8 of 9), in a real subject -0.09 to -0.16 (3 of 3); of two stacks the
 lower one had -0.04 to -0.10 (6 of 6; 3 of 6 real pairs). All by hand."""
+
+STANDS_OUT = 2.0
+"""A stack of three or more is called a mirror image only if its correlation with the antisymmetric part of the head is
+lower than that of the others, asked without it, by so many standard errors, and theirs is above zero by one. In 46 sets
+(23 heads with thick slices, severe motion, noise or bias, each also with its last stack reversed; `fast`, by hand) the
+limit above alone called three of 23 sound sets mirrored, two of them of an atlas that is symmetric: the differences
+were 1.2, 1.5 and 1.7 errors. Of the 14 reversed sets that it called so, 12 stand out (2.1 to 18 errors)."""

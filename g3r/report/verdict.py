@@ -1,6 +1,6 @@
 """The verdict on a volume, "use", "check" or "do not use", with its reasons: what terminal and report say.
 
-Every sentence is in `MESSAGES`. Thresholds are those of the code that judges: `registration.thresholds`,
+Every sentence is in `verdict_messages`. Thresholds are those of the code that judges: `registration.thresholds`,
 `uncertainty.unseen` and `fitting.volume_check`.
 """
 
@@ -8,150 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING
 
 from g3r.planning.anatomy import NAME_OF
 from g3r.registration.quality import LEFT_OUT, PARALLEL, misfit, nearly_parallel
 from g3r.registration.stack_quality import is_mirrored, shortfalls, unlike_others
 from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
+from g3r.report.verdict_messages import HEADLINES, MESSAGES, MILDEST_FIRST, USE, Word
 
 if TYPE_CHECKING:
     from g3r.output.record import RunRecord
     from g3r.output.stack_record import StackRecord
-
-Word = Literal["use", "check", "do not use"]
-
-USE: Final = "use"
-CHECK: Final = "check"
-DO_NOT_USE: Final = "do not use"
-
-MILDEST_FIRST: tuple[Word, ...] = (USE, CHECK, DO_NOT_USE)
-
-
-@dataclass(frozen=True)
-class Message:
-    """What may be said of a result.
-
-    Attributes:
-        word: the best verdict that is possible with it.
-        text: the fact; names in braces are filled in.
-        advice: what to do about it.
-    """
-
-    word: Word
-    text: str
-    advice: str
-
-
-MESSAGES = {
-    "stack failed": Message(
-        DO_NOT_USE,
-        "{stack} does not fit the other stacks ({shortfalls})",
-        "Leave that stack out and run again, or check that it shows the same head and that its mask is right.",
-    ),
-    "stack mirrored": Message(
-        DO_NOT_USE,
-        "{stack} seems to be a mirror image of what the other stacks show (handedness {handedness}; good is above "
-        "{good:g})",
-        "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
-        "as left may be right. Find out which one is wrong, leave it out, and run again.",
-    ),
-    "mirrored left out": Message(
-        CHECK,
-        "{stack} was left out: {why}",
-        "Slices may be in reverse order, or a header may swap two sides, of this stack or of the others: what is shown "
-        "as left may be right. Find out which one is wrong.",
-    ),
-    "stack not used": Message(
-        DO_NOT_USE,
-        "{stack} was not used: no slice has enough pixels in its mask",
-        "Check its mask, or leave the stack out and run again.",
-    ),
-    "unseen too much": Message(
-        DO_NOT_USE, "{line}", "Acquire slices that cover the missing part, or add another stack."
-    ),
-    "stack doubtful": Message(
-        CHECK,
-        "{stack} agrees only just with the other stacks ({agreement}; good is {good:g} and above)",
-        "Look for doubled edges in the volume, and at the slices below.",
-    ),
-    "stack unlike others": Message(
-        CHECK,
-        "the slices of {stack} agree with the volume by {ncc}, those of another stack by {best}",
-        "Check that the stack shows the same head on the same day, and look at its slices below.",
-    ),
-    "unseen": Message(CHECK, "{line}", "Nothing can be said of a lesion there; the part is outlined in the viewer."),
-    "volume check": Message(CHECK, "{line}", "Look at the slices below: measured and predicted should be alike."),
-    "rollbacks": Message(
-        CHECK, "the fit had to step back {n} times because its error rose", "Look at the whole volume for streaks."
-    ),
-    "single stack": Message(
-        CHECK,
-        "there is a single stack: nothing checks where its slices were put, nor which way the head lies",
-        "Compare the volume with the stack; two more stacks in other planes make it far safer.",
-    ),
-    "stacks parallel": Message(
-        CHECK,
-        "the slices of all stacks are nearly parallel in the head ({angle} degrees between them; good is {good:.0f} "
-        "and above): across their slices the stacks do not check each other, though they agree",
-        "The head may have turned between stacks. Lengths and shapes across the slices may be wrong by millimetres; "
-        "add a stack in another plane.",
-    ),
-    "orientation doubtful": Message(
-        CHECK,
-        "the head fits the atlas template about as well in another orientation (correlation {best}, {rival})",
-        "What is shown as left, front or top may be something else: compare the volume with the stack.",
-    ),
-    "masks found": Message(
-        CHECK,
-        "the brain {masks} of {stacks} {were} found automatically",
-        "Look at masks.png: a mask that misses brain or takes in face leads registration astray.",
-    ),
-    "whole image": Message(
-        CHECK, "no mask was used for {stacks}: the whole image was taken for brain", "Check that only brain is shown."
-    ),
-    "mask too small": Message(
-        CHECK,
-        "the mask of {stack} leaves out {share} of what the image shows, and nothing but a brain seems to be in it",
-        "Look whether the mask ends inside the brain: what it leaves out is not in the volume.",
-    ),
-    "thickness assumed": Message(
-        CHECK,
-        "the slice thickness of {stacks} was not stated; the distance of slices was taken ({mm} mm)",
-        "If there was a gap or an overlap, run again with --thickness: it decides how sharp the volume is.",
-    ),
-    "partial": Message(
-        CHECK,
-        "the run was {where}: this is the volume so far, without uncertainty",
-        "Finish it with --resume before using it.",
-    ),
-    "not fitted": Message(
-        CHECK,
-        "there was no time for a fit: this is {what}, without uncertainty",
-        "Run again with a longer --time-budget, or without one, before reading it.",
-    ),
-    "preview": Message(
-        CHECK, "this is a preview: {what}, without uncertainty", "Run again with another --preset before reading it."
-    ),
-    "warning": Message(CHECK, "{line}", ""),
-    "left out": Message(
-        USE,
-        "{stack} was left out: {why}",
-        "Nothing of it is in the volume. Check that it shows the same head, and that its mask is right.",
-    ),
-    "all agree": Message(
-        USE, "{n} of {all} stacks agree with each other ({agreement}; good is {good:g} and above)", ""
-    ),
-    "all seen": Message(USE, "slices saw the whole {what}", ""),
-}
-"""By name: what terminal and report may say."""
-
-HEADLINES = {
-    USE: "No fault was found by the checks that g3r makes.",
-    CHECK: "Look at the points below before using this volume.",
-    DO_NOT_USE: "This volume must not be used.",
-}
-"""What the words mean."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +123,8 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
         return
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
     if is_mirrored(quality):
-        yield "stack mirrored", facts | {"handedness": f"{quality.handedness:.2f}", "good": MIRRORED_BELOW}
+        name = "stack mirrored" if quality.reliable is False else "perhaps mirrored"
+        yield name, facts | {"handedness": f"{quality.handedness:.2f}", "good": MIRRORED_BELOW}
         if not shortfalls(quality):
             return
     if quality.reliable is False:
@@ -293,6 +161,7 @@ def _is_said_otherwise(line: str, record: RunRecord) -> bool:
         LEFT_OUT,
         "registration probably failed",
         "probably a mirror image of",
+        "may be a mirror image of",
         "no slice with enough masked pixels",
     )
     return any(line.startswith(f"{stack.name}: {end}") for stack in record.stacks for end in ends)

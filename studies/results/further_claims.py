@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from g3r.report.verdict import USE
+from g3r.report.verdict_messages import USE
 from studies.results.blocks import Block
 from studies.results.findings import FEW, NOTICEABLE_DB, Claim, Finding, column, paired, shares, table_after, value
 from studies.stress.outcome import FALSE

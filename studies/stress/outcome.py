@@ -9,7 +9,8 @@ from g3r.errors import G3RError
 from g3r.evaluation.case import SimulatedCase
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
-from g3r.report.verdict import DO_NOT_USE, USE, verdict_of
+from g3r.report.verdict import verdict_of
+from g3r.report.verdict_messages import DO_NOT_USE, USE
 from studies.harness import Row
 from studies.runs import BAD_OFF_SHARE, aligned, off_share
 

@@ -12,7 +12,8 @@ from data_synth import cli as simulate
 from data_synth.objects import textured_ellipsoids
 from g3r.cli import evaluate, infer
 from g3r.output.record import RunRecord
-from g3r.report.verdict import USE, verdict_of
+from g3r.report.verdict import verdict_of
+from g3r.report.verdict_messages import USE
 
 
 def simulated(folder: Path, seed: int, *options: str) -> Path:

@@ -13,7 +13,7 @@ import pytest
 
 from g3r.acquisition.images import load_volume
 from g3r.evaluation.align import resample
-from g3r.report.verdict import DO_NOT_USE
+from g3r.report.verdict_messages import DO_NOT_USE
 from tests.cli.test_infer import QUICK, files, run
 
 

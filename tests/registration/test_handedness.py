@@ -13,7 +13,7 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration import RegistrationSettings, register
-from g3r.registration.handedness import antisymmetric_correlation, handedness
+from g3r.registration.handedness import Asymmetry, antisymmetric_correlation, handedness
 from g3r.registration.thresholds import MIRRORED_BELOW
 from tests.registration.moving_heads import Moving, as_slices, simulated, slices_disturbed
 
@@ -88,6 +88,37 @@ def test_what_the_others_saw_on_one_side_alone_is_no_mirror_image(still: list[Si
     assert of_first > 0.05
 
 
+LOW = Asymmetry(-0.08, 0.03)
+
+
+@pytest.mark.parametrize(
+    ("one", "others", "hands"),
+    [
+        (LOW, [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [LOW.highest, 0.1, 0.12]),
+        (LOW, [Asymmetry(0.0, 0.02), Asymmetry(0.0, 0.02)], [None, 0.12, 0.12]),
+        (Asymmetry(-0.08, 0.05), [Asymmetry(0.02, 0.02), Asymmetry(0.02, 0.01)], [None, 0.12, 0.12]),
+        (LOW, [None, None], [None, 0.12, 0.12]),
+        (Asymmetry(-0.03, 0.02), [Asymmetry(0.1, 0.01), Asymmetry(0.1, 0.01)], [-0.01, 0.12, 0.12]),
+    ],
+    ids=["mirrored", "symmetric head", "not by much", "nothing known of the others", "above the limit"],
+)
+def test_a_mirror_image_is_called_so_where_the_others_show_that_the_head_has_sides(
+    still: list[SimulatedStack],
+    monkeypatch: pytest.MonkeyPatch,
+    one: Asymmetry,
+    others: list[Asymmetry | None],
+    hands: list[float | None],
+) -> None:
+    def of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:
+        if stack == 0:
+            return one
+        return Asymmetry(0.1, 0.02) if slices.n_stacks > 2 else others[stack - 1]
+
+    monkeypatch.setattr("g3r.registration.handedness._of_stack", of_stack)
+    slices = as_slices(still)[0]
+    assert handedness(slices, np.ones(len(slices))) == [None if hand is None else pytest.approx(hand) for hand in hands]
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.6])
 def test_slices_that_do_not_agree_say_less(spread: float) -> None:
     """The standard error is that of leaving out each slice in turn, and grows with their disagreement."""
@@ -103,7 +134,10 @@ def test_slices_that_do_not_agree_say_less(spread: float) -> None:
     without = [np.corrcoef(left[plane != k], odd[plane != k])[0, 1] for k in range(n_slices)]
     error = np.sqrt((n_slices - 1) / n_slices * ((without - np.mean(without)) ** 2).sum())
     assert (error > 0.05) == (spread > 0)
-    assert found == pytest.approx(np.corrcoef(left, odd)[0, 1] + error, abs=0.01)
+    assert found is not None
+    assert found.correlation == pytest.approx(np.corrcoef(left, odd)[0, 1], abs=0.01)
+    assert found.error == pytest.approx(error, abs=0.01)
+    assert found.highest == found.correlation + found.error
 
 
 def test_an_even_stack_is_no_error(still: list[SimulatedStack]) -> None:

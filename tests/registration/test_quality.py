@@ -143,16 +143,25 @@ def test_a_good_fit_counts_where_others_saw_the_stack(share: float, reliable: bo
 
 
 @pytest.mark.parametrize(("hand", "reliable"), [(0.2, True), (None, True), (MIRRORED_BELOW - 0.01, False)])
-def test_a_mirror_image_is_not_reliable_and_called_by_its_name(
+def test_a_mirror_image_of_two_others_is_not_reliable_and_called_by_its_name(
     still: list[SimulatedStack], hand: float | None, reliable: bool
 ) -> None:
-    estimate = estimate_with([0.8, 0.8], [0.95] * 2, [1.0] * 2, [0, 2])
-    estimate.handedness = [0.2, hand]
+    estimate = estimate_with([0.8] * 3, [0.95] * 3, [1.0] * 3, [0, 1, 2])
+    estimate.handedness = [0.2, 0.2, hand]
     found = stack_qualities(estimate, 3)
-    assert [one.reliable for one in found] == [True, False, reliable]
-    lines = pose_warnings(estimate, found, [one.stack for one in still])[1:]
+    assert [one.reliable for one in found] == [True, True, reliable]
+    lines = pose_warnings(estimate, found, [one.stack for one in still])
     assert len(lines) == (0 if reliable else 1)
     assert all(line.startswith(f"{still[2].stack.name}: probably a mirror image") for line in lines)
+
+
+def test_of_two_stacks_one_may_be_a_mirror_image_and_both_are_reliable(still: list[SimulatedStack]) -> None:
+    estimate = estimate_with([0.8, 0.8], [0.95] * 2, [1.0] * 2, [0, 2])
+    estimate.handedness = [0.2, MIRRORED_BELOW - 0.01]
+    found = stack_qualities(estimate, 3)
+    assert [one.reliable for one in found] == [True, False, True]  # the second has no slices
+    (line,) = pose_warnings(estimate, found, [one.stack for one in still])[1:]
+    assert line.startswith(f"{still[2].stack.name}: may be a mirror image of what the other stack shows")
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]) -> None:

@@ -21,7 +21,7 @@ from g3r.cli.report import main
 from g3r.errors import InputError
 from g3r.report import page
 from g3r.report.page import SCRIPTS, report_html
-from g3r.report.verdict import MESSAGES
+from g3r.report.verdict_messages import MESSAGES
 
 MAX_BYTES = 10_000_000
 

@@ -12,7 +12,8 @@ from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
 from g3r.registration.quality import PARALLEL
 from g3r.registration.stack_quality import StackQuality
-from g3r.report.verdict import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE, verdict_of
+from g3r.report.verdict import verdict_of
+from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
 from g3r.run.context import StoppedAt
 from g3r.run.json_record import to_plain
 from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
@@ -64,6 +65,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         stacks_with(stack("c.nii", replace(quality(False), handedness=-0.13))),
         DO_NOT_USE,
         "c.nii seems to be a mirror image of what the other stacks show (handedness -0.13; good is above -0.02)",
+    ),
+    "perhaps mirrored": (
+        stacks_with(stack("c.nii", replace(quality(True), handedness=-0.13))),
+        CHECK,
+        "c.nii may be a mirror image of what the other stack shows (handedness -0.13; good is above -0.02)",
     ),
     "misfit left out": (
         stacks_with(stack("c.nii", replace(quality(False, 0.31), left_out=True))),
