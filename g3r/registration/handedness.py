@@ -95,18 +95,19 @@ def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, Asymmetry | N
     if len(stacks) > 2 and low:
         lowest = min(low, key=lambda stack: low[stack].highest)
         others = _of_all(slices.take(slices.stack_id != lowest), rng)
-        if _stands_out(low[lowest], [one for one in others.values() if one is not None]):
+        if _stands_out(low[lowest], list(others.values())):
             return {**found, **others}
         found |= dict.fromkeys(low)
     return found
 
 
-def _stands_out(one: Asymmetry, others: Sequence[Asymmetry]) -> bool:
-    """Whether other stacks show without it that the head has sides, and it shows them the other way round."""
-    if not others:
+def _stands_out(one: Asymmetry, others: Sequence[Asymmetry | None]) -> bool:
+    """Whether all other stacks show without it that the head has sides, and it shows them the other way round."""
+    known = [other for other in others if other is not None]
+    if len(known) < len(others):
         return False
-    usual = mean(other.correlation for other in others)
-    error = sum(other.error**2 for other in others) ** 0.5 / len(others)
+    usual = mean(other.correlation for other in known)
+    error = sum(other.error**2 for other in known) ** 0.5 / len(known)
     return usual > error and one.correlation < usual - STANDS_OUT * np.hypot(one.error, error)
 
 
