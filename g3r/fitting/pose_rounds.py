@@ -196,7 +196,9 @@ def _registered_to_fit(
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     weight = slice_weights(model.losses(slices.planes, gain, width), gain, slices.n_stacks)
     # the slices of a single stack have no others to be found in
-    slices, n_found = find_strays(slices, gain, weight, rng) if slices.n_stacks > 1 else (slices, 0)
+    n_found = 0
+    if slices.n_stacks > 1:
+        slices, n_found = find_strays(slices, gain, weight, registration.ncc, rng)
     slices, n_moved = try_neighbours(model, slices, gain, width=width)
     slices, gain, at_end = register_slices(model, slices, gain, n_steps=n_steps, width=width)
     moved = replace(

@@ -13,7 +13,8 @@ from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.registration.estimate import Registration, register
-from g3r.registration.quality import stack_qualities
+from g3r.registration.open_strain import crossing_deg
+from g3r.registration.quality import nearly_parallel, stack_qualities
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.stack_quality import StackQuality, unlike_others
 from g3r.registration.thresholds import IN_PLACE_CORRELATION
@@ -100,8 +101,10 @@ def _failed(qualities: Sequence[StackQuality]) -> list[int]:
 
 
 def _fits(registration: Registration, least_correlation: float = 0.0) -> bool:
-    """Whether all stacks fit each other, and a volume of the others by at least so much."""
+    """Whether all stacks fit each other, a volume of the others by at least so much, and cross enough to check that."""
     _, qualities = _present(registration)
+    if nearly_parallel(crossing_deg(registration.slices)):
+        return False
     agree = all((one.held_out_correlation or 0.0) >= least_correlation for one in qualities)
     return agree and all(one.reliable for one in qualities) and not unlike_others(qualities)
 

@@ -93,7 +93,7 @@ def refine_slices(
     for _ in range(settings.stray_searches if settings.n_rounds else 0):
         if deadline is not None and deadline.has_passed():
             break
-        rounds.slices, n_found = find_strays(rounds.slices, rounds.gain, rounds.weight, rng)
+        rounds.slices, n_found = find_strays(rounds.slices, rounds.gain, rounds.weight, rounds.ncc, rng)
         if not n_found:
             break
         logger.info("slices: %d that went astray were found again", n_found)
@@ -116,7 +116,7 @@ class _Rounds:
     def __init__(self, slices: Slices, settings: RegistrationSettings, seen_share: NDArray[np.float64] | None) -> None:
         self.slices, self.settings = slices, settings
         self.normal_tie = None if seen_share is None else UNSEEN_NORMAL_TIE * (1 - seen_share) ** 2
-        self.gain, self.weight = np.ones(len(slices)), np.ones(len(slices))
+        self.gain, self.weight, self.ncc = (np.ones(len(slices)) for _ in range(3))
         self.volume: NDArray[np.float32] | None = None
         self.grid: VolumeGrid | None = None
         self.history: list[dict[str, float]] = []
@@ -146,7 +146,7 @@ class _Rounds:
         self.slices, self.gain, fit = register_slices(
             model, self.slices, self.gain, n_steps=settings.steps_per_round, width=width, normal_tie=self.normal_tie
         )
-        self.weight = slice_weights(fit.loss, self.gain, self.slices.n_stacks)
+        self.weight, self.ncc = slice_weights(fit.loss, self.gain, self.slices.n_stacks), fit.ncc
         if fraction >= FINEST_FROM:
             self.slices = carried_on(before, self.slices, OVER_RELAXATION)
         number, median_ncc = len(self.history), float(np.median(fit.ncc))

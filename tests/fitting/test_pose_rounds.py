@@ -105,7 +105,9 @@ def test_slices_of_several_stacks_are_searched_for_where_they_do_not_fit(
 ) -> None:
     weights: list[np.ndarray] = []
 
-    def found_seven(slices: Slices, gain: np.ndarray, weight: np.ndarray, rng: object) -> tuple[Slices, int]:
+    def found_seven(
+        slices: Slices, gain: np.ndarray, weight: np.ndarray, ncc: np.ndarray, rng: object
+    ) -> tuple[Slices, int]:
         weights.append(weight)
         return slices, 7
 

@@ -36,13 +36,25 @@ def test_slices_of_one_jerk_are_found_again(
     slices, at = astray
     weight = np.ones(len(slices))
     weight[at] = 1e-3
-    found, n_found = find_strays(slices, np.ones(len(slices)), weight, rng())
+    found, n_found = find_strays(slices, np.ones(len(slices)), weight, np.ones(len(slices)), rng())
     assert n_found == len(at)
     assert off_mm(slices, still_slices[0])[at].min() > 8
     assert off_mm(found, still_slices[0])[at].max() < 4.0  # the slices are as thick
     others = np.delete(np.arange(len(slices)), at)
     assert np.array_equal(found.planes.pose.rotation[others], slices.planes.pose.rotation[others])
     assert np.array_equal(found.planes.pose.translation_mm[others], slices.planes.pose.translation_mm[others])
+
+
+@pytest.mark.parametrize(("ncc", "expected"), [(0.78, 2), (0.82, 0)])
+def test_slices_with_all_their_weight_are_searched_where_they_are_unlike_the_volume(
+    still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray], ncc: float, expected: int
+) -> None:
+    slices, at = astray
+    ones, ncc_of_all = np.ones(len(slices)), np.full(len(slices), 0.9)
+    ncc_of_all[at] = ncc
+    found, n_found = find_strays(slices, ones, ones, ncc_of_all, rng())
+    assert n_found == expected
+    assert (off_mm(found, still_slices[0])[at].max() < 4.0) == (expected > 0)
 
 
 def test_rounds_end_with_the_search(still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]) -> None:
@@ -58,19 +70,19 @@ def test_rounds_end_with_the_search(still_slices: tuple[Slices, RigidPose], astr
 
 def test_slices_that_fit_cost_no_search(still_slices: tuple[Slices, RigidPose]) -> None:
     slices, ones = still_slices[0], np.ones(len(still_slices[0]))
-    assert find_strays(slices, ones, ones, rng()) == (slices, 0)
+    assert find_strays(slices, ones, ones, ones, rng()) == (slices, 0)
 
 
 def test_where_nothing_fits_nothing_is_searched(astray: tuple[Slices, np.ndarray]) -> None:
     slices, ones = astray[0], np.ones(len(astray[0]))
-    assert find_strays(slices, ones, 1e-3 * ones, rng()) == (slices, 0)
+    assert find_strays(slices, ones, 1e-3 * ones, ones, rng()) == (slices, 0)
 
 
 def test_dark_slices_are_not_searched(astray: tuple[Slices, np.ndarray]) -> None:
     slices, at = astray
     gain, weight = np.ones(len(slices)), np.ones(len(slices))
     gain[at], weight[at] = 0.9 * DARK, 1e-3
-    assert find_strays(slices, gain, weight, rng()) == (slices, 0)
+    assert find_strays(slices, gain, weight, np.ones(len(slices)), rng()) == (slices, 0)
 
 
 def test_small_slices_are_not_searched(astray: tuple[Slices, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,4 +91,4 @@ def test_small_slices_are_not_searched(astray: tuple[Slices, np.ndarray], monkey
     weight[at] = 1e-3
     n_samples = slices.planes.shape.prod(1) * slices.planes.spacing_mm.prod(1) / CORRELATION_AREA_MM2
     monkeypatch.setattr(stray_slices, "MIN_SAMPLES", 1.01 * n_samples[at].max())
-    assert find_strays(slices, np.ones(len(slices)), weight, rng()) == (slices, 0)
+    assert find_strays(slices, np.ones(len(slices)), weight, np.ones(len(slices)), rng()) == (slices, 0)
