@@ -19,6 +19,7 @@ from g3r.registration.bias_correction import bias_corrected
 from g3r.registration.global_search import GlobalSearch, SearchResult, search_single
 from g3r.registration.handedness import handedness
 from g3r.registration.held_out import estimate_interleave, held_out_score
+from g3r.registration.intruder import misfit_without_each
 from g3r.registration.motion_segments import SAME_PLACE_MM, changes_in_time
 from g3r.registration.motion_shear import without_excess_shear
 from g3r.registration.overlap import Overlap, overlap_of
@@ -58,6 +59,7 @@ class Registration:
         profiles: of each stack, missing slices included.
         overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
         handedness: of each stack, see `registration.handedness`; None where it was not asked for.
+        misfit_without: for each stack see `registration.intruder`; None where it was not asked for.
         left_out: numbers of stacks that are not among the slices since they do not fit the others, and their quality
             beside these.
     """
@@ -76,6 +78,7 @@ class Registration:
     profiles: list[AreaProfile] = field(default_factory=list)
     overlap: Overlap | None = None
     handedness: list[float | None] | None = None
+    misfit_without: list[float] | None = None
     left_out: list[tuple[int, StackQuality]] = field(default_factory=list)
 
     def __repr__(self) -> str:
@@ -153,6 +156,7 @@ def register(
         profiles=[sample.profile for sample in samples],
         overlap=overlap,
         handedness=hands,
+        misfit_without=misfit_without_each(fitted, settings.finest_voxel_mm, settings.max_pixels),
     )
 
 

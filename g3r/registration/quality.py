@@ -39,17 +39,17 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
         if n not in present:
             found.append(left_out.get(n, StackQuality(False, None, None, 0.0)))
             continue
-        held_out = None if registration.held_out is None else registration.held_out[present.index(n)]
+        place = present.index(n)
+        held_out = None if registration.held_out is None else registration.held_out[place]
         ncc = float(np.median(registration.ncc[of_stack]))
         downweighted = float((registration.weight[of_stack] < DOWNWEIGHTED_BELOW).mean())
         share = correlation = None
         if registration.overlap is not None:
-            place = present.index(n)
             share = registration.overlap.stack_share[place]
             correlation = registration.overlap.correlation[place]
         missing = {}
         if registration.profiles:
-            profile = registration.profiles[present.index(n)]
+            profile = registration.profiles[place]
             missing = {
                 "n_missing": profile.n_inside,
                 "longest_gap_mm": profile.longest_gap_mm,
@@ -62,7 +62,8 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             downweighted_share=downweighted,
             overlap_share=share,
             overlap_correlation=correlation,
-            handedness=None if registration.handedness is None else registration.handedness[present.index(n)],
+            handedness=None if registration.handedness is None else registration.handedness[place],
+            misfit_without=None if registration.misfit_without is None else registration.misfit_without[place],
             **missing,
         )
         # two stacks have no third that shows whether the head has sides: the verdict asks to look

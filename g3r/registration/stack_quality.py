@@ -13,6 +13,7 @@ from g3r.registration.thresholds import (
     MAX_DOWNWEIGHTED_SHARE,
     MAX_NCC_BELOW_OTHERS,
     MIN_HELD_OUT,
+    MIN_MISFIT_WITHOUT,
     MIN_NCC,
     MIN_OVERLAP_CORRELATION,
     MIN_OVERLAP_SHARE,
@@ -38,6 +39,8 @@ class StackQuality:
         overlap_correlation: with the other stacks over those pixels.
         handedness: whether it shows the asymmetry of the head as the others do (`registration.handedness`); None where
             that was not asked for or cannot be said.
+        misfit_without: how much of the misfit of the other stacks is left without it (`registration.intruder`); None
+            where that was not asked for.
         left_out: whether the volume was made without it, since it does not fit the others (`registration.misfits`);
             then the figures are those that it had beside them.
     """
@@ -52,6 +55,7 @@ class StackQuality:
     overlap_share: float | None = None
     overlap_correlation: float | None = None
     handedness: float | None = None
+    misfit_without: float | None = None
     left_out: bool = False
 
     def record(self) -> dict[str, Any]:
@@ -82,6 +86,9 @@ def shortfalls(one: StackQuality) -> list[str]:
     if one.overlap_correlation is not None and one.overlap_correlation < least_overlap:
         good = f"good is {MIN_OVERLAP_CORRELATION:g} and above"
         found.append(f"agreement {one.overlap_correlation:.3g} where others saw it; {good}")
+    if one.misfit_without is not None and one.misfit_without < MIN_MISFIT_WITHOUT:
+        good = f"good is {1 - MIN_MISFIT_WITHOUT:.0%} or less"
+        found.append(f"the other stacks fit each other {1 - one.misfit_without:.0%} better without it; {good}")
     return found
 
 

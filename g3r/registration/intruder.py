@@ -1,0 +1,44 @@
+"""How much better the slices of all other stacks fit a volume that one stack is left out of.
+
+A stack of another head of the same age finds a place among the others, and the volume becomes a mean of both heads.
+All stacks then agree with it about equally, and less than they would with their own head; no comparison of one stack
+with the others tells which one is to blame. What tells is what the others gain by its absence.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.planes import Slices
+from g3r.registration.slice_rounds import FittedSlices, correlation_with_all
+from g3r.registration.thresholds import IN_PLACE_NCC
+
+
+def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) -> list[float] | None:
+    """For each stack how much of the misfit of all others is left without it.
+
+    The misfit of a slice is what its correlation with the volume lacks to 1. It is smaller in a volume of fewer stacks
+    in any case, since each slice then is a larger part of it.
+
+    Args:
+        fitted: slices of three or more stacks, in place.
+        voxel_mm: of the volumes.
+        max_pixels: about as many are looked at, at most.
+
+    Returns:
+        The median over the slices of the other stacks, stack by stack; None for fewer than three stacks, of which
+        those left have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
+    """
+    slices: Slices = fitted.slices
+    stacks = np.unique(slices.stack_id).tolist()
+    fit = [float(np.median(fitted.ncc[slices.stack_id == stack])) for stack in stacks]
+    if len(stacks) < 3 or min(fit) >= IN_PLACE_NCC:
+        return None
+    found = []
+    for stack in stacks:
+        others: NDArray[np.int64] = np.flatnonzero(slices.stack_id != stack)
+        gain, weight = fitted.gain[others], fitted.weight[others]
+        ncc = correlation_with_all(slices.take(others), gain, weight, voxel_mm, max_pixels)
+        found.append(float(np.median((1 - ncc) / np.maximum(1 - fitted.ncc[others], 1e-6))))
+    return found

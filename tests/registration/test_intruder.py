@@ -1,0 +1,63 @@
+"""A stack of another head is told by what the others gain without it, even where it fits as well as they do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.phantom import fetal_brain_phantom
+from data_synth.simulator import SimulatedStack
+from g3r.acquisition.planes import Slices
+from g3r.registration.intruder import misfit_without_each
+from g3r.registration.slice_rounds import FittedSlices, correlation_with_all
+from g3r.registration.stack_quality import StackQuality, shortfalls
+from g3r.registration.thresholds import IN_PLACE_NCC, MIN_MISFIT_WITHOUT
+from tests.registration.moving_heads import STILL, as_slices, simulated
+
+VOXEL_MM, MAX_PIXELS = 1.8, 100_000
+
+
+def fitted(slices: Slices) -> FittedSlices:
+    ones = np.ones(len(slices))
+    ncc = correlation_with_all(slices, ones, ones, VOXEL_MM, MAX_PIXELS)
+    return FittedSlices(slices=slices, gain=ones, weight=ones, ncc=ncc, history=[])
+
+
+def noisy(slices: Slices) -> Slices:
+    """So noisy that no slice fits as those in place do."""
+    noise = np.random.default_rng(0).normal(0, 0.15, slices.value.shape)
+    return replace(slices, value=(slices.value + noise).astype(np.float32))
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_others_fit_each_other_without_a_stack_of_another_head(still: list[SimulatedStack], which: int) -> None:
+    other = simulated(fetal_brain_phantom(28, 1.2, 9), STILL, seed=4)
+    slices = as_slices([other[n] if n == which else one for n, one in enumerate(still)])[0]
+    left = misfit_without_each(fitted(slices), VOXEL_MM, MAX_PIXELS)
+    assert left is not None
+    assert np.argmin(left) == which
+    assert left[which] < MIN_MISFIT_WITHOUT
+    # without one of the others the slices of the third gain, too: half of the blur goes
+    assert min(one for n, one in enumerate(left) if n != which) > 1.2 * left[which]
+
+
+def test_noise_stays_without_any_of_them(still: list[SimulatedStack]) -> None:
+    left = misfit_without_each(fitted(noisy(as_slices(still)[0])), VOXEL_MM, MAX_PIXELS)
+    assert left is not None
+    assert min(left) > MIN_MISFIT_WITHOUT
+
+
+def test_stacks_in_place_and_those_that_have_no_two_others_are_not_asked(still: list[SimulatedStack]) -> None:
+    in_place = fitted(as_slices(still)[0])
+    in_place = replace(in_place, ncc=np.full(len(in_place.slices), IN_PLACE_NCC))
+    assert misfit_without_each(in_place, VOXEL_MM, MAX_PIXELS) is None
+    assert misfit_without_each(fitted(noisy(as_slices(still[:2])[0])), VOXEL_MM, MAX_PIXELS) is None
+
+
+def test_the_reason_says_how_much_better_the_others_fit() -> None:
+    good = StackQuality(True, 0.8, 0.88, 0.0, misfit_without=MIN_MISFIT_WITHOUT)
+    assert shortfalls(good) == []
+    (line,) = shortfalls(replace(good, misfit_without=0.45))
+    assert line == "the other stacks fit each other 55% better without it; good is 35% or less"
