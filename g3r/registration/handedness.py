@@ -108,7 +108,8 @@ def _stands_out(one: Asymmetry, others: Sequence[Asymmetry | None]) -> bool:
         return False
     usual = mean(other.correlation for other in known)
     error = sum(other.error**2 for other in known) ** 0.5 / len(known)
-    return usual > error and one.correlation < usual - STANDS_OUT * np.hypot(one.error, error)
+    below_zero = one.correlation < -STANDS_OUT * one.error
+    return below_zero and usual > error and one.correlation < usual - STANDS_OUT * float(np.hypot(one.error, error))
 
 
 def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:

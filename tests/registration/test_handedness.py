@@ -96,11 +96,19 @@ LOW = Asymmetry(-0.08, 0.03)
     [
         (LOW, [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [LOW.highest, 0.1, 0.12]),
         (LOW, [Asymmetry(0.0, 0.02), Asymmetry(0.0, 0.02)], [None, 0.12, 0.12]),
-        (Asymmetry(-0.08, 0.05), [Asymmetry(0.02, 0.02), Asymmetry(0.02, 0.01)], [None, 0.12, 0.12]),
+        (Asymmetry(-0.065, 0.03), [Asymmetry(0.065, 0.085)] * 2, [None, 0.12, 0.12]),
+        (Asymmetry(-0.09, 0.05), [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [None, 0.12, 0.12]),
         (LOW, [None, None], [None, 0.12, 0.12]),
         (Asymmetry(-0.03, 0.02), [Asymmetry(0.1, 0.01), Asymmetry(0.1, 0.01)], [-0.01, 0.12, 0.12]),
     ],
-    ids=["mirrored", "symmetric head", "not by much", "nothing known of the others", "above the limit"],
+    ids=[
+        "mirrored",
+        "symmetric head",
+        "hardly unlike the others",
+        "hardly below zero",
+        "nothing known of the others",
+        "above the limit",
+    ],
 )
 def test_a_mirror_image_is_called_so_where_the_others_show_that_the_head_has_sides(
     still: list[SimulatedStack],
