@@ -59,7 +59,7 @@ class Registration:
         profiles: of each stack, missing slices included.
         overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
         handedness: of each stack, see `registration.handedness`; None where it was not asked for.
-        misfit_without: for each stack see `registration.intruder`; None where it was not asked for.
+        misfit_without: for each stack see `registration.intruder`; None where nobody asked.
         left_out: numbers of stacks that are not among the slices since they do not fit the others, and their quality
             beside these.
     """
@@ -78,7 +78,7 @@ class Registration:
     profiles: list[AreaProfile] = field(default_factory=list)
     overlap: Overlap | None = None
     handedness: list[float | None] | None = None
-    misfit_without: list[float] | None = None
+    misfit_without: list[float | None] | None = None
     left_out: list[tuple[int, StackQuality]] = field(default_factory=list)
 
     def __repr__(self) -> str:

@@ -15,8 +15,8 @@ from g3r.registration.slice_rounds import FittedSlices, correlation_with_all
 from g3r.registration.thresholds import IN_PLACE_NCC
 
 
-def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) -> list[float] | None:
-    """For each stack how much of the misfit of all others is left without it.
+def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) -> list[float | None] | None:
+    """How much of the misfit of all others is left without a stack, for the stack without which least is left.
 
     The misfit of a slice is what its correlation with the volume lacks to 1. It is smaller in a volume of fewer stacks
     in any case, since each slice then is a larger part of it.
@@ -27,8 +27,9 @@ def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) 
         max_pixels: about as many are looked at, at most.
 
     Returns:
-        The median over the slices of the other stacks, stack by stack; None for fewer than three stacks, of which
-        those left have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
+        The median over the slices of the other stacks, at the place of that stack, and None at the others: without one
+        of those the slices of the rest gain, too, as long as it stays. None for fewer than three stacks, of which those
+        left have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
     """
     slices: Slices = fitted.slices
     stacks = np.unique(slices.stack_id).tolist()
@@ -41,4 +42,5 @@ def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) 
         gain, weight = fitted.gain[others], fitted.weight[others]
         ncc = correlation_with_all(slices.take(others), gain, weight, voxel_mm, max_pixels)
         found.append(float(np.median((1 - ncc) / np.maximum(1 - fitted.ncc[others], 1e-6))))
-    return found
+    least = int(np.argmin(found))
+    return [one if n == least else None for n, one in enumerate(found)]

@@ -63,12 +63,16 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             overlap_share=share,
             overlap_correlation=correlation,
             handedness=None if registration.handedness is None else registration.handedness[place],
-            misfit_without=None if registration.misfit_without is None else registration.misfit_without[place],
             **missing,
         )
         # two stacks have no third that shows whether the head has sides: the verdict asks to look
         fails = bool(shortfalls(one)) or (is_mirrored(one) and len(present) > 2)
         found.append(one if held_out is None else replace(one, reliable=not fails))
+    if registration.misfit_without is not None and all(found[n].reliable for n in present):
+        # one that failed is known to be wrong, and others may gain without a sound one as long as it stays
+        for n, left in zip(present, registration.misfit_without, strict=True):
+            one = replace(found[n], misfit_without=left)
+            found[n] = replace(one, reliable=not shortfalls(one))
     return found
 
 

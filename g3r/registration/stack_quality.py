@@ -40,7 +40,7 @@ class StackQuality:
         handedness: whether it shows the asymmetry of the head as the others do (`registration.handedness`); None where
             that was not asked for or cannot be said.
         misfit_without: how much of the misfit of the other stacks is left without it (`registration.intruder`); None
-            where that was not asked for.
+            where that was not asked for, or less is left without another.
         left_out: whether the volume was made without it, since it does not fit the others (`registration.misfits`);
             then the figures are those that it had beside them.
     """

@@ -37,16 +37,14 @@ def test_others_fit_each_other_without_a_stack_of_another_head(still: list[Simul
     slices = as_slices([other[n] if n == which else one for n, one in enumerate(still)])[0]
     left = misfit_without_each(fitted(slices), VOXEL_MM, MAX_PIXELS)
     assert left is not None
-    assert np.argmin(left) == which
-    assert left[which] < MIN_MISFIT_WITHOUT
-    # without one of the others the slices of the third gain, too: half of the blur goes
-    assert min(one for n, one in enumerate(left) if n != which) > 1.2 * left[which]
+    assert [one is not None for one in left] == [n == which for n in range(3)]
+    assert (left[which] or 1.0) < MIN_MISFIT_WITHOUT
 
 
 def test_noise_stays_without_any_of_them(still: list[SimulatedStack]) -> None:
     left = misfit_without_each(fitted(noisy(as_slices(still)[0])), VOXEL_MM, MAX_PIXELS)
     assert left is not None
-    assert min(left) > MIN_MISFIT_WITHOUT
+    assert min(one for one in left if one is not None) > MIN_MISFIT_WITHOUT
 
 
 def test_stacks_in_place_and_those_that_have_no_two_others_are_not_asked(still: list[SimulatedStack]) -> None:
@@ -60,4 +58,4 @@ def test_the_reason_says_how_much_better_the_others_fit() -> None:
     good = StackQuality(True, 0.8, 0.88, 0.0, misfit_without=MIN_MISFIT_WITHOUT)
     assert shortfalls(good) == []
     (line,) = shortfalls(replace(good, misfit_without=0.45))
-    assert line == "the other stacks fit each other 55% better without it; good is 35% or less"
+    assert line == "the other stacks fit each other 55% better without it; good is 40% or less"

@@ -24,6 +24,7 @@ from g3r.registration.thresholds import (
     IN_PLACE_NCC,
     LEEWAY,
     MIN_HELD_OUT,
+    MIN_MISFIT_WITHOUT,
     MIN_NCC,
     MIN_OVERLAP_CORRELATION,
     MIRRORED_BELOW,
@@ -95,6 +96,7 @@ def estimate_with(held_out: list[float] | None, ncc: list[float], weight: list[f
         profiles=[],
         overlap=None,
         handedness=None,
+        misfit_without=None,
         left_out=[],
         slices=SimpleNamespace(stack_id=np.array(ids)),
         held_out=held_out,
@@ -130,6 +132,7 @@ def test_every_figure_can_call_a_stack_unreliable(held_out: float, ncc: float, w
         "overlap_share": None,
         "overlap_correlation": None,
         "handedness": None,
+        "misfit_without": None,
         "left_out": False,
     }
 
@@ -162,6 +165,13 @@ def test_of_two_stacks_one_may_be_a_mirror_image_and_both_are_reliable(still: li
     assert [one.reliable for one in found] == [True, False, True]  # the second has no slices
     (line,) = pose_warnings(estimate, found, [one.stack for one in still])[1:]
     assert line.startswith(f"{still[2].stack.name}: may be a mirror image of what the other stack shows")
+
+
+@pytest.mark.parametrize(("ncc", "reliable"), [(0.85, [True, False, True]), (MIN_NCC - 0.01, [False, True, True])])
+def test_a_stack_is_one_too_many_where_no_other_failed(ncc: float, reliable: list[bool]) -> None:
+    estimate = estimate_with([0.8] * 3, [ncc, 0.85, 0.85], [1.0] * 3, [0, 1, 2])
+    estimate.misfit_without = [None, MIN_MISFIT_WITHOUT - 0.1, None]
+    assert [one.reliable for one in stack_qualities(estimate, 3)] == reliable
 
 
 def test_a_stack_without_slices_is_named_and_shifts_nobody(still: list[SimulatedStack]) -> None:
