@@ -16,7 +16,7 @@ from g3r.registration.estimate import Registration, register
 from g3r.registration.open_strain import crossing_deg
 from g3r.registration.quality import nearly_parallel, stack_qualities
 from g3r.registration.settings import RegistrationSettings
-from g3r.registration.stack_quality import StackQuality, unlike_others
+from g3r.registration.stack_quality import StackQuality, is_mirrored, unlike_others
 from g3r.registration.thresholds import IN_PLACE_CORRELATION
 from g3r.run.deadline import Deadline
 
@@ -78,7 +78,7 @@ def register_robustly(
                 return found
             logger.info("most stacks do not fit: registration without stack %d", number)
             others = without([number])
-            believed += [([number], others)] if _fits(others, IN_PLACE_CORRELATION) else []
+            believed += [([number], others)] if _fits(others, beyond_doubt=True) else []
     if len(believed) != 1:
         return found
     ((out, others),) = believed
@@ -100,13 +100,21 @@ def _failed(qualities: Sequence[StackQuality]) -> list[int]:
     return [n for n, one in enumerate(qualities) if one.reliable is False]
 
 
-def _fits(registration: Registration, least_correlation: float = 0.0) -> bool:
-    """Whether all stacks fit each other, a volume of the others by at least so much, and cross enough to check that."""
+def _fits(registration: Registration, *, beyond_doubt: bool = False) -> bool:
+    """Whether all stacks fit each other, and cross enough to check that.
+
+    Args:
+        registration: of these stacks.
+        beyond_doubt: whether they must agree as well as stacks in place do, and none may be a mirror image.
+    """
     _, qualities = _present(registration)
     if nearly_parallel(crossing_deg(registration.slices)):
         return False
-    agree = all((one.held_out_correlation or 0.0) >= least_correlation for one in qualities)
-    return agree and all(one.reliable for one in qualities) and not unlike_others(qualities)
+    if beyond_doubt and any(
+        is_mirrored(one) or (one.held_out_correlation or 0.0) < IN_PLACE_CORRELATION for one in qualities
+    ):
+        return False
+    return all(one.reliable for one in qualities) and not unlike_others(qualities)
 
 
 def _present(registration: Registration) -> tuple[list[int], list[StackQuality]]:

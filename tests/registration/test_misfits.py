@@ -16,6 +16,7 @@ from g3r.fitting.initial_volumes import with_pixels_of
 from g3r.registration import Registration, register, register_robustly
 from g3r.registration.misfits import misfits
 from g3r.registration.stack_quality import StackQuality, unlike_others
+from g3r.registration.thresholds import MIN_CROSSING_DEG
 from g3r.run.deadline import Deadline
 from g3r.run.stage_file import as_stored
 from tests.registration.moving_heads import Moving, as_slices
@@ -23,6 +24,7 @@ from tests.registration.test_quality import QUICK, noise_instead
 
 GOOD, FAILED = StackQuality(True, 0.8, 0.95, 0.0), StackQuality(False, 0.3, 0.8, 0.0)
 UNLIKE = StackQuality(True, 0.8, 0.85, 0.0)
+MIRRORED = replace(GOOD, handedness=-0.1)  # as one of two may be
 
 
 def with_noise(still: list[SimulatedStack], place: int) -> list[SimulatedStack]:
@@ -95,6 +97,15 @@ def test_all_stay_where_the_others_do_not_fit_without_it_either(
     assert register_robustly(slices, QUICK).left_out == []
 
 
+@pytest.mark.parametrize(("angle_deg", "expected"), [(MIN_CROSSING_DEG - 1, []), (MIN_CROSSING_DEG, [1])])
+def test_all_stay_where_the_others_would_not_check_each_other(
+    still: list[SimulatedStack], monkeypatch: pytest.MonkeyPatch, angle_deg: float, expected: list[int]
+) -> None:
+    slices, _ = as_slices(with_noise(still, 1))
+    monkeypatch.setattr("g3r.registration.misfits.crossing_deg", lambda slices: angle_deg)
+    assert [n for n, _ in register_robustly(slices, QUICK).left_out] == expected
+
+
 def test_the_registration_serves_for_all_stacks_again(still: list[SimulatedStack]) -> None:
     """As `reconstruct(stacks, registration)` has it: the slices of the stack that was left out are not expected."""
     slices, _ = as_slices(with_noise(still, 2))
@@ -127,8 +138,9 @@ def agreeing(correlation: float, *, fits: bool = True) -> list[StackQuality]:
         ({0: agreeing(0.5, fits=False), 1: agreeing(0.5, fits=False), 2: agreeing(0.6, fits=False)}, None),
         ({0: agreeing(0.5, fits=False), 1: agreeing(0.7), 2: agreeing(0.6, fits=False)}, None),
         ({0: agreeing(0.5, fits=False), 1: [GOOD, UNLIKE], 2: agreeing(0.6, fits=False)}, None),
+        ({0: agreeing(0.5, fits=False), 1: [GOOD, MIRRORED], 2: agreeing(0.6, fits=False)}, None),
     ],
-    ids=["one fits without", "two do", "none does", "only just", "unlike each other"],
+    ids=["one fits without", "two do", "none does", "only just", "unlike each other", "a mirror image"],
 )
 def test_where_all_failed_each_is_left_out_in_its_turn(
     moving: Moving, monkeypatch: pytest.MonkeyPatch, without: dict[int, list[StackQuality]], expected: int | None
