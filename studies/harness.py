@@ -23,6 +23,7 @@ from g3r.bench.record import machine, machine_line, put_between_markers, write_j
 from g3r.errors import G3RError, InputError
 from g3r.planning.presets import PRESETS
 from g3r.run.machine import available_cores, use_up_to
+from studies.worker import begin_worker
 
 Row = dict[str, Any]
 Record = dict[str, Any]
@@ -262,7 +263,7 @@ def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[t
         return
     # a fresh interpreter for each worker: thread pools do not survive a fork
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawn, initializer=use_up_to, initargs=(threads or 1,)) as pool:
+    with ProcessPoolExecutor(jobs, spawn, initializer=begin_worker, initargs=(threads or 1,)) as pool:
         waiting = {pool.submit(task.call, *task.arguments): task for task in tasks}
         try:
             for done in as_completed(waiting):

@@ -86,6 +86,13 @@ def test_the_better_mean_of_the_slices_is_said() -> None:
     assert "registration" in line
 
 
+def test_what_differs_by_less_than_the_check_can_tell_is_not_called_worse() -> None:
+    tie = VolumeCheck(volume=0.0951, prior=0.0948, coarse=0.0947)
+    assert not tie.falls_back
+    assert tie.line() == ""
+    assert VolumeCheck(volume=0.0951, prior=0.0944, coarse=0.2).falls_back
+
+
 def reconstruction() -> ReconstructionResult:
     """A small head with a fit as long as that of `fast`."""
     settings = replace(SETTINGS, slice_stage=PRESETS["fast"].slice_stage, gaussian_spacing_pixels=1.5)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import time
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import psutil
 import pytest
 
 from g3r.bench.record import machine_line
@@ -108,6 +112,40 @@ def test_nothing_more_is_measured_once_a_job_failed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="of the first one"):
         list(results(tasks, 2, 1))
     assert len(list(tmp_path.iterdir())) < 50
+
+
+def endless(n: int, folder: Path) -> dict[str, int]:
+    (folder / f"process-{os.getpid()}").touch()
+    while True:
+        time.sleep(1)
+
+
+ENDLESS = """
+from pathlib import Path
+from studies.harness import Task, results
+from tests.studies.test_harness import endless
+if __name__ == "__main__":
+    list(results([Task(str(n), endless, (n, Path({folder!r}))) for n in range(2)], 2, 1))
+"""
+
+
+def test_workers_end_with_a_command_that_was_killed(tmp_path: Path) -> None:
+    script, started = tmp_path / "endless.py", tmp_path / "started"
+    script.write_text(ENDLESS.format(folder=str(started)))
+    started.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
+    with subprocess.Popen([sys.executable, str(script)], env=environment, cwd=FOLDER.parent) as run:
+        wait_until(lambda: len(list(started.iterdir())) == 2)
+        run.kill()
+    workers = [int(path.name.removeprefix("process-")) for path in started.iterdir()]
+    wait_until(lambda: not any(psutil.pid_exists(one) for one in workers))
+
+
+def wait_until(happened: Callable[[], bool], limit_s: float = 60) -> None:
+    end = time.monotonic() + limit_s
+    while not happened():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.1)
 
 
 def test_subjects_that_were_looked_at_are_not_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

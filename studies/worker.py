@@ -1,0 +1,26 @@
+"""A process that measures for a study."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from threading import Thread
+
+from g3r.run.machine import use_up_to
+
+
+def begin_worker(threads: int) -> None:
+    """Set the threads of this process, and end it with the one that began it, also if that was killed.
+
+    Args:
+        threads: at most so many.
+    """
+    use_up_to(threads)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # a process without one would be no worker
+    parent.join()
+    os._exit(1)
