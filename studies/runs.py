@@ -113,7 +113,12 @@ def off_share(error_mm: Mapping[SliceKey, float], slices: Slices, weight: NDArra
 
 
 def aligned(
-    case: SimulatedCase, data: NDArray[np.float32], grid: VolumeGrid, truth_from_volume: RigidPose
+    case: SimulatedCase,
+    data: NDArray[np.float32],
+    grid: VolumeGrid,
+    truth_from_volume: RigidPose,
+    *,
+    near: bool = False,
 ) -> Comparison:
     """A volume compared with the truth after rigid alignment.
 
@@ -125,9 +130,10 @@ def aligned(
         data: [I, J, K] of the volume.
         grid: of the data.
         truth_from_volume: the common motion of the slices (`PoseError.common`).
+        near: whether to rely on it, which is quicker where a volume is unlike the truth (`align_rigid`).
     """
     volume = Volume(data, grid.moved(truth_from_volume).affine, case.name)
-    return compare(volume, case.truth, case.truth_mask, align=True)
+    return compare(volume, case.truth, case.truth_mask, align=True, near=near)
 
 
 def figures(scores: Scores) -> dict[str, float]:

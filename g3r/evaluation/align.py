@@ -29,6 +29,9 @@ START_ANGLES_DEG = (-25.0, 0.0, 25.0)
 GOOD_ENOUGH_NCC = 0.95
 """If the first start reaches this at the coarse level, the others are not tried."""
 
+N_NEAR = 2
+"""The first starts, without rotations: all that a volume needs whose orientation is known."""
+
 COARSE_SHRINK = 4
 SAMPLED_SHARE = 0.15
 """Share of the voxels that the metric uses, on a regular lattice that ITK jitters."""
@@ -54,7 +57,7 @@ class Alignment:
     translation_mm: float
 
 
-def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> Alignment:
+def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, near: bool = False) -> Alignment:
     """Find the rigid motion that best correlates a volume with the reference inside its mask.
 
     Multi-start at a coarse level (centres of mass, headers as they are, then rotations about each
@@ -64,6 +67,7 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> A
         volume: the image to be aligned; zero or not finite where it has no data.
         reference: the image that stays.
         mask: bool [I, J, K] on the reference's grid.
+        near: whether the volume is known to lie there within some ten degrees; then no rotations are tried.
 
     Raises:
         InputError: no start gave an overlap, or a header is sheared.
@@ -72,7 +76,7 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_]) -> A
     fixed_mask = _to_sitk(Volume(mask.astype(np.float32), reference.affine, "mask"))
     fixed_mask = sitk.Cast(fixed_mask > 0.5, sitk.sitkUInt8)
     best: tuple[float, sitk.Euler3DTransform] | None = None
-    for n, start in enumerate(_starts(fixed, moving)):
+    for n, start in enumerate(itertools.islice(_starts(fixed, moving), N_NEAR if near else None)):
         try:
             found = _register(fixed, moving, fixed_mask, start, levels=(COARSE_SHRINK,), n_iterations=40)
         except RuntimeError as error:  # ITK found no overlap

@@ -31,7 +31,9 @@ class Comparison:
     volume: NDArray[np.float32]
 
 
-def compare(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align: bool = False) -> Comparison:
+def compare(
+    volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align: bool = False, near: bool = False
+) -> Comparison:
     """Score a volume against a reference in the mask of the reference.
 
     Args:
@@ -39,6 +41,7 @@ def compare(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align
         reference: the volume to compare with.
         mask: bool [I, J, K] on the grid of the reference.
         align: remove a rigid motion first; otherwise the headers are used as they are.
+        near: see `align_rigid`.
 
     Raises:
         InputError: a volume without finite values, a reference that is not finite or not positive in the
@@ -54,7 +57,7 @@ def compare(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, align
         raise InputError(f"{reference.name}: has values that are not finite in the mask; choose another reference")
     if np.percentile(inside, 99.9) <= 0:
         raise InputError(f"{reference.name}: is not positive in the mask; check that the mask belongs to it")
-    alignment = align_rigid(volume, reference, mask) if align else None
+    alignment = align_rigid(volume, reference, mask, near=near) if align else None
     moved = resample(volume, reference.grid, alignment.volume_from_reference if alignment else None)
     if not moved[mask].any():
         raise InputError(

@@ -56,7 +56,7 @@ def scored(
         known: alignment of a volume of the same slices in the same poses, which is then taken; found when None.
     """
     if known is None:
-        found = aligned(case, data, grid, truth_from_volume)
+        found = aligned(case, data, grid, truth_from_volume, near=True)
     else:
         volume = Volume(data, grid.moved(truth_from_volume).affine, case.name)
         moved = resample(volume, case.truth.grid, known.volume_from_reference)

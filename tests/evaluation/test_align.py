@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from scipy.ndimage import map_coordinates
 
 from g3r.acquisition.images import Volume
 from g3r.errors import InputError
+from g3r.evaluation import align
 from g3r.evaluation.align import align_rigid, resample
 from g3r.evaluation.compare import compare
 from g3r.geometry import RigidPose, VolumeGrid
@@ -41,18 +44,45 @@ def pose_deg(rotation: Sequence[float], translation_mm: Sequence[float]) -> Rigi
 
 
 @pytest.mark.parametrize(
-    ("rotation_deg", "translation_mm"), [((0, 0, 0), (0, 0, 0)), ((4, -6, 3), (3, -2, 5)), ((18, 12, -22), (9, 4, -7))]
+    ("rotation_deg", "translation_mm", "near"),
+    [
+        ((0, 0, 0), (0, 0, 0), False),
+        ((4, -6, 3), (3, -2, 5), False),
+        ((4, -6, 3), (3, -2, 5), True),
+        ((18, 12, -22), (9, 4, -7), False),
+    ],
 )
-def test_a_known_motion_is_found(rotation_deg: tuple[int, int, int], translation_mm: tuple[int, int, int]) -> None:
+def test_a_known_motion_is_found(
+    rotation_deg: tuple[int, int, int], translation_mm: tuple[int, int, int], near: bool
+) -> None:
     reference, mask = on_grid(GRID)
     pose = pose_deg(rotation_deg, translation_mm)
     moved, _ = on_grid(VolumeGrid.isotropic((-52, -60, -50), (56, 60, 48), 1.7), pose)
-    found = align_rigid(moved, reference, mask)
+    found = align_rigid(moved, reference, mask, near=near)
     points = GRID.world(np.argwhere(mask)[::50])
     error = np.linalg.norm((found.volume_from_reference.apply(points[None]) - pose.apply(points[None]))[0], axis=1)
     assert error.max() < 0.1 * GRID.spacing_mm[0]
     assert found.ncc > 0.99
     assert found.rotation_deg == pytest.approx(np.linalg.norm(rotation_deg), abs=0.3)
+
+
+def test_other_orientations_are_not_tried_where_the_volume_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, mask = on_grid(GRID)
+    noise = np.random.default_rng(0).normal(0, reference.data.std(), reference.data.shape)
+    unlike = Volume((reference.data + noise).astype(np.float32), reference.affine, "noise")
+    tried: list[tuple[int, ...]] = []
+
+    def register(*arguments: Any, **options: Any) -> tuple[float, sitk.Euler3DTransform]:
+        tried.append(options["levels"])
+        return 0.5, arguments[3]
+
+    monkeypatch.setattr(align, "_register", register)
+    n_tried = {}
+    for near in (False, True):
+        align_rigid(unlike, reference, mask, near=near)
+        n_tried[near] = tried.count((align.COARSE_SHRINK,))
+        tried.clear()
+    assert n_tried == {False: 28, True: 2}
 
 
 def test_same_input_same_result() -> None:
