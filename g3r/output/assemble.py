@@ -5,26 +5,24 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from g3r.acquisition.slicing import by_headers
-from g3r.errors import NumericalError
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.lattice_mean import mean_cloud
 from g3r.fitting.slice_stage import SliceFit
-from g3r.geometry.grid import on_grid
-from g3r.output.mixture import FinishedVolume, Mixture
+from g3r.output.maps import VolumeMaps, estimate_maps
+from g3r.output.mixture import FinishedVolume
 from g3r.output.record import RegistrationRecord, RunRecord, inactive_terms
 from g3r.output.result import ReconstructionResult
 from g3r.output.stack_record import stack_records
 from g3r.output.stage_results import StageResults
-from g3r.output.written_volume import checked, corrected, least_weight, masks_on
+from g3r.output.written_volume import WrittenVolume, written_volume
 from g3r.planning.anatomy import FETAL_BRAIN, NAME_OF, NOTE_ON_OTHERS
 from g3r.planning.plan import Plan
 from g3r.planning.presets import ReconstructionSettings, adapted
-from g3r.planning.stages import Stage, stage_rng
+from g3r.planning.stages import Stage
 from g3r.registration.quality import (
     left_out_notes,
     parallel_warnings,
@@ -33,12 +31,8 @@ from g3r.registration.quality import (
     stack_qualities,
 )
 from g3r.registration.stack_quality import StackQuality
-from g3r.run.allocator import release_memory
 from g3r.run.context import RunContext
 from g3r.run.machine import peak_bytes
-from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
-from g3r.uncertainty.estimate import prior_share_summary
-from g3r.uncertainty.prior_share import estimate_prior_share
 from g3r.uncertainty.unseen import UnseenPart
 
 logger = logging.getLogger(__name__)
@@ -63,103 +57,43 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
     run.notes += left_out_notes(qualities, found.stacks)
     run.warnings += pose_warnings(found.registration, qualities, found.stacks)
     run.warnings += parallel_warnings(found.registration.slices)
-    grid = volumes.grid.respaced(settings.resolution_mm)
-    cloud = mean_cloud(fit := found.fit or found.no_fit())
-    uncertainty, prior_share, uncertainty_record = None, None, None
+    fit = found.fit or found.no_fit()
+    cloud = mean_cloud(fit)
     with run.timed(Stage.VOLUME) as tell:
-        mask, support, edge = masks_on(grid, found.prior, fit)
-        least = least_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run)
-        mixture = Mixture(
-            grid=grid,
-            support=support,
-            prior=found.prior.values,
-            density=volumes.density,
-            prior_grid=volumes.grid,
-            least_weight=least,
-            edge=edge,
-            cutoff_sigma=settings.slice_stage.cutoff_sigma,
-        )
-        volume, seen = mixture.volume(cloud, grid), mixture.seen(grid)
-        if not np.isfinite(volume).all():
-            raise NumericalError("the volume holds values that are not finite; lower the step sizes")
-        check = checked(volume, mixture, found, fit) if settings.use_prior else None
-        if check is not None and check.falls_back:
-            mixture = replace(mixture, least_weight=1.0)
-            volume = mixture.volume(cloud, grid)
-        # errors are calibrated on what the fit gives; the correction takes a little of them away
-        mixed, correction = volume, corrected(volume, cloud, mixture, found, settings, run)
-        if correction is not None:
-            mixture = replace(mixture, correction=correction.values)
-            volume = mixture.corrected(mixed, grid)
-        unseen = mask & ~seen
-        unseen_part = UnseenPart.of(
-            unseen,
-            mask,
-            grid.voxel_volume_mm3,
-            shown=_shown_unseen(found.prior, settings),
-            share_by_areas=_share_by_areas(found, settings),
-            has_template=found.prior.has_template,
-            what=NAME_OF[settings.anatomy],
-        )
-        tell(FinishedVolume(volume=volume, mask=mask, grid=grid, unseen=unseen_part))
-    run.warnings += [line for line in (check.line() if check else "", unseen_part.line()) if line]
+        written = written_volume(cloud, fit, found, settings, run)
+        unseen = _unseen_part(written, found, settings)
+        tell(FinishedVolume(volume=written.volume, mask=written.mask, grid=written.grid, unseen=unseen))
+    run.warnings += [line for line in (written.check.line() if written.check else "", unseen.line()) if line]
     run.notes += [NOTE_ON_OTHERS] if settings.anatomy != FETAL_BRAIN else []
+    maps = VolumeMaps()
     if run.stopped_at or not settings.n_lattices:
         run.notes.append(PARTIAL_NOTE if run.stopped_at else UNFITTED_NOTE)
     else:
-        if settings.use_prior:
-            with run.timed(Stage.PRIOR_SHARE):
-                prior_share = estimate_prior_share(
-                    fit,
-                    density=volumes.density,
-                    density_grid=volumes.grid,
-                    mask=mask,
-                    grid=grid,
-                    rng=stage_rng(settings.seed, Stage.PRIOR_SHARE),
-                    n_probes=settings.share_probes,
-                    cutoff_sigma=settings.slice_stage.cutoff_sigma,
-                    projection_bytes=settings.slice_stage.projection_bytes,
-                )
-                left = mixture.left_to_prior(grid)
-                prior_share = np.where(unseen, 1, left + (1 - left) * prior_share).astype(np.float32)
-                release_memory()
-        with run.timed(Stage.UNCERTAINTY):
-            estimated = estimate_uncertainty(
-                UncertaintyInputs(
-                    volume=mixed,
-                    mask=mask,
-                    grid=grid,
-                    fit=fit,
-                    prior=found.prior.values,
-                    density=volumes.density,
-                    prior_grid=volumes.grid,
-                    prior_share=prior_share,
-                    cutoff_sigma=settings.slice_stage.cutoff_sigma,
-                ),
-                with_prior=settings.use_prior,
-                intensity=found.intensity,
-                reliable=registration_reliable(qualities),
-            )
-        uncertainty, uncertainty_record = estimated.expected_error, estimated.record
-        if correction is not None and prior_share is not None:
-            prior_share = np.where(unseen, 1, prior_share * on_grid(correction.kept, volumes.grid, grid, outside=1.0))
-            uncertainty_record |= {"prior_share": prior_share_summary(prior_share[mask])}
+        maps = estimate_maps(written, fit, found, settings, run, reliable=registration_reliable(qualities))
+    record = replace(
+        _record(found, fit, qualities, plan, run, maps),
+        unseen=unseen,
+        prior_weight=written.mixture.least_weight,
+        volume_check=written.check,
+        voxel_correction=written.correction.record if written.correction else None,
+    )
     intensity = np.float32(found.intensity)
+    volume, mask, uncertainty = written.volume, written.mask, maps.uncertainty
     if not settings.fill_unseen:
-        volume, mask = volume * seen, mask & ~unseen
-        uncertainty = None if uncertainty is None else uncertainty * ~unseen
+        volume, mask = volume * written.seen, mask & ~written.unseen
+        uncertainty = None if uncertainty is None else uncertainty * ~written.unseen
     return ReconstructionResult(
         volume=volume * intensity,
         mask=mask,
-        unseen=unseen,
-        support=support,
-        edge=edge,
-        grid=grid,
+        unseen=written.unseen,
+        support=written.support,
+        edge=written.edge,
+        grid=written.grid,
         prior=found.prior.values * intensity,
         coarse=volumes.coarse * intensity,
         density=volumes.density,
         prior_grid=volumes.grid,
-        correction=mixture.correction,
+        correction=written.mixture.correction,
         cloud=cloud,
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
@@ -167,15 +101,22 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         weight=fit.weight,
         ncc=found.registration.ncc,
         uncertainty=uncertainty,
-        prior_share=prior_share,
+        prior_share=maps.prior_share,
         stacks=tuple(found.stacks),
-        record=replace(
-            _record(found, fit, qualities, plan, run, uncertainty_record),
-            unseen=unseen_part,
-            prior_weight=mixture.least_weight,
-            volume_check=check,
-            voxel_correction=correction.record if correction else None,
-        ),
+        record=record,
+    )
+
+
+def _unseen_part(written: WrittenVolume, found: StageResults, settings: ReconstructionSettings) -> UnseenPart:
+    """How much of the brain no slice saw, and what is shown there."""
+    return UnseenPart.of(
+        written.unseen,
+        written.mask,
+        written.grid.voxel_volume_mm3,
+        shown=_shown_unseen(found.prior, settings),
+        share_by_areas=_share_by_areas(found, settings),
+        has_template=found.prior.has_template,
+        what=NAME_OF[settings.anatomy],
     )
 
 
@@ -198,12 +139,7 @@ def _share_by_areas(found: StageResults, settings: ReconstructionSettings) -> fl
 
 
 def _record(
-    found: StageResults,
-    fit: SliceFit,
-    qualities: Sequence[StackQuality],
-    plan: Plan,
-    run: RunContext,
-    uncertainty: dict[str, Any] | None,
+    found: StageResults, fit: SliceFit, qualities: Sequence[StackQuality], plan: Plan, run: RunContext, maps: VolumeMaps
 ) -> RunRecord:
     settings, slices = plan.settings, found.prior.volumes.slices
     n_rollbacks = sum("rollback" in entry for entry in fit.history)
@@ -231,7 +167,7 @@ def _record(
         n_rollbacks=n_rollbacks,
         inactive_terms=inactive_terms(slices, adapted(settings, slices.n_stacks)),
         loss={Stage.FIT_TO_PRIOR: found.cloud.history if found.cloud else [], Stage.FIT_TO_SLICES: list(fit.history)},
-        uncertainty=uncertainty,
+        uncertainty=maps.record,
         seconds=run.clock.seconds,
         cpu_seconds=run.clock.cpu_seconds,
         peak_memory_bytes=peak_bytes(),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground
+from g3r.errors import NumericalError
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
@@ -22,6 +23,91 @@ from g3r.output.stage_results import StageResults
 from g3r.planning.presets import ReconstructionSettings, adapted
 from g3r.planning.stages import Stage, stage_rng
 from g3r.run.context import RunContext
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenVolume:
+    """The volume as it is written, in intensities of the fit, and how it came about.
+
+    Attributes:
+        volume: float32 [I, J, K].
+        mixed: float32 [I, J, K], the same before the correction by the slices.
+        mask: bool [I, J, K] of the brain.
+        support: bool [I, J, K] of what is shown.
+        edge: float16 [I, J, K], how the support fades.
+        seen: bool [I, J, K], where slices looked.
+        unseen: bool [I, J, K], brain where none did.
+        grid: of all these.
+        mixture: of Gaussians, V_prior and the correction.
+        check: the volume beside those before the fit; None without a prior.
+        correction: by the slices; None where there is none.
+    """
+
+    volume: NDArray[np.float32]
+    mixed: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    support: NDArray[np.bool_]
+    edge: NDArray[np.float16]
+    seen: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
+    grid: VolumeGrid
+    mixture: Mixture
+    check: VolumeCheck | None
+    correction: VoxelCorrection | None
+
+
+def written_volume(
+    cloud: GaussianCloud, fit: SliceFit, found: StageResults, settings: ReconstructionSettings, run: RunContext
+) -> WrittenVolume:
+    """The volume of a cloud on the output grid.
+
+    Args:
+        cloud: mean of the fit's lattices.
+        fit: to the slices, or what stands for it where there was none.
+        found: what the stages gave.
+        settings: as they were used.
+        run: takes notes.
+
+    Raises:
+        NumericalError: the volume is not finite.
+    """
+    prior, volumes = found.prior, found.prior.volumes
+    grid = volumes.grid.respaced(settings.resolution_mm)
+    mask, support, edge = masks_on(grid, prior, fit)
+    mixture = Mixture(
+        grid=grid,
+        support=support,
+        prior=prior.values,
+        density=volumes.density,
+        prior_grid=volumes.grid,
+        least_weight=least_weight(fit, float(mask.sum()) * grid.voxel_volume_mm3, settings, run),
+        edge=edge,
+        cutoff_sigma=settings.slice_stage.cutoff_sigma,
+    )
+    volume, seen = mixture.volume(cloud, grid), mixture.seen(grid)
+    if not np.isfinite(volume).all():
+        raise NumericalError("the volume holds values that are not finite; lower the step sizes")
+    check = checked(volume, mixture, found, fit) if settings.use_prior else None
+    if check is not None and check.falls_back:
+        mixture = replace(mixture, least_weight=1.0)
+        volume = mixture.volume(cloud, grid)
+    mixed, correction = volume, corrected(volume, cloud, mixture, found, settings, run)
+    if correction is not None:
+        mixture = replace(mixture, correction=correction.values)
+        volume = mixture.corrected(mixed, grid)
+    return WrittenVolume(
+        volume=volume,
+        mixed=mixed,
+        mask=mask,
+        support=support,
+        edge=edge,
+        seen=seen,
+        unseen=mask & ~seen,
+        grid=grid,
+        mixture=mixture,
+        check=check,
+        correction=correction,
+    )
 
 
 def masks_on(

@@ -1,0 +1,105 @@
+"""The maps beside a volume: how far each voxel rests on other brains, and its expected error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.fitting.slice_stage import SliceFit
+from g3r.geometry.grid import on_grid
+from g3r.output.stage_results import StageResults
+from g3r.output.written_volume import WrittenVolume
+from g3r.planning.presets import ReconstructionSettings
+from g3r.planning.stages import Stage, stage_rng
+from g3r.run.allocator import release_memory
+from g3r.run.context import RunContext
+from g3r.uncertainty import UncertaintyInputs, estimate_uncertainty
+from g3r.uncertainty.estimate import prior_share_summary
+from g3r.uncertainty.prior_share import estimate_prior_share
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeMaps:
+    """Maps of a volume, on its grid; None where they were not estimated.
+
+    Attributes:
+        uncertainty: float32 [I, J, K], expected error in units of the stacks.
+        prior_share: float32 [I, J, K], from 0 to 1; None without a prior, too.
+        record: for run.json.
+    """
+
+    uncertainty: NDArray[np.float32] | None = None
+    prior_share: NDArray[np.float32] | None = None
+    record: dict[str, Any] | None = None
+
+
+def estimate_maps(
+    written: WrittenVolume,
+    fit: SliceFit,
+    found: StageResults,
+    settings: ReconstructionSettings,
+    run: RunContext,
+    *,
+    reliable: bool | None,
+) -> VolumeMaps:
+    """The maps of a volume.
+
+    Args:
+        written: the volume.
+        fit: that it was made of.
+        found: what the stages gave.
+        settings: as they were used.
+        run: times both stages.
+        reliable: whether the registration can be relied on; None where nothing tells.
+    """
+    prior_share = None
+    if settings.use_prior:
+        with run.timed(Stage.PRIOR_SHARE):
+            prior_share = _mixed_share(written, fit, found, settings)
+            release_memory()
+    with run.timed(Stage.UNCERTAINTY):
+        estimated = estimate_uncertainty(
+            UncertaintyInputs(
+                volume=written.mixed,  # errors are calibrated on it; the correction takes a little of them away
+                mask=written.mask,
+                grid=written.grid,
+                fit=fit,
+                prior=found.prior.values,
+                density=found.prior.volumes.density,
+                prior_grid=found.prior.volumes.grid,
+                prior_share=prior_share,
+                cutoff_sigma=settings.slice_stage.cutoff_sigma,
+            ),
+            with_prior=settings.use_prior,
+            intensity=found.intensity,
+            reliable=reliable,
+        )
+    record = estimated.record
+    if written.correction is not None and prior_share is not None:
+        kept = on_grid(written.correction.kept, found.prior.volumes.grid, written.grid, outside=1.0)
+        prior_share = np.where(written.unseen, 1, prior_share * kept)
+        record = record | {"prior_share": prior_share_summary(prior_share[written.mask])}
+    return VolumeMaps(uncertainty=estimated.expected_error, prior_share=prior_share, record=record)
+
+
+def _mixed_share(
+    written: WrittenVolume, fit: SliceFit, found: StageResults, settings: ReconstructionSettings
+) -> NDArray[np.float32]:
+    """The prior's share of the mixed volume: through the Gaussians, and as it is mixed in."""
+    volumes = found.prior.volumes
+    share = estimate_prior_share(
+        fit,
+        density=volumes.density,
+        density_grid=volumes.grid,
+        mask=written.mask,
+        grid=written.grid,
+        rng=stage_rng(settings.seed, Stage.PRIOR_SHARE),
+        n_probes=settings.share_probes,
+        cutoff_sigma=settings.slice_stage.cutoff_sigma,
+        projection_bytes=settings.slice_stage.projection_bytes,
+    )
+    left = written.mixture.left_to_prior(written.grid)
+    return np.where(written.unseen, 1, left + (1 - left) * share).astype(np.float32)
