@@ -14,7 +14,8 @@ from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.volume_check import VolumeCheck, check_volume
-from g3r.fitting.voxel_correction import VoxelCorrection, correct_on_voxels, too_fine
+from g3r.fitting.voxel_correction import VoxelCorrection, correct_on_voxels
+from g3r.fitting.voxel_problem import too_fine
 from g3r.gaussians import GaussianCloud
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid

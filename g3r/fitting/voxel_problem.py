@@ -1,0 +1,157 @@
+"""A volume on voxels that explains pixels of a fit, held near another volume and kept smooth between edges.
+
+    minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s |grad V| ]_v
+
+A is the voxel operator with the profiles of the fit, r the mean coverage of a voxel. Total variation is solved as a
+sequence of weighted squares (lagged diffusivity, Vogel and Oman 1996).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from g3r.acquisition.planes import Slices
+from g3r.acquisition.robust import robust_width
+from g3r.acquisition.total_variation import diffusivity, divergence_of_gradient
+from g3r.acquisition.voxel_operator import VoxelOperator
+from g3r.fitting.bias_field import StackBiasField
+from g3r.fitting.slice_stage import SliceFit
+from g3r.geometry import VolumeGrid
+
+Array = NDArray[np.float32]
+
+FINE_VOXEL, TOO_FINE_VOXEL = 0.6, 0.5
+"""Share of a pixel below which a voxel may lie between pixels that are read along their normals alone, so that they get
+nodes in plane as well; and below which these leave holes, too, and nothing is asked of the pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelProblemSettings:
+    """How a volume is found.
+
+    Args:
+        hold: h, pull towards V_0, over what slices measure in a voxel.
+        total_variation: s.
+        tip: change from voxel to voxel below which total variation is a square.
+        n_rounds: solutions, each with the edges of the one before.
+        n_iterations: conjugate-gradient steps of each.
+    """
+
+    hold: float
+    total_variation: float
+    tip: float
+    n_rounds: int
+    n_iterations: int
+
+
+def too_fine(grid: VolumeGrid, slices: Slices) -> bool:
+    """Whether the voxels of a grid are too small for the pixels of slices to say what is in each."""
+    return _voxel_over_pixel(grid, slices) < TOO_FINE_VOXEL
+
+
+def _voxel_over_pixel(grid: VolumeGrid, slices: Slices) -> float:
+    return float(grid.spacing_mm.min()) / float(np.median(slices.planes.spacing_mm))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitPixels:
+    """P' pixels of a fit as the volume should show them.
+
+    Attributes:
+        slices: with profiles and poses.
+        index: number of each pixel among all.
+        plane: of each pixel.
+        value: intensities without gain and field.
+        weight: not negative.
+    """
+
+    slices: Slices
+    index: NDArray[np.int64]
+    plane: NDArray[np.integer]
+    value: Array
+    weight: Array
+
+    @classmethod
+    def of(cls, fit: SliceFit, slices: Slices, pixel_weight: Array) -> FitPixels:
+        """The masked pixels of slices of a fit, or of the same slices with other values or masks.
+
+        Args:
+            fit: its gains, fields and slice weights are taken.
+            slices: in the poses of the fit.
+            pixel_weight: [P].
+        """
+        index, plane = slices.pixel_index, slices.pixel_plane
+        value = slices.value[index] / fit.gain[plane]
+        if fit.bias_field:
+            value = value / np.exp(StackBiasField(slices).log_field(np.array(fit.bias_field))[index])
+        weight = pixel_weight[index] * fit.weight[plane]
+        return cls(slices=slices, index=index, plane=plane, value=value.astype(np.float32), weight=weight.astype("f4"))
+
+    def operator(self, grid: VolumeGrid) -> VoxelOperator:
+        """A for these pixels and a grid."""
+        in_plane = 3 if _voxel_over_pixel(grid, self.slices) < FINE_VOXEL else 1
+        return VoxelOperator(self.slices.planes, grid, self.index, (in_plane, in_plane, 5))
+
+    def error(self, volume: Array, grid: VolumeGrid) -> float:
+        """Root mean square error of what a volume [I, J, K] predicts, after a gain for each slice."""
+        off = self._off(volume, grid)
+        return float(np.sqrt((self.weight * off**2).sum() / max(float(self.weight.sum()), 1e-30)))
+
+    def noise(self, volume: Array, grid: VolumeGrid) -> float:
+        """Standard deviation of the same from its median, so that edges that the volume shows too soft hardly count."""
+        counts = self.weight > 0.5 * self.weight.max(initial=0)
+        return robust_width(self._off(volume, grid)[counts]) if counts.any() else 0.0
+
+    def _off(self, volume: Array, grid: VolumeGrid) -> NDArray[np.float64]:
+        predicted, n = self.operator(grid).forward(volume), len(self.slices)
+        across, own = (np.bincount(self.plane, self.weight * predicted * one, n) for one in (self.value, predicted))
+        gain = np.divide(across, own, out=np.ones(n), where=own > 0)
+        return gain[self.plane] * predicted - self.value
+
+
+class VoxelProblem:
+    """The minimisation for some pixels and a hold.
+
+    Args:
+        pixels: that are explained.
+        grid: of the volumes.
+        settings: hold, strength of total variation, and how long.
+    """
+
+    def __init__(self, pixels: FitPixels, grid: VolumeGrid, settings: VoxelProblemSettings) -> None:
+        self.pixels, self.grid, self.settings = pixels, grid, settings
+        self.operator = pixels.operator(grid)
+        seen = self.operator.adjoint(pixels.weight)
+        typical = float(seen[seen > 0.1 * seen.max(initial=0)].mean()) if seen.any() else 1.0
+        self.hold, self.strength = (np.float32(typical * one) for one in (settings.hold, settings.total_variation))
+
+    def solved(self, volume: Array) -> Array:
+        """V [I, J, K] of V_0."""
+        target = self.operator.adjoint(self.pixels.weight * self.pixels.value) + self.hold * volume
+        found = volume
+        for _ in range(self.settings.n_rounds):
+            found = self.solve(target, found, diffusivity(found, self.settings.tip))
+        return found
+
+    def solve(self, target: Array, start: Array, edges: Array) -> Array:
+        """One solution of the normal equations with edges that are known.
+
+        Args:
+            target: [I, J, K] their right side.
+            start: [I, J, K] where it begins.
+            edges: [I, J, K] of `diffusivity`.
+        """
+
+        def normal(flat: NDArray[np.floating]) -> Array:
+            volume = flat.reshape(self.grid.shape).astype(np.float32)
+            data = self.operator.adjoint(self.pixels.weight * self.operator.forward(volume).astype(np.float32))
+            held = self.hold * volume + self.strength * divergence_of_gradient(volume, edges)
+            return (data + held).ravel().astype(np.float32)
+
+        system = LinearOperator((target.size, target.size), matvec=normal, dtype=np.float32)
+        found, _ = cg(system, target.ravel(), x0=start.ravel(), maxiter=self.settings.n_iterations, rtol=1e-4)
+        return np.asarray(found, np.float32).reshape(self.grid.shape)
