@@ -8,7 +8,7 @@ sequence of weighted squares (lagged diffusivity, Vogel and Oman 1996).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +87,14 @@ class FitPixels:
         index, plane = slices.pixel_index, slices.pixel_plane
         value = slices.value[index] / fit.gain[plane]
         if fit.bias_field:
-            value = value / np.exp(StackBiasField(slices).log_field(np.array(fit.bias_field))[index])
+            value = value / np.exp(StackBiasField(fit.slices).log_field(np.array(fit.bias_field))[index])
         weight = pixel_weight[index] * fit.weight[plane]
         return cls(slices=slices, index=index, plane=plane, value=value.astype(np.float32), weight=weight.astype("f4"))
+
+    def take(self, chosen: NDArray[np.bool_]) -> FitPixels:
+        """Some of them: bool [P']."""
+        kept = {name: getattr(self, name)[chosen] for name in ("index", "plane", "value", "weight")}
+        return replace(self, **kept)
 
     def operator(self, grid: VolumeGrid) -> VoxelOperator:
         """A for these pixels and a grid."""

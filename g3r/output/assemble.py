@@ -76,6 +76,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         prior_weight=written.mixture.least_weight,
         volume_check=written.check,
         voxel_correction=written.correction.record if written.correction else None,
+        edge_by_image=written.edge_by_image,
     )
     intensity = np.float32(found.intensity)
     volume, mask, uncertainty = written.volume, written.mask, maps.uncertainty

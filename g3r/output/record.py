@@ -170,6 +170,7 @@ class RunRecord:
         prior_weight: least weight of V_prior in the volume.
         volume_check: how well volume, V_prior and V_coarse explain the slices; None without V_prior.
         voxel_correction: of the volume after that; None where there was none.
+        edge_by_image: whether slices that are black beside the brain told where the volume ends, not their masks alone.
         gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
         n_rollbacks: times that a fit went back to its best state.
         loss: by stage, figures of each step.
@@ -199,6 +200,7 @@ class RunRecord:
     prior_weight: float = 0.0
     volume_check: VolumeCheck | None = None
     voxel_correction: VoxelCorrectionRecord | None = None
+    edge_by_image: bool = False
     gaussian_spacing_mm: float | None = None
     n_rollbacks: int = 0
     inactive_terms: list[InactiveTerm] = field(default_factory=list)

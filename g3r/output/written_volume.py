@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.foreground import foreground
 from g3r.errors import NumericalError
+from g3r.fitting.edge_by_image import shown_by_image
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_weight import ended_early, prior_weight
 from g3r.fitting.slice_stage import SliceFit
@@ -36,6 +37,7 @@ class WrittenVolume:
         mask: bool [I, J, K] of the brain.
         support: bool [I, J, K] of what is shown.
         edge: float16 [I, J, K], how the support fades.
+        edge_by_image: whether slices that are black beside the brain told that, and not their masks alone.
         seen: bool [I, J, K], where slices looked.
         unseen: bool [I, J, K], brain where none did.
         grid: of all these.
@@ -49,6 +51,7 @@ class WrittenVolume:
     mask: NDArray[np.bool_]
     support: NDArray[np.bool_]
     edge: NDArray[np.float16]
+    edge_by_image: bool
     seen: NDArray[np.bool_]
     unseen: NDArray[np.bool_]
     grid: VolumeGrid
@@ -96,12 +99,18 @@ def written_volume(
     if correction is not None:
         mixture = replace(mixture, correction=correction.values)
         volume = mixture.corrected(mixed, grid)
+    shown = shown_by_slices(volume, mixture, found, fit, run)
+    if shown is not None:
+        mixture = replace(mixture, edge=(edge * shown).astype(edge.dtype))
+        left = np.divide(mixture.edge, edge, out=np.zeros_like(volume), where=edge > 0)
+        volume, mixed = volume * left, mixed * left
     return WrittenVolume(
         volume=volume,
         mixed=mixed,
         mask=mask,
         support=support,
-        edge=edge,
+        edge=mixture.edge,
+        edge_by_image=shown is not None,
         seen=seen,
         unseen=mask & ~seen,
         grid=grid,
@@ -131,6 +140,20 @@ def masks_on(
     found = foreground(fit.slices, grid, fit.weight)
     mask, support = found.mask(likely), found.support(likely)
     return mask, support, found.edge(support, mask, likely)
+
+
+def shown_by_slices(
+    volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit, run: RunContext
+) -> NDArray[np.float32] | None:
+    """How much of the volume slices show that are black beside the brain; None where they are not, or for want of time.
+
+    What no slice saw is left as it is.
+    """
+    if found.fit is None or run.stopped_at is not None:
+        return None
+    grid = mixture.grid
+    shown = shown_by_image(volume, mixture.edge, mixture.support, grid, fit, found.prior.volumes.slices)
+    return None if shown is None else np.where(mixture.seen(grid), shown, 1).astype(np.float32)
 
 
 def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:

@@ -116,9 +116,10 @@ def estimate_memory(
         Stage.FIT_TO_PRIOR: volumes + cloud + prior_projections + TARGET_PER_VOXEL * voxels,
         Stage.FIT_TO_SLICES: volumes + cloud + max(fit, rim),
     }
-    if settings.voxel_correction is not None:
-        correction = COARSE_PER_PIXEL * n_pixels + 4 * (CORRECTION_VOLUMES + buffers) * voxels
-        stages[Stage.VOLUME] = max(stages[Stage.VOLUME], outputs + correction)
+    # the correction on voxels, and the edge by the image
+    solved_on = output if settings.voxel_correction is None else max(voxels, output)
+    on_voxels = COARSE_PER_PIXEL * n_pixels + 4 * (CORRECTION_VOLUMES + buffers) * solved_on
+    stages[Stage.VOLUME] = max(stages[Stage.VOLUME], outputs + on_voxels)
     if settings.held_out is not None:
         stages[Stage.HELD_OUT] = stages[Stage.FIT_TO_SLICES]
     if settings.pose_rounds.n_rounds(slices.n_stacks):

@@ -63,8 +63,8 @@ output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
 
-CORRECTION_OVER_COARSE = 0.8
-"""Seconds of the correction on voxels over those of V_coarse and V_sharp."""
+CORRECTION_OVER_COARSE, EDGE_OVER_COARSE = 0.8, 0.4
+"""Seconds of the correction on voxels, and of the edge by the image, over those of V_coarse and V_sharp."""
 
 VOLUME_AT_END = 0.15
 """The same of a run without a fit, which has no maps of uncertainty."""
@@ -166,7 +166,8 @@ class TimeBudget:
             n_output_voxels: of the volume to be written.
         """
         settings, volumes = self.settings, prior.volumes
-        after_s = WRITING_S + COARSE_AT_END * coarse_s * max(1.0, n_output_voxels / prior.values.size)
+        at_end = (COARSE_AT_END + EDGE_OVER_COARSE) * max(1.0, n_output_voxels / prior.values.size)
+        after_s = WRITING_S + at_end * coarse_s
         after_compiling_s = self.deadline.remaining_s - after_s - compiling_s()
         if after_compiling_s < NO_FIT * coarse_s:
             self.settings = replace(settings, n_lattices=0)

@@ -1,0 +1,115 @@
+"""Where the volume ends, as the image shows it: in stacks that are black beside the brain.
+
+A mask says only which pixels have their middle in the brain, and the volume that is fitted to them goes on beyond it as
+if there were brain. Where nothing but black lies beside the brain, a pixel of the rim says itself how much brain is
+beneath it: its value over what it would have if all beneath were brain. Minimised over the share f of brain in a voxel
+is
+
+    sum_p w_p (A V)_p^2 (A f - y / A V)_p^2  +  r s |grad f|
+
+over masked pixels and those beside them, with V the volume, continued beyond its edge. Total variation keeps the edge
+sharp. Where stacks show skull, fluid and mother, nothing is found, and masks alone decide (`acquisition.foreground`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from g3r.acquisition.planes import Slices
+from g3r.fitting.slice_stage import SliceFit
+from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProblemSettings, too_fine
+from g3r.geometry import VolumeGrid
+
+SHARES = (0.2, 0.5)
+"""Shares of brain between which the volume fades in. On nine development cases (docs/method.md, "Mask") half of a
+voxel, where the edge lies, would be best on the whole grid; a voxel of the brain that is lost costs more."""
+
+SETTINGS = VoxelProblemSettings(hold=0.01, total_variation=0.1, tip=0.05, n_rounds=3, n_iterations=10)
+
+FULL_MM = 1.5
+"""So far inside the support the volume is shown in full: dark there is fluid."""
+
+CONTINUED_MM = 1.5
+"""Beyond the edge the volume is the mean of what lies around, by a Gaussian of this width."""
+
+OUTSIDE_MM, INSIDE_MM = 5.0, 6.0
+"""From the edge, pixels that are asked."""
+
+BESIDE_MM = (3.0, 10.0)
+"""From the edge, pixels that tell whether there is anything beside the brain."""
+
+BRIGHT_SHARE, MAX_BRIGHT = 0.3, 0.05
+"""Of the median in the brain, what is darker is noise; and the share of pixels beside the brain that may be brighter.
+Simulated stacks that were cut out have 0.00 to 0.01."""
+
+LEAST_PREDICTED = 0.1
+"""In normalised intensities: of pixels that would have less the share is not told."""
+
+
+def shown_by_image(
+    volume: Array,
+    edge: NDArray[np.floating],
+    support: NDArray[np.bool_],
+    grid: VolumeGrid,
+    fit: SliceFit,
+    acquired: Slices,
+) -> Array | None:
+    """How much of the volume [I, J, K], of 1, is to be shown; None where something lies beside the brain.
+
+    Args:
+        volume: [I, J, K] as it is, faded by `edge`.
+        edge: [I, J, K] from 0 to 1.
+        support: [I, J, K] bool, where it was fitted.
+        grid: of all these.
+        fit: slices with profiles, poses, gains and fields.
+        acquired: the same slices with the values as they came, unmasked pixels of their boxes included.
+    """
+    if too_fine(grid, acquired):
+        return None
+    depth_mm = _depth_mm(support, grid)
+    pixels = _around(fit, acquired, depth_mm, grid)
+    if pixels is None:
+        return None
+    predicted = pixels.operator(grid).forward(_continued(volume, edge, depth_mm, grid))
+    power = float((volume[support].astype(np.float64) ** 2).mean())
+    asked = replace(
+        pixels,
+        value=np.clip(pixels.value / np.maximum(predicted, LEAST_PREDICTED), 0, 1.2).astype(np.float32),
+        weight=(pixels.weight * predicted**2 / power).astype(np.float32),
+    )
+    share = VoxelProblem(asked, grid, SETTINGS).solved(edge.astype(np.float32))
+    low, high = SHARES
+    shown = np.clip((share - low) / (high - low), 0, 1)
+    return np.where(depth_mm > FULL_MM, 1, shown).astype(np.float32)
+
+
+def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Array:
+    """Distance [I, J, K] from the edge of the support, positive inside."""
+    inside, outside = (distance_transform_edt(part, sampling=grid.spacing_mm) for part in (support, ~support))
+    return (inside - outside).astype(np.float32)
+
+
+def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) -> FitPixels | None:
+    """Pixels near the edge, masked or not; None where something lies beside the brain, or no pixel says."""
+    slices = replace(fit.slices, value=acquired.value, mask=np.ones_like(acquired.mask))
+    pixels = FitPixels.of(fit, slices, np.ones(len(slices.value), np.float32))
+    place = grid.index(slices.planes.pixel_world_mm()).T
+    depth = map_coordinates(depth_mm, place, order=1, mode="nearest")
+    near, far = BESIDE_MM
+    brain, beside = pixels.value[depth > near], pixels.value[(depth < -near) & (depth > -far)]
+    if not len(brain) or not len(beside) or (beside > BRIGHT_SHARE * np.median(brain)).mean() > MAX_BRIGHT:
+        return None
+    return pixels.take((depth > -OUTSIDE_MM) & (depth < INSIDE_MM))
+
+
+def _continued(volume: Array, edge: NDArray[np.floating], depth_mm: Array, grid: VolumeGrid) -> Array:
+    """The volume [I, J, K] as if it had no edge."""
+    counts = np.where(depth_mm > 0, edge, 0).astype(np.float32)
+    width = CONTINUED_MM / grid.spacing_mm
+    weight = gaussian_filter(counts * counts, width)
+    around = np.divide(gaussian_filter(volume * counts, width), weight, out=np.zeros_like(volume), where=weight > 1e-3)
+    return np.where(depth_mm > float(grid.spacing_mm.min()), volume, around).astype(np.float32)
