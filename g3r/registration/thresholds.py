@@ -91,9 +91,13 @@ IN_PLACE_NCC = 0.94
 others are lower than the limits above by `LEEWAY`, as they are at times for sharp, flat phantoms. Stacks in place have
 0.944 to 0.969 (four heads, two and three stacks). After one stack of them was turned by 6 to 180 degrees or moved by 6
 mm and rounds of registration, runs that ended 2 mm off or more had 0.928 at most (by hand). Only where others saw
-`IN_PLACE_SHARE` of the stack or more: alone it agrees with itself."""
+`IN_PLACE_SHARE` of the stack or more: alone it agrees with itself.
 
-IN_PLACE_SHARE, LEEWAY = 0.9, 0.05
+The verdict still says that such a stack agrees only just. With a leeway of 0.05 three of 21 sets of phantoms of 21 to
+27 weeks lost a stack whose slices were 0.2 mm off (medians): agreements of 0.71, 0.54 and 0.65, of 0.54, 0.48 and 0.55
+over what others saw, NCC of 0.953, 0.949 and 0.932 (moderate motion, by hand). Two of them keep it now."""
+
+IN_PLACE_SHARE, LEEWAY = 0.9, 0.12
 
 MIN_OVERLAP_SHARE = 0.2
 """So is one of which others saw a smaller share: too little to prove anything. Two crossing halves share about half
