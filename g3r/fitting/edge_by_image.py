@@ -68,7 +68,7 @@ def shown_by_image(
         fit: slices with profiles, poses, gains and fields.
         acquired: the same slices with the values as they came, unmasked pixels of their boxes included.
     """
-    if too_fine(grid, acquired):
+    if too_fine(float(grid.spacing_mm.min()), acquired):
         return None
     depth_mm = _depth_mm(support, grid)
     pixels = _around(fit, acquired, depth_mm, grid)

@@ -48,13 +48,9 @@ class VoxelProblemSettings:
     n_iterations: int
 
 
-def too_fine(grid: VolumeGrid, slices: Slices) -> bool:
-    """Whether the voxels of a grid are too small for the pixels of slices to say what is in each."""
-    return _voxel_over_pixel(grid, slices) < TOO_FINE_VOXEL
-
-
-def _voxel_over_pixel(grid: VolumeGrid, slices: Slices) -> float:
-    return float(grid.spacing_mm.min()) / float(np.median(slices.planes.spacing_mm))
+def too_fine(voxel_mm: float, slices: Slices) -> bool:
+    """Whether voxels are too small for the pixels of slices to say what is in each."""
+    return voxel_mm / float(np.median(slices.planes.spacing_mm)) < TOO_FINE_VOXEL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +94,8 @@ class FitPixels:
 
     def operator(self, grid: VolumeGrid) -> VoxelOperator:
         """A for these pixels and a grid."""
-        in_plane = 3 if _voxel_over_pixel(grid, self.slices) < FINE_VOXEL else 1
+        pixel_mm = float(np.median(self.slices.planes.spacing_mm))
+        in_plane = 3 if float(grid.spacing_mm.min()) / pixel_mm < FINE_VOXEL else 1
         return VoxelOperator(self.slices.planes, grid, self.index, (in_plane, in_plane, 5))
 
     def error(self, volume: Array, grid: VolumeGrid) -> float:

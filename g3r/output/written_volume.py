@@ -99,10 +99,11 @@ def written_volume(
     if correction is not None:
         mixture = replace(mixture, correction=correction.values)
         volume = mixture.corrected(mixed, grid)
-    shown = shown_by_slices(volume, mixture, found, fit, run)
+    shown = shown_by_slices(volume, mixture, found, fit)
     if shown is not None:
         mixture = replace(mixture, edge=(edge * shown).astype(edge.dtype))
-        left = np.divide(mixture.edge, edge, out=np.zeros_like(volume), where=edge > 0)
+        before, after = edge.astype(np.float32), mixture.edge.astype(np.float32)
+        left = np.divide(after, before, out=np.zeros_like(volume), where=before > 0)
         volume, mixed = volume * left, mixed * left
     return WrittenVolume(
         volume=volume,
@@ -143,13 +144,13 @@ def masks_on(
 
 
 def shown_by_slices(
-    volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit, run: RunContext
+    volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit
 ) -> NDArray[np.float32] | None:
-    """How much of the volume slices show that are black beside the brain; None where they are not, or for want of time.
+    """How much of the volume slices show that are black beside the brain; None where they are not, or without a fit.
 
     What no slice saw is left as it is.
     """
-    if found.fit is None or run.stopped_at is not None:
+    if found.fit is None:
         return None
     grid = mixture.grid
     shown = shown_by_image(volume, mixture.edge, mixture.support, grid, fit, found.prior.volumes.slices)
@@ -194,7 +195,7 @@ def corrected(
     asked = adapted(settings, prior.volumes.slices.n_stacks).voxel_correction
     if asked is None or fit is None or run.stopped_at is not None or mixture.least_weight == 1:
         return None
-    if too_fine(mixture.prior_grid, fit.slices):
+    if too_fine(float(mixture.prior_grid.spacing_mm.min()), fit.slices):
         return None
     widths = found.held_out.widths if found.held_out else None
     target = slice_target(prior, found.registration.weight, settings.slice_model, widths)

@@ -16,6 +16,7 @@ from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import MAX_SCATTER_BUFFERS
 from g3r.fitting.initial_volumes import MARGIN_MM
+from g3r.fitting.voxel_problem import too_fine
 from g3r.planning.memory_size import gigabytes
 from g3r.planning.presets import ReconstructionSettings
 from g3r.planning.stages import Stage
@@ -117,7 +118,8 @@ def estimate_memory(
         Stage.FIT_TO_SLICES: volumes + cloud + max(fit, rim),
     }
     # the correction on voxels, and the edge by the image
-    solved_on = output if settings.voxel_correction is None else max(voxels, output)
+    edge_on = 0.0 if too_fine(settings.resolution_mm, slices) else output
+    solved_on = edge_on if settings.voxel_correction is None else max(voxels, edge_on)
     on_voxels = COARSE_PER_PIXEL * n_pixels + 4 * (CORRECTION_VOLUMES + buffers) * solved_on
     stages[Stage.VOLUME] = max(stages[Stage.VOLUME], outputs + on_voxels)
     if settings.held_out is not None:

@@ -119,8 +119,8 @@ def test_fine_voxels_show_no_grid_of_pixels() -> None:
         values = found.values[inside].astype(np.float64)
         assert 0.05 < values.mean() < 0.1
         assert values.std() < pattern * values.mean()
-    assert not too_fine(GRID.respaced(0.55), slices)
-    assert too_fine(GRID.respaced(0.45), slices)
+    assert not too_fine(0.55, slices)
+    assert too_fine(0.45, slices)
 
 
 def test_the_noisier_the_slices_the_stronger_the_pull() -> None:

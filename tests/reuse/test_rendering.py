@@ -29,6 +29,7 @@ def largest_difference(folder: Path) -> float:
 def test_on_its_own_grid_it_is_the_volume(finished: Path, run: FinishedRun) -> None:
     assert run.geometry.grid.shape != run.geometry.prior_grid.shape  # else half of the mixture is not tested
     assert 0 < run.record.prior_weight < 1
+    assert run.record.edge_by_image  # nor is that of the masks alone
     assert largest_difference(finished) < 1e-6
 
 
