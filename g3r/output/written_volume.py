@@ -148,9 +148,9 @@ def shown_by_slices(
 ) -> NDArray[np.float32] | None:
     """How much of the volume slices show that are black beside the brain; None where they are not, or without a fit.
 
-    What no slice saw is left as it is.
+    A single stack is not asked: its slices may lie a millimetre off. What no slice saw is left as it is.
     """
-    if found.fit is None:
+    if found.fit is None or fit.slices.n_stacks == 1:
         return None
     grid = mixture.grid
     shown = shown_by_image(volume, mixture.edge, mixture.support, grid, fit, found.prior.volumes.slices)
