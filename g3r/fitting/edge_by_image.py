@@ -25,7 +25,7 @@ from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProbl
 from g3r.geometry import VolumeGrid
 
 SHARES = (0.2, 0.5)
-"""Shares of brain between which the volume fades in. On nine development cases (docs/method.md, "Mask") half of a
+"""Shares of brain between which the volume fades in. On eight development cases (docs/method.md, "Mask") half of a
 voxel, where the edge lies, would be best on the whole grid; a voxel of the brain that is lost costs more."""
 
 SETTINGS = VoxelProblemSettings(hold=0.01, total_variation=0.1, tip=0.05, n_rounds=3, n_iterations=10)
