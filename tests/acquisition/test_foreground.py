@@ -116,6 +116,19 @@ def test_a_probability_decides_unseen_voxels_and_never_seen_ones() -> None:
     np.testing.assert_array_equal(found.mask(np.full(GRID.shape, 0.5)), found.mask(0 * contrary))
 
 
+def test_what_is_merely_possible_is_shown_beside_the_mask_alone() -> None:
+    """A slab at the border of the grid that touches the brain, as the network leaves it where it knows little."""
+    seen, possible = np.zeros((30, 9, 9), bool), np.zeros((30, 9, 9), bool)
+    seen[2:9], possible[9:27] = True, True
+    found = Foreground(seen, seen, seen.astype(np.float32), ~seen, np.zeros_like(seen), possible_voxels=4)
+    np.testing.assert_array_equal(found.mask(0.4 * possible), seen)
+    shown = found.support(0.4 * possible)
+    assert shown[2:13].all()
+    assert not shown[13:].any()
+    # what is likely is in the mask, and shown as far as it reaches
+    assert found.support(0.6 * possible)[2:27].all()
+
+
 def test_a_factor_common_to_all_weights_says_nothing() -> None:
     slices = slices_from_stacks([ellipsoid_stack(low_mm=0.0), ellipsoid_stack(TURNS[1], low_mm=-10.0)])
     one = foreground(slices, GRID)
