@@ -57,6 +57,18 @@ def test_slices_with_all_their_weight_are_searched_where_they_are_unlike_the_vol
     assert (off_mm(found, still_slices[0])[at].max() < 4.0) == (expected > 0)
 
 
+def test_a_stack_that_is_unlike_the_volume_as_a_whole_is_not_searched(
+    still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]
+) -> None:
+    """With most of its slices gone there is no volume in which they could be found."""
+    slices, at = astray
+    ones, own = np.ones(len(slices)), np.flatnonzero(slices.stack_id == STACK)
+    for share, expected in ((0.4, True), (0.6, False)):
+        ncc = np.full(len(slices), 0.9)
+        ncc[np.union1d(at, own[: round(share * len(own))])] = 0.7
+        assert (find_strays(slices, ones, ones, ncc, rng())[1] > 0) == expected
+
+
 def test_rounds_end_with_the_search(still_slices: tuple[Slices, RigidPose], astray: tuple[Slices, np.ndarray]) -> None:
     slices, at = astray
     settings = RegistrationSettings(n_rounds=4, finest_voxel_mm=1.8, stray_searches=0)
