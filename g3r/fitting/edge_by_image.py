@@ -101,7 +101,10 @@ def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) 
     depth = map_coordinates(depth_mm, place, order=1, mode="nearest")
     near, far = BESIDE_MM
     brain, beside = pixels.value[depth > near], pixels.value[(depth < -near) & (depth > -far)]
-    if not len(brain) or not len(beside) or (beside > BRIGHT_SHARE * np.median(brain)).mean() > MAX_BRIGHT:
+    if not len(brain) or not len(beside):
+        return None
+    usual = float(np.median(brain))
+    if usual <= 0 or (beside > BRIGHT_SHARE * usual).mean() > MAX_BRIGHT:
         return None
     return pixels.take((depth > -OUTSIDE_MM) & (depth < INSIDE_MM))
 

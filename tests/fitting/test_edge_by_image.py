@@ -100,12 +100,15 @@ def test_masks_decide_where_something_lies_beside_the_brain(beside: float) -> No
 
 
 def test_masks_decide_where_no_pixel_beside_the_brain_is_kept() -> None:
+    planes = stack_planes(4, 2.0, 8)
+    value, mask = np.full(planes.n_pixels, 0.6, np.float32), np.ones(planes.n_pixels, bool)
+    assert np.linalg.norm(planes.pixel_world_mm(), axis=1).max() < SUPPORT_MM
+    assert shown(slices_of(planes, value, mask, 3, 2.0)) is None
+
+
+def test_nothing_is_asked_of_black_images() -> None:
     slices = slices_that_see(0.0)
-    near = np.linalg.norm(slices.planes.pixel_world_mm(), axis=1) < 6
-    planes = replace(slices.planes, shape=np.full_like(slices.planes.shape, 8))
-    assert near.any()
-    small = slices_of(planes, np.full(planes.n_pixels, 0.6, np.float32), np.ones(planes.n_pixels, bool), 3, 2.0)
-    assert shown(small) is None
+    assert shown(replace(slices, value=np.zeros_like(slices.value))) is None
 
 
 def test_voxels_that_are_too_fine_for_the_pixels_are_left_to_the_masks() -> None:
