@@ -33,16 +33,18 @@ class Networks:
         prior: checkpoint of the prior, or the name of a set of weights that ships with the package; the usual one
             when None.
         pose: the same of the pose network; when None that of the set that `prior` names.
-        use_prior, use_pose: whether the reconstruction uses them at all.
+        settings: of the reconstruction, which say what of these it uses.
         device: see `device_of`.
 
     Raises:
         InputError: an unreadable or mismatched checkpoint, no GPU.
     """
 
-    def __init__(self, prior: Source, pose: Source, *, use_prior: bool, use_pose: bool, device: str) -> None:
-        self.device = device_of(device) if use_prior or use_pose or device != "auto" else "cpu"
+    def __init__(self, prior: Source, pose: Source, settings: ReconstructionSettings, device: str) -> None:
+        use_prior, search = settings.use_prior, settings.registration
+        self.device = device_of(device) if use_prior or search.network or device != "auto" else "cpu"
         self.stored_prior = StoredModel(prior, "prior", self._load_prior) if use_prior else None
+        use_pose = search.template or search.network
         self.stored_pose = StoredModel(pose or set_of(prior), "pose", self._load_pose) if use_pose else None
 
     def start(self) -> None:

@@ -61,9 +61,7 @@ class GaussianReconstructor:
         observer: FitObserver | None = None,
     ) -> None:
         self.settings, self.observer = settings_of(settings), observer
-        search, use_prior = self.settings.registration, self.settings.use_prior
-        use_pose = search.template or search.network
-        self.networks = Networks(checkpoint, pose_checkpoint, use_prior=use_prior, use_pose=use_pose, device=device)
+        self.networks = Networks(checkpoint, pose_checkpoint, self.settings, device)
 
     def reconstruct(
         self,

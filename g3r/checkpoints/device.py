@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from importlib.metadata import version
 
@@ -32,8 +33,20 @@ def device_of(name: str) -> str:
 
 
 def knows_no_gpu() -> bool:
-    """Whether the installed torch has no CUDA, as far as can be told without importing it."""
-    return sys.platform == "darwin" or version("torch").endswith("+cpu")
+    """Whether there is no GPU for torch, as far as can be told without importing it."""
+    build = version("torch")
+    if sys.platform == "darwin" or build.endswith("+cpu"):
+        return True
+    return "rocm" not in build and not has_cuda_driver()  # ROCm needs no driver of NVIDIA's
+
+
+def has_cuda_driver() -> bool:
+    """Whether NVIDIA's driver is installed. PyPI's torch is built for CUDA, but most machines have none."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def is_bfloat16_fast(device_type: str) -> bool:

@@ -84,14 +84,14 @@ class MaskCommand:
                 words,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
+                stderr=subprocess.PIPE,
                 start_new_session=True,  # what it starts ends with it
             )
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
             raise InputError(f"{name}: --mask-command cannot be started ({found}): {words[0]}") from None
         try:
-            said, _ = process.communicate(timeout=self.timeout_s)
+            said, complained = process.communicate(timeout=self.timeout_s)
         except BaseException as error:  # Ctrl-C, too
             _end(process)
             if not isinstance(error, subprocess.TimeoutExpired):
@@ -101,7 +101,9 @@ class MaskCommand:
                 "raise --mask-timeout"
             ) from None
         if process.returncode:
-            raise InputError(f"{name}: --mask-command failed with exit code {process.returncode}{_last_words(said)}")
+            raise InputError(
+                f"{name}: --mask-command failed with exit code {process.returncode}{_last_words(complained, said)}"
+            )
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -112,10 +114,15 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         else:
             process.kill()
     process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+    for pipe in (process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()
 
 
-def _last_words(said: bytes) -> str:
-    lines = [line for line in said.decode(errors="replace").splitlines() if line.strip()]
-    return f": {lines[-1].strip()[-MAX_SAID:]}" if lines else " and said nothing"
+def _last_words(*outputs: bytes) -> str:
+    """The last line of the first output that has one. What a program prints may arrive after it has complained."""
+    for output in outputs:
+        lines = [line for line in output.decode(errors="replace").splitlines() if line.strip()]
+        if lines:
+            return f": {lines[-1].strip()[-MAX_SAID:]}"
+    return " and said nothing"

@@ -35,6 +35,37 @@ def test_a_build_for_cpus_is_known_without_torch() -> None:
     assert device.knows_no_gpu() or not torch.__version__.endswith("+cpu")
 
 
+@pytest.mark.parametrize(
+    ("build", "driver", "known"),
+    [
+        ("2.13.0+cpu", True, True),
+        ("2.13.0", False, True),  # PyPI's, on a machine without a GPU
+        ("2.13.0", True, False),
+        ("2.13.0+cu128", True, False),
+        ("2.13.0+rocm6.4", False, False),
+    ],
+)
+def test_a_machine_without_a_driver_is_known_without_torch(
+    monkeypatch: pytest.MonkeyPatch, build: str, driver: bool, known: bool
+) -> None:
+    monkeypatch.setattr(device.sys, "platform", "linux")
+    monkeypatch.setattr(device, "version", lambda name: build)
+    monkeypatch.setattr(device, "has_cuda_driver", lambda: driver)
+    assert device.knows_no_gpu() is known
+
+
+def test_a_driver_is_found_where_its_library_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str) -> None:
+        if name not in present:
+            raise OSError(name)
+
+    monkeypatch.setattr(device.ctypes, "CDLL", load)
+    present: set[str] = set()
+    assert not device.has_cuda_driver()
+    present = {"libcuda.so.1", "nvcuda.dll"}
+    assert device.has_cuda_driver()
+
+
 def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="'tpu'; expected auto, cpu, cuda"):
         device_of("tpu")

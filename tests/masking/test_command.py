@@ -50,6 +50,7 @@ def test_its_mask_is_taken(stack: Path, tmp_path: Path) -> None:
     ("program", "says"),
     [
         ("import sys; print('reading'); print('no weights found', file=sys.stderr); sys.exit(7)", "code 7: no weights"),
+        ("import sys; print('no weights'); sys.exit(7)", "code 7: no weights"),
         ("import sys; sys.exit(1)", "code 1 and said nothing"),
         ("import os; os.kill(os.getpid(), 9)", "exit code -9"),
         ("print('done')", "ended well but wrote no {mask}"),
@@ -58,7 +59,17 @@ def test_its_mask_is_taken(stack: Path, tmp_path: Path) -> None:
         (GOOD.replace("image.affine", "image.affine * 3"), "cannot be used: .*voxels off"),
         ("import sys; open(sys.argv[2], 'w').write('a mask')", "cannot be used"),
     ],
-    ids=["fails", "fails without a word", "killed", "writes nothing", "empty", "other grid", "other place", "no image"],
+    ids=[
+        "fails",
+        "fails on standard output",
+        "fails without a word",
+        "killed",
+        "writes nothing",
+        "empty",
+        "other grid",
+        "other place",
+        "no image",
+    ],
 )
 def test_what_it_does_wrong_is_said(program: str, says: str, stack: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"a stack .*nii.gz: --mask-command .*{says}"):
