@@ -12,7 +12,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack
 from g3r.registration.estimate import Registration
 from g3r.registration.open_strain import crossing_deg
-from g3r.registration.stack_quality import StackQuality, is_mirrored, shortfalls
+from g3r.registration.stack_quality import StackQuality, is_mirrored, rounded_down, shortfalls
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MIN_CROSSING_DEG
 
 PARALLEL = "all stacks: their slices are nearly parallel in the head"
@@ -93,13 +93,13 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
             lines += [f"{stack.name}: {LEFT_OUT}, {misfit(one)}"] if is_mirrored(one) else []
         elif is_mirrored(one) and one.reliable:
             lines.append(
-                f"{stack.name}: may be a mirror image of what the other stack shows (handedness {one.handedness:.2f}); "
-                "compare both where the head is not symmetric"
+                f"{stack.name}: may be a mirror image of what the other stack shows (handedness "
+                f"{rounded_down(one.handedness)}); compare both where the head is not symmetric"
             )
         elif is_mirrored(one) and not shortfalls(one):
             lines.append(
                 f"{stack.name}: probably a mirror image of what the other stacks show (handedness "
-                f"{one.handedness:.2f}); do not rely on the volume"
+                f"{rounded_down(one.handedness)}); do not rely on the volume"
             )
         elif one.reliable is False:
             lines.append(
@@ -134,7 +134,8 @@ def left_out_notes(qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -
 def misfit(one: StackQuality) -> str:
     """Why a stack was left out."""
     if is_mirrored(one):
-        return f"it is probably a mirror image of what the other stacks show (handedness {one.handedness:.2f})"
+        said = rounded_down(one.handedness)
+        return f"it is probably a mirror image of what the other stacks show (handedness {said})"
     why = "; ".join(shortfalls(one)) or f"its slices agree with the volume by {one.median_slice_ncc:.2f}, others better"
     return f"it does not fit the other stacks ({why})"
 

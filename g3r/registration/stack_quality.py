@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from decimal import ROUND_FLOOR, Decimal
 from typing import Any
 
 from g3r.registration.thresholds import (
@@ -66,6 +67,11 @@ class StackQuality:
 def is_mirrored(one: StackQuality) -> bool:
     """Whether the stack seems to be a mirror image of what the others show."""
     return one.handedness is not None and one.handedness < MIRRORED_BELOW
+
+
+def rounded_down(value: float | None) -> str:
+    """With two decimals; "none" for None. What misses a lower limit by a hair is not to be read as if it reached it."""
+    return "none" if value is None else str(Decimal(str(value)).quantize(Decimal("0.01"), ROUND_FLOOR))
 
 
 def shortfalls(one: StackQuality) -> list[str]:

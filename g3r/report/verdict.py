@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from g3r.planning.anatomy import NAME_OF
 from g3r.registration.quality import LEFT_OUT, PARALLEL, misfit, nearly_parallel
-from g3r.registration.stack_quality import is_mirrored, shortfalls, unlike_others
+from g3r.registration.stack_quality import is_mirrored, rounded_down, shortfalls, unlike_others
 from g3r.registration.thresholds import MIN_CROSSING_DEG, MIRRORED_BELOW, RETRY_BELOW_CORRELATION
 from g3r.report.verdict_messages import HEADLINES, MESSAGES, MILDEST_FIRST, USE, Word
 
@@ -124,7 +124,7 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
     facts: dict[str, object] = {"stack": stack.name, "agreement": _agreement(stack)}
     if is_mirrored(quality):
         name = "stack mirrored" if quality.reliable is False else "perhaps mirrored"
-        yield name, facts | {"handedness": f"{quality.handedness:.2f}", "good": MIRRORED_BELOW}
+        yield name, facts | {"handedness": rounded_down(quality.handedness), "good": MIRRORED_BELOW}
         if not shortfalls(quality):
             return
     if quality.reliable is False:
@@ -144,7 +144,7 @@ def _unlike_others(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]
 
 def _agreement(stack: StackRecord) -> str:
     found = stack.quality.held_out_correlation if stack.quality else None
-    return "none" if found is None else f"{found:.2f}"
+    return rounded_down(found)
 
 
 def _listed(names: list[str]) -> str:

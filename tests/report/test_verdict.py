@@ -83,6 +83,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
     ),
     "not used": (stacks_with(stack("c.nii", StackQuality(False, None, None, 0.0))), DO_NOT_USE, "c.nii was not used"),
     "doubtful": (stacks_with(stack("c.nii", quality(True, 0.66))), CHECK, "c.nii agrees only just"),
+    "doubtful by a hair": (
+        stacks_with(stack("c.nii", quality(True, 0.6799))),
+        CHECK,
+        "c.nii agrees only just with the other stacks (0.67; good is 0.68 and above)",
+    ),
     "unlike": (
         stacks_with(stack("c.nii", StackQuality(True, 0.81, 0.82, 0.0))),
         CHECK,
