@@ -9,22 +9,15 @@ comes out too soft. The correction D = V - V_0 sharpens it as far as the slices 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from g3r.acquisition.total_variation import diffusivity
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProblemSettings
 from g3r.geometry import VolumeGrid
-
-QUIET = 0.03
-"""Standard deviation of noise, in normalised intensities, up to which the settings hold as they are: a little more than
-that of stacks with a signal-to-noise ratio of 20 (0.024), since what V_0 lacks in detail is counted, too. The word of
-noisier slices counts less, by the square of it, as in a MAP estimate: with a ratio of 5 and two stacks of a simulated
-subject an unchanged hold cost 0.6 dB against no correction."""
 
 PROBE_SIGMA_MM, KEPT_SIGMA_MM = 0.4, 3.2
 """Width of the random change by which it is found how much of V_0 stays, and of the neighbourhoods in which answers are
@@ -41,11 +34,6 @@ class VoxelCorrectionSettings(VoxelProblemSettings):
     tip: float = 0.02
     n_rounds: int = 2
     n_iterations: int = 8
-
-    def for_noise(self, noise: float) -> VoxelCorrectionSettings:
-        """The settings for slices with a standard deviation of noise, in normalised intensities, see `QUIET`."""
-        by = max(1.0, noise / QUIET) ** 2
-        return replace(self, hold=by * self.hold, total_variation=by * self.total_variation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +103,7 @@ def _kept(problem: VoxelProblem, found: Array, rng: np.random.Generator) -> Arra
     grid = problem.grid
     change = gaussian_filter(rng.standard_normal(grid.shape), PROBE_SIGMA_MM / grid.spacing_mm)
     change = (change / change.std()).astype(np.float32)
-    left = problem.solve(problem.hold * change, change, diffusivity(found, problem.settings.tip))
+    left = problem.solve(problem.hold * change, change, problem.edges(found))
     width = KEPT_SIGMA_MM / grid.spacing_mm
     together, own = (gaussian_filter(one * change, width) for one in (left, change))
     return np.clip(together / np.maximum(own, 1e-6), 0, 1).astype(np.float32)

@@ -1,6 +1,6 @@
 """A volume on voxels that explains pixels of a fit, held near another volume and kept smooth between edges.
 
-    minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s |grad V| ]_v
+    minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s (|grad V| + q |grad V|^2) ]_v
 
 A is the voxel operator with the profiles of the fit, r the mean coverage of a voxel. Total variation is solved as a
 sequence of weighted squares (lagged diffusivity, Vogel and Oman 1996).
@@ -9,6 +9,7 @@ sequence of weighted squares (lagged diffusivity, Vogel and Oman 1996).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,13 @@ FINE_VOXEL, TOO_FINE_VOXEL = 0.6, 0.5
 nodes in plane as well; and below which these leave holes, too, and nothing is asked of the pixels."""
 
 
+QUIET = 0.03
+"""Standard deviation of noise, in normalised intensities, up to which the settings hold as they are: a little more than
+that of stacks with a signal-to-noise ratio of 20 (0.024), since what a volume lacks in detail is counted, too. The word
+of noisier slices counts less, by the square of it, as in a MAP estimate: with a ratio of 5 and two stacks of a
+simulated subject an unchanged hold cost 0.6 dB against no correction."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class VoxelProblemSettings:
     """How a volume is found.
@@ -39,6 +47,7 @@ class VoxelProblemSettings:
         tip: change from voxel to voxel below which total variation is a square.
         n_rounds: solutions, each with the edges of the one before.
         n_iterations: conjugate-gradient steps of each.
+        squares: q, against voxels that stand out by themselves, which total variation lets stand.
     """
 
     hold: float
@@ -46,6 +55,12 @@ class VoxelProblemSettings:
     tip: float
     n_rounds: int
     n_iterations: int
+    squares: float = 0.0
+
+    def for_noise(self, noise: float) -> Self:
+        """The settings for slices with a standard deviation of noise, in normalised intensities, see `QUIET`."""
+        by = max(1.0, noise / QUIET) ** 2
+        return replace(self, hold=by * self.hold, total_variation=by * self.total_variation)
 
 
 def too_fine(voxel_mm: float, slices: Slices) -> bool:
@@ -136,8 +151,12 @@ class VoxelProblem:
         target = self.operator.adjoint(self.pixels.weight * self.pixels.value) + self.hold * volume
         found = volume
         for _ in range(self.settings.n_rounds):
-            found = self.solve(target, found, diffusivity(found, self.settings.tip))
+            found = self.solve(target, found, self.edges(found))
         return found
+
+    def edges(self, volume: Array) -> Array:
+        """What `solve` takes for the edges of a volume [I, J, K]."""
+        return diffusivity(volume, self.settings.tip) + np.float32(self.settings.squares)
 
     def solve(self, target: Array, start: Array, edges: Array) -> Array:
         """One solution of the normal equations with edges that are known.
@@ -145,7 +164,7 @@ class VoxelProblem:
         Args:
             target: [I, J, K] their right side.
             start: [I, J, K] where it begins.
-            edges: [I, J, K] of `diffusivity`.
+            edges: [I, J, K] of `edges`.
         """
 
         def normal(flat: NDArray[np.floating]) -> Array:

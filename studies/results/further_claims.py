@@ -17,10 +17,14 @@ SEEDS = 3
 """Trainings of a variant that show more than their own chance."""
 
 
-EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject"}
+EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject", "stress-drawn-later": "Every subject"}
 """Title of the table of all runs, by the block of the study."""
 
-AT_ONCE = {"stress-sweep": "", "stress-drawn": ", all drawn at once"}
+AT_ONCE = {
+    "stress-sweep": "",
+    "stress-drawn": ", all drawn at once",
+    "stress-drawn-later": ", all drawn at once after the rules stood",
+}
 """What claims about a study say of it."""
 
 

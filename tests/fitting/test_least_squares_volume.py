@@ -39,8 +39,8 @@ def stack(normal: int, beside: float) -> Stack:
     return Stack(image=image.astype(np.float32), mask=mask, affine=affine, thickness_mm=THICKNESS_MM)
 
 
-def volumes(beside: float) -> InitialVolumes:
-    slices = slices_from_stacks([stack(normal, beside) for normal in range(3)])
+def volumes(beside: float, unit: float = 1.0) -> InitialVolumes:
+    slices = slices_from_stacks([stack(normal, beside) for normal in range(3)]).scaled(unit)
     ones = np.ones(len(slices))
     return InitialVolumes.of(slices, ones, ones, VOXEL_MM, common_bias_field=False)
 
@@ -87,10 +87,11 @@ def test_units_and_gains_do_not_matter() -> None:
     ones = np.ones(len(made.slices))
     found = least_squares_volume(made, made.foreground.support(), ones, ones)
     gain = np.where(np.arange(len(ones)) % 2, 1.5, 0.5)
-    scaled = replace(made, slices=made.slices.scaled(1e4), coarse=made.coarse * 1e4, sharp=made.sharp * 1e4)
+    scaled = volumes(0.0, unit=1e4)
     by_gain = replace(made, slices=replace(made.slices, value=made.slices.value * gain[made.slices.planes.plane_id()]))
+    assert scaled.scale == pytest.approx(1e4 * made.scale)
     np.testing.assert_allclose(
-        least_squares_volume(scaled, made.foreground.support(), ones, ones), found * 1e4, rtol=1e-3, atol=20
+        least_squares_volume(scaled, made.foreground.support(), ones, ones), found, rtol=1e-3, atol=2e-3
     )
     np.testing.assert_allclose(
         least_squares_volume(by_gain, made.foreground.support(), gain.astype(float), ones), found, rtol=1e-3, atol=2e-3

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from g3r.fitting.slice_stage import SliceFit
-from g3r.fitting.voxel_correction import QUIET, VoxelCorrection, VoxelCorrectionSettings, correct_on_voxels
-from g3r.fitting.voxel_problem import too_fine
+from g3r.fitting.voxel_correction import VoxelCorrection, VoxelCorrectionSettings, correct_on_voxels
+from g3r.fitting.voxel_problem import QUIET, too_fine
 from g3r.geometry import VolumeGrid
 from tests.fitting.scene import BALL, GRID, INDEX, make_slices, true_cloud, true_volume
 
