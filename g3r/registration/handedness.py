@@ -25,7 +25,7 @@ from g3r.registration.normal_equations import SliceModel
 from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity import SearchPixels, correlation
 from g3r.registration.slice_registration import register_slices
-from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_OUT
+from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, STANDS_APART, STANDS_OUT
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def _stands_out(one: Asymmetry, others: Sequence[Asymmetry | None]) -> bool:
     usual = mean(other.correlation for other in known)
     error = sum(other.error**2 for other in known) ** 0.5 / len(known)
     below_zero = one.correlation < -STANDS_OUT * one.error
-    return below_zero and usual > error and one.correlation < usual - STANDS_OUT * float(np.hypot(one.error, error))
+    return below_zero and usual > error and one.correlation < usual - STANDS_APART * float(np.hypot(one.error, error))
 
 
 def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry | None:

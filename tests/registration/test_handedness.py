@@ -96,7 +96,7 @@ LOW = Asymmetry(-0.08, 0.03)
     [
         (LOW, [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [LOW.highest, 0.1, 0.12]),
         (LOW, [Asymmetry(0.0, 0.02), Asymmetry(0.0, 0.02)], [None, 0.12, 0.12]),
-        (Asymmetry(-0.065, 0.03), [Asymmetry(0.065, 0.085)] * 2, [None, 0.12, 0.12]),
+        (Asymmetry(-0.051, 0.018), [Asymmetry(0.043, 0.016), Asymmetry(0.036, 0.02)], [None, 0.12, 0.12]),
         (Asymmetry(-0.09, 0.05), [Asymmetry(0.08, 0.02), Asymmetry(0.1, 0.02)], [None, 0.12, 0.12]),
         (LOW, [None, None], [None, 0.12, 0.12]),
         (Asymmetry(-0.03, 0.02), [Asymmetry(0.1, 0.01), Asymmetry(0.1, 0.01)], [-0.01, 0.12, 0.12]),
