@@ -23,6 +23,7 @@ WIDTH = 118
 
 TOPICS: Mapping[str, Callable[[], Iterable[Claim]]] = {
     "The paper's Table 1, three stacks": paper_claims.table_1,
+    "The same in mild motion": paper_claims.mild_motion,
     "One stack": paper_claims.one_stack,
     "Parts of the fit": paper_claims.parts,
     "The prior": further_claims.prior,

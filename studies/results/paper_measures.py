@@ -15,17 +15,18 @@ Find = Callable[[Block], Finding | None]
 PSNR, SSIM, LPIPS = "PSNR, dB", "SSIM", "LPIPS"
 
 
-def of_condition(block: Block, n_stacks: int, place: str = "mask") -> Table | None:
-    """Table 1 of moderate motion.
+def of_condition(block: Block, n_stacks: int, place: str = "mask", motion: str = "moderate") -> Table | None:
+    """Table 1.
 
     Args:
         block: of all methods.
         n_stacks: that volumes are made of.
         place: "mask" or "grid".
+        motion: its level.
     """
     tables = list(block.tables)
     for n, table in enumerate(tables):
-        if f"**Moderate motion, {stacks(n_stacks)}," in table.before:
+        if f"**{motion.capitalize()} motion, {stacks(n_stacks)}," in table.before:
             return table if place == "mask" else next((t for t in tables[n + 1 :] if "grid" in t.before), None)
     return None
 
@@ -63,6 +64,7 @@ def ahead(
     first: str = PRODUCT,
     at_least: float = 0.0,
     place: str = "mask",
+    motion: str = "moderate",
 ) -> Find:
     """By how much a method is better than the best of others that were made of as many subjects.
 
@@ -74,10 +76,11 @@ def ahead(
         first: the method.
         at_least: what the difference is to reach; with 0 it is to be above.
         place: "mask" or "grid".
+        motion: its level.
     """
 
     def find(block: Block) -> Finding | None:
-        table = of_condition(block, n_stacks, place)
+        table = of_condition(block, n_stacks, place, motion)
         row = table.row(first) if table else None
         own, n = value(row, head), value(row, "subjects")
         if table is None or own is None or n is None:

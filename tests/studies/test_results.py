@@ -13,7 +13,7 @@ from studies.harness import DOCS
 from studies.results.blocks import NO_MEASUREMENT, PAGE, Block, origin, published
 from studies.results.findings import FAILS, HOLDS, MISSING, UNSAID, Claim, Finding, Judged, judged, paired, shares
 from studies.results.page import MARKER, TOPICS, judgements, main, page
-from studies.results.paper_claims import one_stack, parts, table_1
+from studies.results.paper_claims import mild_motion, one_stack, parts, table_1
 from studies.results.picture_claims import real_masks, volumes_of_real_masks
 
 
@@ -104,6 +104,16 @@ def test_claims_follow_the_figures() -> None:
     assert found.verdict == f"{UNSAID} (n too small; so far it {FAILS})"
     assert "3 subjects" in found.conclusion
     assert outcome(claims, "Better LPIPS", methods("| g3r | 16 | 1 | 30 | 1 | |", "")).outcome == MISSING
+
+
+def test_levels_of_motion_are_told_apart() -> None:
+    rows = "| g3r | 16 | 30 | 31.00 | 0.970 | 0.010 |", "| least squares, TV | 16 | 2 | 28.00 | 0.980 | 0.020 |"
+    moderate = methods(*rows)
+    mild = replace(moderate, text=moderate.text.replace("Moderate", "Mild"))
+    assert outcome(list(mild_motion()), "Better PSNR", mild).outcome == HOLDS
+    assert outcome(list(mild_motion()), "Better SSIM", mild).outcome == FAILS
+    assert outcome(list(mild_motion()), "Better PSNR", moderate).outcome == MISSING
+    assert outcome(list(table_1()), "PSNR in the mask", mild).outcome == MISSING
 
 
 def test_real_masks() -> None:
