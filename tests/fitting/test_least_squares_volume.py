@@ -12,6 +12,7 @@ from g3r.acquisition.stacks import Stack
 from g3r.fitting import least_squares_volume as least_squares
 from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.fitting.least_squares_volume import least_squares_volume
+from g3r.fitting.voxel_problem import VoxelProblemSettings
 
 RADIUS_MM, THICKNESS_MM, VOXEL_MM = 18.0, 4.0, 1.5
 
@@ -113,3 +114,44 @@ def test_a_slice_beside_its_place_makes_no_bright_crust(monkeypatch: pytest.Monk
     assert brightest_crust() < 1.7
     monkeypatch.setattr(least_squares, "CONTRADICTED", np.inf)
     assert brightest_crust() > 2.0
+
+
+def noisy(made: InitialVolumes, noise: float, n_stacks: int = 3) -> InitialVolumes:
+    """The same with noise of a standard deviation in normalised intensities, and fewer stacks."""
+    slices = made.slices.take(made.slices.stack_id < n_stacks)
+    more = np.random.default_rng(0).normal(0, noise, slices.value.shape)
+    slices = replace(slices, value=(slices.value + more).astype(np.float32))
+    ones = np.ones(len(slices))
+    return InitialVolumes.of(slices, ones, ones, VOXEL_MM, common_bias_field=False)
+
+
+def test_noise_is_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = noisy(volumes(0.0), 0.1)
+    ones = np.ones(len(made.slices))
+
+    def off() -> float:
+        found = least_squares_volume(made, made.foreground.support(), ones, ones)
+        return error(found, made, 0.0, RADIUS_MM - 3)
+
+    usual = off()
+    monkeypatch.setattr(least_squares, "SETTINGS", replace(least_squares.SETTINGS, total_variation=1e-6))
+    assert usual < 0.7 * off()
+
+
+def test_what_slices_of_a_single_stack_disagree_by_is_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One slice in eight is far off: that counts in full there, and hardly where other stacks check the poses."""
+    asked: list[float] = []
+
+    def for_noise(settings: VoxelProblemSettings, noise: float) -> VoxelProblemSettings:
+        asked.append(noise)
+        return settings
+
+    monkeypatch.setattr(VoxelProblemSettings, "for_noise", for_noise)
+    for n_stacks in (1, 3):
+        made = noisy(volumes(0.0), 0.0, n_stacks)
+        sign = np.random.default_rng(1).choice([-0.5, 0.5], made.slices.value.shape)
+        value = made.slices.value + np.where(made.slices.planes.plane_id() % 8 == 3, sign, 0)
+        off = replace(made, slices=replace(made.slices, value=value.astype(np.float32)))
+        ones = np.ones(len(made.slices))
+        least_squares_volume(off, made.foreground.support(), ones, ones)
+    assert asked[0] > 2 * asked[1]
