@@ -121,5 +121,5 @@ below zero by the first of these in standard errors, and lower by the second tha
 which is known and above zero by one error. In 48 sets (24 heads with thick slices, severe motion, noise or bias, each
 also with its last stack reversed; `fast`, by hand) `MIRRORED_BELOW` alone called three of 24 sound sets mirrored, two
 of them of an atlas that is symmetric. Three sound sets that were below zero by 1.6, 2.0 and 2.8 errors, drawn with all
-else that goes wrong (docs/stress.md), were 3.1, 3.1 and 4.1 below the others; twelve stacks in reverse order, three of
-them of a real subject, 5.3 to 18 (by hand; the second limit was 2 up to commit 95845ea)."""
+else that goes wrong (docs/stress.md), were 3.1, 3.1 and 4.1 below the others; the twelve stacks in reverse order that
+were called so, three of them of a real subject, 5.3 to 18 (by hand; the second limit was 2 up to commit 95845ea)."""
