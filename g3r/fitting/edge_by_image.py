@@ -46,6 +46,11 @@ BRIGHT_SHARE, MAX_BRIGHT = 0.3, 0.05
 """Of the median in the brain, what is darker is noise; and the share of pixels beside the brain that may be brighter.
 Simulated stacks that were cut out have 0.00 to 0.01."""
 
+NOISE_TOP, MAX_NOISE_TOP = 3.0 / 1.18, 0.65
+"""Noise in black has a Rayleigh distribution, whose median is 1.18 standard deviations: one pixel in a hundred is
+brighter than three of them, which may be more than `BRIGHT_SHARE` of the brain, at an SNR of 5 twice as much. What is
+brighter in the middle is no noise."""
+
 LEAST_PREDICTED = 0.1
 """In normalised intensities: of pixels that would have less the share is not told."""
 
@@ -104,7 +109,10 @@ def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) 
     if not len(brain) or not len(beside):
         return None
     usual = float(np.median(brain))
-    if usual <= 0 or (beside > BRIGHT_SHARE * usual).mean() > MAX_BRIGHT:
+    noise_top = NOISE_TOP * float(np.median(beside))
+    if usual <= 0 or noise_top > MAX_NOISE_TOP * usual:
+        return None
+    if (beside > max(BRIGHT_SHARE * usual, noise_top)).mean() > MAX_BRIGHT:
         return None
     return pixels.take((depth > -OUTSIDE_MM) & (depth < INSIDE_MM))
 

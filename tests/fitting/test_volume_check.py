@@ -87,10 +87,11 @@ def test_the_better_mean_of_the_slices_is_said() -> None:
 
 
 def test_what_differs_by_less_than_the_check_can_tell_is_not_called_worse() -> None:
-    tie = VolumeCheck(volume=0.0951, prior=0.0948, coarse=0.0947)
+    tie = VolumeCheck(volume=0.0951, prior=0.0930, coarse=0.0925)
     assert not tie.falls_back
     assert tie.line() == ""
-    assert VolumeCheck(volume=0.0951, prior=0.0944, coarse=0.2).falls_back
+    assert VolumeCheck(volume=0.0951, prior=0.0920, coarse=0.2).falls_back
+    assert VolumeCheck(volume=0.0951, prior=0.1, coarse=0.0920).line()
 
 
 def reconstruction() -> ReconstructionResult:
