@@ -11,7 +11,7 @@ from g3r.acquisition.foreground import foreground
 from g3r.errors import NumericalError
 from g3r.fitting.edge_by_image import shown_by_image
 from g3r.fitting.initial_volumes import PriorVolume
-from g3r.fitting.prior_weight import ended_early, prior_weight
+from g3r.fitting.prior_weight import ended_early, noise_of, prior_weight
 from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.slice_targets import slice_target
 from g3r.fitting.volume_check import VolumeCheck, check_volume
@@ -164,7 +164,7 @@ def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettin
     if settings.prior_weight > 0 and ended_early(n_steps := len(fit.history), settings.slice_stage.n_steps):
         run.notes.append(f"the fit ended after {n_steps} steps: the volume is the prior volume alone")
         return 1.0
-    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3)
+    return prior_weight(settings.prior_weight, fit.slices, fit.weight, brain_mm3, noise_of(fit))
 
 
 def checked(volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit) -> VolumeCheck:
