@@ -23,7 +23,7 @@ EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject", "stress-d
 AT_ONCE = {
     "stress-sweep": "",
     "stress-drawn": ", all drawn at once",
-    "stress-drawn-later": ", all drawn at once again (one limit was raised on two of these)",
+    "stress-drawn-later": ", all drawn at once again with one limit raised on two of these",
 }
 """What claims about a study say of it."""
 
