@@ -20,7 +20,6 @@ MAX_WEIGHT = 0.75
 FEWEST_STEPS = 16
 """After fewer steps of the fit, where time or the user ended it, V_prior alone is better than any mixture."""
 
-
 LAST_STEPS = 5
 """Of the fit, whose residuals say how noisy slices are."""
 
