@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 
+from g3r.acquisition.intensity_levels import level_notes, same_level
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import normalised_slices, skipped_slice_notes
 from g3r.acquisition.stacks import Stack
@@ -88,8 +89,9 @@ class GaussianReconstructor:
         plan, run = plan or FixedPlan(self.settings), run or RunContext()
         if plan.settings.use_prior:
             self.networks.start()  # their libraries are imported while poses are found
+        stacks = same_level(stacks)
         slices, intensity = normalised_slices(stacks)
-        run.notes += skipped_slice_notes(stacks, slices)
+        run.notes += level_notes(stacks) + skipped_slice_notes(stacks, slices)
         poses = self._poses(slices, registration, plan, run)
         stacks, poses = self._masks(stacks, poses, intensity, plan, run)
         maker = self.networks.subject_prior(plan.settings)
@@ -120,7 +122,7 @@ class GaussianReconstructor:
         Raises:
             InputError: stacks that cannot be used.
         """
-        return self.register(normalised_slices(stacks)[0])
+        return self.register(normalised_slices(same_level(stacks))[0])
 
     def register(
         self,

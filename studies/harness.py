@@ -152,13 +152,15 @@ class Study:
         tasks = list(self.tasks(options))
         path = options.output / f"{self.name.split('.')[-1]}.json"
         renewed = {task.key for task in tasks} if options.fresh or not self.resumes else set()
-        record = resumed(path, {**settings, "machine": machine(settings.get("threads")), "rows": {}}, renewed)
+        here = machine(settings.get("threads"))
+        record = resumed(path, {**settings, "machine": here, "rows": {}}, renewed)
         rows = record["rows"]
         todo = [task for task in tasks if task.key not in rows]
         start = time.perf_counter()
         for n, (task, row) in enumerate(results(todo, settings.get("jobs", 1), settings.get("threads")), 1):
             if row is not None:
-                rows[task.key] = row
+                rows[task.key] = row | {"commit": here["commit"]}
+                record["machine"] = here | {"commit": commits(rows)}
                 left = left_text(n, len(todo), time.perf_counter() - start)
                 print((self.line(task.key, row) if self.line else f"{task.key}: measured") + left, flush=True)
                 write_json(path, record)
@@ -244,7 +246,14 @@ def resumed(path: Path, new: Record, renewed: set[str]) -> Record:
         listed = ", ".join(f"{name} {found.get(name)} instead of {new[name]}" for name in other)
         raise InputError(f"{path}: measured with {listed}; choose another --output, or remove it")
     print(f"{path}: {len(rows)} rows kept, of commit {found['machine']['commit']}; --fresh measures again")
-    return {**found, "rows": rows}
+    before = found["machine"]["commit"]
+    rows = {key: {"commit": before} | row for key, row in rows.items()}  # of records that hold it for all rows alone
+    return {**found, "machine": found["machine"] | {"commit": commits(rows)}, "rows": rows}
+
+
+def commits(rows: Mapping[str, Row]) -> str:
+    """The commits that rows were measured with, each once, in their order."""
+    return ", ".join(dict.fromkeys(str(row["commit"] or "unknown") for row in rows.values()))
 
 
 def results(tasks: Sequence[Task], jobs: int, threads: int | None) -> Iterator[tuple[Task, Row | None]]:

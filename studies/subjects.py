@@ -168,7 +168,7 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
     """
     folder = cache / spec.name
-    record = asdict(spec) | {"simulator": SIMULATOR}
+    record = json.loads(json.dumps(asdict(spec) | {"simulator": SIMULATOR}))  # as it is read again: tuples are lists
     if folder.is_dir():
         path = folder / RECORD_NAME
         found = json.loads(path.read_text(encoding="utf-8")).get("spec") if path.is_file() else None

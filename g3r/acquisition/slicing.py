@@ -17,13 +17,14 @@ from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
 
 MIN_SLICE_PIXELS = 12
-"""Slices with fewer masked pixels carry no pose and little image; they are skipped and named in run.json."""
+"""Slices with fewer masked pixels carry no pose and little image; they are skipped and named in run.json. So are those
+without a positive masked pixel: they were not acquired, or were blanked, and saw nothing."""
 
 
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
     """Cut stacks into slices, each cropped to the bounding box of its mask.
 
-    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels are skipped.
+    Slices whose mask has fewer than `MIN_SLICE_PIXELS` pixels, or that are blank inside it, are skipped.
 
     Raises:
         InputError: no stack, or none with a usable slice.
@@ -39,7 +40,7 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
         frame = np.stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
         left, _, right = np.linalg.svd(frame)
         frame = left @ right
-        used = np.flatnonzero(stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS)
+        used = np.flatnonzero((stack.mask.sum((0, 1)) >= MIN_SLICE_PIXELS) & ~_blank(stack))
         n_beyond = _slices_beyond(stack, used)
         for k in used:
             inside = stack.mask[:, :, k]
@@ -80,6 +81,11 @@ def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
             extent_mm=np.array(extent), spacing_mm=np.array(distance), n_beyond=np.array(beyond, dtype=np.int64)
         ),
     )
+
+
+def _blank(stack: Stack) -> NDArray[np.bool_]:
+    """Which slices [K] have no positive value inside the mask."""
+    return np.asarray(~((stack.image > 0) & stack.mask).any((0, 1)))
 
 
 def _slices_beyond(stack: Stack, used: NDArray[np.int64]) -> tuple[int, int]:
@@ -130,7 +136,7 @@ def slice_spacing_mm(stack: Slices) -> float:
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
-    """A line for each stack some of whose slices are not used, for want of masked pixels.
+    """A line for each stack some of whose slices are not used, for want of masked pixels or of an image.
 
     Args:
         stacks: as they were given.
@@ -139,8 +145,12 @@ def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
     lines = []
     for n, stack in enumerate(stacks):
         masked = np.flatnonzero(stack.mask.any((0, 1)))
-        missing = sorted(set(masked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist()))
-        if missing:
-            numbers = ", ".join(map(str, missing))
-            lines.append(f"{stack.name}: slices {numbers} skipped, fewer than {MIN_SLICE_PIXELS} masked pixels")
+        missing = set(masked.tolist()) - set(slices.slice_index[slices.stack_id == n].tolist())
+        blank = missing & set(np.flatnonzero(_blank(stack)).tolist())
+        for rows, why in (
+            (missing - blank, f"fewer than {MIN_SLICE_PIXELS} masked pixels"),
+            (blank, "blank inside the mask: they count as not taken"),
+        ):
+            if rows:
+                lines.append(f"{stack.name}: slices {', '.join(map(str, sorted(rows)))} skipped, {why}")
     return lines

@@ -56,6 +56,7 @@ class Stack:
         axes: how the file's arrays became these.
         file_affine: [4, 4] of the file, of which `affine` is the settled one; None where there is no file.
         mask_source, mask_detail: who made the mask, and with what.
+        level: what the intensities of the file were multiplied by (`acquisition.intensity_levels`).
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
@@ -74,6 +75,7 @@ class Stack:
     file_affine: NDArray[np.float64] | None = None
     mask_source: MaskSource = "file"
     mask_detail: str = ""
+    level: float = 1.0
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image, dtype=np.float32)

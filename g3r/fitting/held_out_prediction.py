@@ -58,15 +58,18 @@ class HeldOutFit:
         off: NDArray[np.float64] = self.share * np.abs(gain[number] * predicted - measured)
         return off
 
-    def relative_widths(self) -> NDArray[np.float64]:
-        """Width of each stack's profile, through the plane, over that of the fit; their geometric mean is 1.
+    def relative_widths(self, stack_ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Width of each stack's profile [N], through the plane, over that of the fit; their geometric mean is 1.
 
         1 for all where one of the stacks has too few held-out slices, or no clear minimum.
+
+        Args:
+            stack_ids: [N] of the run's stacks, ascending, whether slices of them were held out or not.
         """
-        _, stack = np.unique(self.slices.stack_id, return_inverse=True)
-        n_stacks = int(stack.max()) + 1
+        stack = np.searchsorted(stack_ids, self.slices.stack_id)
+        n_stacks = len(stack_ids)
         unknown = np.ones(n_stacks)
-        if n_stacks == 1 or np.bincount(stack).min() < MIN_HELD_OUT:
+        if n_stacks == 1 or np.bincount(stack, minlength=n_stacks).min() < MIN_HELD_OUT:
             return unknown
         stack_of_pixel = stack[self.slices.pixel_plane]
         pixels = np.bincount(stack_of_pixel)

@@ -128,7 +128,7 @@ def ask_held_out_slices(
     mean_width = lowest(list(error), list(error.values()))
     return HeldOutChoice(
         mean_width=mean_width,
-        widths=None if mean_width is None else _widths(mean_width, best.relative_widths()),
+        widths=None if mean_width is None else _widths(mean_width, best.relative_widths(np.unique(slices.stack_id))),
         error={f"{width:.3g}": value for width, value in error.items()},
         n_slices=len(best.slices),
     )

@@ -52,7 +52,7 @@ def _mark(columns, r, t, psf, half, cut, marks):
     for j in range(len(x)):
         dx, dy, dz = x[j] - t[0], y[j] - t[1], z[j] - t[2]
         slack = f32(SLACK_MM) + f32(1e-6) * (abs(dx) + abs(dy) + abs(dz))
-        slack = f32(VARIANCE_SLACK) * (xx[j] + yy[j] + zz[j])
+        variance_slack = f32(VARIANCE_SLACK) * (xx[j] + yy[j] + zz[j])
         touches = True
         for axis in range(3):
             a, b, c = r[0, axis], r[1, axis], r[2, axis]
@@ -63,7 +63,7 @@ def _mark(columns, r, t, psf, half, cut, marks):
                 + zz[j] * c * c
                 + f32(2.0) * (xy[j] * a * b + xz[j] * a * c + yz[j] * b * c)
                 + psf[axis]
-                + slack
+                + variance_slack
             )
             reach = max(abs(m) - slack - half[axis], f32(0.0))
             touches &= reach * reach <= cut * s

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from g3r.acquisition.intensity_levels import gain_in_files
 from g3r.acquisition.slicing import by_headers
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.lattice_mean import mean_cloud
@@ -98,7 +99,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
         cloud=cloud,
         intensity_scale=found.intensity,
         slices=by_headers(fit.slices, found.stacks),
-        gain=fit.gain,
+        gain=gain_in_files(fit.gain, fit.slices.stack_id, found.stacks),
         weight=fit.weight,
         ncc=found.registration.ncc,
         uncertainty=uncertainty,

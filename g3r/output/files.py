@@ -44,8 +44,9 @@ FULL_WEIGHT = 0.99
 """Slices of a smaller weight get a reason in slices.tsv."""
 
 LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
-"""A down-weighted slice with a gain below the first has lost signal; one with less than the second of its
-stack's median number of pixels is small; one that correlates less than the third with the volume does not fit."""
+"""A down-weighted slice with a gain below the first, over that of its stack, has lost signal; one with less than the
+second of its stack's median number of pixels is small; one that correlates less than the third with the volume does
+not fit."""
 
 
 def slice_table(
@@ -68,8 +69,9 @@ def slice_table(
         figures = [f"{x:.4g}" for x in (gain[k], weight[k], ncc[k])]
         reason = "-"
         if weight[k] < FULL_WEIGHT:
-            typical = float(np.median(n_pixels[slices.stack_id == slices.stack_id[k]]))
-            reason = _reason(gain[k], ncc[k], n_pixels[k] / typical)
+            same = slices.stack_id == slices.stack_id[k]
+            usual_gain, typical = np.median(gain[same]), float(np.median(n_pixels[same]))
+            reason = _reason(gain[k] / usual_gain, ncc[k], n_pixels[k] / typical)
         lines.append("\t".join([str(slices.stack_id[k]), str(slices.slice_index[k]), *pose, *figures, reason]))
     return "\n".join(lines) + "\n"
 

@@ -222,7 +222,9 @@ def _with_rigid_stacks(
         logger.info("stack %d: is rigid, slices keep its motion", sample.stack)
         refined = refined.with_rows(sample.rows, motion.take(sample.rows))
         gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
-    kept = replace(fitted, slices=slices.with_motion(refined), gain=gain, weight=weight)
+    moved = slices.with_motion(refined)
+    ncc = correlation_with_all(moved, gain, weight, settings.finest_voxel_mm, settings.max_pixels)
+    kept = replace(fitted, slices=moved, gain=gain, weight=weight, ncc=ncc)
     return kept, held_out_score(slices, samples, refined, fill).agreements(samples, weight)
 
 

@@ -4,11 +4,12 @@
 
 rho is the square (Tikhonov), or the length with a rounded tip (total variation). The second is solved as a sequence of
 weighted squares (lagged diffusivity, Vogel and Oman 1996). A is g3r's own operator with the profile of the product's
-fit, r the mean coverage of a voxel.
+fit, r the mean coverage of a voxel. What lies beside the brain is not taken out of the pixels of the rim.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,11 @@ class Regulariser:
 
 
 def least_squares_volume(
-    volumes: InitialVolumes, gain: NDArray[np.float64], weight: NDArray[np.float64], regulariser: Regulariser
+    volumes: InitialVolumes,
+    gain: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    regulariser: Regulariser,
+    widths: Sequence[float] | None = None,
 ) -> Array:
     """The volume [I, J, K] on the grid of the initial volumes, started from V_coarse.
 
@@ -51,8 +56,9 @@ def least_squares_volume(
         gain: [K] intensity factors.
         weight: [K] slice weights.
         regulariser: how it is kept smooth.
+        widths: of each stack's profile through the plane, see `SliceModel.applied`.
     """
-    slices, grid = SliceModel().applied(volumes.slices), volumes.grid
+    slices, grid = SliceModel().applied(volumes.slices, widths), volumes.grid
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     pixel_weight = weight[slices.pixel_plane].astype(np.float32)
     value = (slices.masked_value / gain[slices.pixel_plane]).astype(np.float32)
@@ -88,5 +94,5 @@ def tuned(atlas: bool, n_stacks: int) -> tuple[Regulariser, Regulariser]:
         n_stacks: of the subject.
     """
     if not atlas:
-        return TIKHONOV, TOTAL_VARIATION
+        return (TIKHONOV if n_stacks > 1 else replace(TIKHONOV, strength=0.01)), TOTAL_VARIATION
     return replace(TIKHONOV, strength=0.1), replace(TOTAL_VARIATION, strength=0.03 if n_stacks == 1 else 0.01)

@@ -101,7 +101,8 @@ def measure_peer(spec: PaperSubject, n_stacks: int, one: Peer, options: argparse
             volume = load_volume(output)
             lpips = metric(options.lpips_weights) if options.with_lpips else None
             common = case.header_error().common
-            scores, _ = scored(case, volume.data, volume.grid, common, lpips)
+            # a program may give the head any orientation
+            scores, _ = scored(case, volume.data, volume.grid, common, lpips, near=False)
         except G3RError as error:
             print(f"{one.name}, {spec.name}, {n_stacks}: {error}", flush=True)
             return row | {"skipped": str(error)}

@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
-from g3r.acquisition.slicing import normalised_slices
 from g3r.acquisition.stacks import Stack, load_stack, load_stacks
 from g3r.bench.record import machine_line
 from g3r.errors import InputError
 from g3r.evaluation.held_out_stack import ERODED_PIXELS, predicted_pixels, score_prediction
-from g3r.fitting.initial_volumes import InitialVolumes
 from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import on_grid
 from g3r.output.result import ReconstructionResult
@@ -29,8 +27,8 @@ from studies.harness import DOCS, FITS, Record, Row, Study, Task
 from studies.masks.real import stacks_with_masks
 from studies.paper.least_squares import least_squares_volume, tuned
 from studies.paper.methods import PRIOR, PRODUCT, SCATTER, SQUARES, VARIATION
+from studies.paper.posed import volumes_without_network
 from studies.paper.real_pictures import Shown, draw_real, keep_predictions, largest_slice
-from studies.paper.subjects import VOXEL_MM
 from studies.tables import Cell, details, spread, table
 
 METHODS = (PRODUCT, PRIOR, SCATTER, SQUARES, VARIATION)
@@ -148,13 +146,12 @@ def volumes_of(result: ReconstructionResult, stacks: Sequence[Stack]) -> dict[st
         result: of the stacks.
         stacks: that it was made of.
     """
-    slices = normalised_slices(stacks)[0]
-    slices = slices.take(np.isin(slices.stack_id, result.slices.stack_id)).with_pose(result.slices.planes.pose)
-    own = InitialVolumes.of(slices, result.gain, result.weight, VOXEL_MM)
+    own, gain = volumes_without_network(stacks, result)
+    widths = result.record.held_out.widths if result.record.held_out else None
     made = {SCATTER: own.coarse}
     # as strong as is best for atlas volumes: those are brains, phantoms are not
     for name, regulariser in zip((SQUARES, VARIATION), tuned(True, len(stacks)), strict=True):
-        made[name] = least_squares_volume(own, result.gain, result.weight, regulariser)
+        made[name] = least_squares_volume(own, gain, result.weight, regulariser, widths)
     return {
         PRODUCT: (result.volume, result.grid),
         PRIOR: (result.prior, result.prior_grid),

@@ -42,6 +42,8 @@ def scored(
     truth_from_volume: RigidPose,
     lpips: Lpips | None,
     known: Alignment | None = None,
+    *,
+    near: bool = True,
 ) -> tuple[Row, Comparison]:
     """Scores in the mask of the truth ("mask") and on its whole grid ("grid"), and the volume as it was scored.
 
@@ -54,9 +56,10 @@ def scored(
         truth_from_volume: the common motion of the slices, from where the alignment starts.
         lpips: the metric; None leaves it out.
         known: alignment of a volume of the same slices in the same poses, which is then taken; found when None.
+        near: whether the search relies on `truth_from_volume` (`align_rigid`).
     """
     if known is None:
-        found = aligned(case, data, grid, truth_from_volume, near=True)
+        found = aligned(case, data, grid, truth_from_volume, near=near)
     else:
         volume = Volume(data, grid.moved(truth_from_volume).affine, case.name)
         moved = resample(volume, case.truth.grid, known.volume_from_reference)

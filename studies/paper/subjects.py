@@ -26,9 +26,6 @@ N_SUBJECTS = 16
 
 WEEKS = (21.0, 38.0)
 
-BIAS = 0.05
-"""Strength of the inhomogeneity: three times that of other studies."""
-
 VOXEL_MM = 0.8
 
 
@@ -41,7 +38,6 @@ class PaperSubject(SubjectSpec):
     """
 
     weeks: float
-    bias: float = BIAS
 
     def acquisition(self, n_stacks: int) -> list[StackSettings]:
         """Stacks as the paper has them, through another profile than the model's."""

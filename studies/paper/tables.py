@@ -95,6 +95,12 @@ def gains(rows: Sequence[Row]) -> str:
             best = max(means, key=lambda name: means[name])
             least = min(one - other for one, other in zip(product, found[best], strict=True))
             lines.append(f"{mean(product) - means[best]:+.2f} dB over {what} ({best}; least {least:+.2f})")
+    partly = [name for name in METHODS if 0 < len(values(rows, name, "mask", "psnr_db")) < len(product)]
+    for name in partly:
+        own = [row for row in rows if name in row["scores"] and PRODUCT in row["scores"]]
+        if own:
+            ahead = mean(values(own, PRODUCT, "mask", "psnr_db")) - mean(values(own, name, "mask", "psnr_db"))
+            lines.append(f"{ahead:+.2f} dB over {name} (on {subjects(len(own))})")
     return f"g3r: {'; '.join(lines)}."
 
 
@@ -106,8 +112,17 @@ def main_tables(record: Record) -> str:
         if not rows:
             continue
         own = [row for row in rows if "tre_mm" in row]
+        if not own:
+            continue
+        refused = sum(
+            "skipped" in row
+            and "peer" not in row
+            and (row["kind"], row["motion"], row["n_stacks"]) == ("methods", motion, n)
+            for row in record["rows"].values()
+        )
         poses = mean(row["tre_mm"] for row in own), mean(row["own_tre_mm"] for row in own)
         title = f"**{motion.capitalize()} motion, {stacks(n)}, {subjects(len(own))}.**"
+        title += f" g3r refused {refused} more, which count for no method." if refused else ""
         parts.append(
             f"{title} Median pose error {poses[0]:.2f} mm, {poses[1]:.2f} mm of poses of their own; "
             f"{mean(row['cpu_seconds'] for row in own):.0f} CPU seconds of g3r. {gains(own)}"

@@ -11,12 +11,14 @@ from pathlib import Path
 from statistics import mean
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g3r.acquisition.images import Volume
 from g3r.acquisition.slicing import normalised_slices
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.compare import compare
 from g3r.fitting.initial_volumes import InitialVolumes
+from g3r.fitting.intensity_matching import match_intensities
 from studies.harness import Record, Row, Study, Task
 from studies.paper.figures import PHANTOMS, suffix
 from studies.paper.least_squares import TIKHONOV, TOTAL_VARIATION, least_squares_volume
@@ -51,26 +53,28 @@ def measure(spec: PaperSubject, n_stacks: int, atlas: Path | None, cache: Path) 
         cache: of simulated subjects.
     """
     case = paper_case(spec, atlas, cache, n_stacks)
-    volumes = true_volumes(case)
-    ones = np.ones(len(volumes.slices))
+    volumes, gain = true_volumes(case)
+    ones = np.ones(len(gain))
     support = volumes.foreground.support()
     found: dict[str, dict[str, float]] = {}
     for kind, regulariser in KINDS.items():
         found[kind] = {}
         for strength in STRENGTHS:
-            data = least_squares_volume(volumes, ones, ones, replace(regulariser, strength=strength))
+            data = least_squares_volume(volumes, gain, ones, replace(regulariser, strength=strength))
             made = Volume(np.where(support, data, 0).astype(np.float32), volumes.grid.affine, kind)
             found[kind][f"{strength:g}"] = round(compare(made, case.truth, case.truth_mask).scores.psnr_db, 3)
     return {"subject": spec.name, "n_stacks": n_stacks, "psnr_db": found}
 
 
-def true_volumes(case: SimulatedCase) -> InitialVolumes:
-    """What the slices of a case give in their true poses."""
+def true_volumes(case: SimulatedCase) -> tuple[InitialVolumes, NDArray[np.float64]]:
+    """What the slices of a case give in their true poses, and their gains [K], matched as in the tables."""
     slices = normalised_slices(case.stacks)[0]
     row = {key: n for n, key in enumerate(case.true.keys)}
     order = [row[key] for key in zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True)]
     moved = slices.with_motion(case.true.pose.take(np.array(order)))
-    return InitialVolumes.of(moved, np.ones(len(moved)), np.ones(len(moved)), VOXEL_MM)
+    ones = np.ones(len(moved))
+    matched = match_intensities(moved, ones, ones)
+    return InitialVolumes.of(matched.slices, matched.gain, ones, VOXEL_MM), matched.gain
 
 
 def tables(record: Record) -> dict[str, str]:

@@ -7,6 +7,7 @@ those of the product, the amplitude is as Eq. 5 prints it or exact.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,7 @@ def fit_unconstrained(
     spacing_mm: float,
     settings: Unconstrained,
     rng: np.random.Generator,
+    widths: Sequence[float] | None = None,
 ) -> GaussianCloud:
     """The Gaussians that fit the slices best.
 
@@ -61,8 +63,9 @@ def fit_unconstrained(
         spacing_mm: cube root of the volume per Gaussian; as many as the product's fit has.
         settings: seeds, amplitudes, steps.
         rng: draws the seeds.
+        widths: of each stack's profile through the plane, see `SliceModel.applied`.
     """
-    slices = SliceModel().applied(volumes.slices)
+    slices = SliceModel().applied(volumes.slices, widths)
     planes = slices.planes
     cloud = seeds(volumes, spacing_mm, settings.seeding, rng)
     target = torch.from_numpy(slices.value)

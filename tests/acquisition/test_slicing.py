@@ -1,5 +1,6 @@
 """From stacks to slices: what is cut, normalised and measured by the headers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -9,7 +10,7 @@ import pytest
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.area_profile import head_volume_mm3
 from g3r.acquisition.psf import psf_variance_mm2
-from g3r.acquisition.slicing import by_headers, normalised_slices, slices_from_stacks
+from g3r.acquisition.slicing import by_headers, normalised_slices, skipped_slice_notes, slices_from_stacks
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, stacks_of_two, write
@@ -110,3 +111,18 @@ def test_slices_with_hardly_a_pixel_are_left_out() -> None:
 def test_no_stack_is_refused() -> None:
     with pytest.raises(InputError, match="no stack"):
         slices_from_stacks([])
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_blank_slices_count_as_not_taken(value: float) -> None:
+    before = stacks_of_two()
+    image = before[0].image.copy()
+    middle = image.shape[2] // 2
+    image[:, :, middle] = value
+    stacks = [replace(before[0], image=image), *before[1:]]
+    slices = slices_from_stacks(stacks)
+    of_first = slices.slice_index[slices.stack_id == 0].tolist()
+    assert middle not in of_first
+    assert len(slices) == len(slices_from_stacks(before)) - 1
+    (note,) = skipped_slice_notes(stacks, slices)
+    assert note == f"{stacks[0].name}: slices {middle} skipped, blank inside the mask: they count as not taken"

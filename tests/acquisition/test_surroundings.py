@@ -30,7 +30,7 @@ def stacks_of(volume: np.ndarray) -> Slices:
         affine[:3, 3] = -affine[:3, :3] @ ((np.array(shape) - 1) / 2)
         world = np.moveaxis(np.indices(shape), 0, -1) @ affine[:3, :3].T + affine[:3, 3]
         mask = np.linalg.norm(world, axis=-1) < RADIUS_MM
-        stacks.append(Stack(image=world[..., 0].astype(np.float32), mask=mask, affine=affine, thickness_mm=3.0))
+        stacks.append(Stack(image=world[..., 0].astype(np.float32) + 100, mask=mask, affine=affine, thickness_mm=3.0))
     slices = slices_from_stacks(stacks)
     value = VoxelOperator(slices.planes, GRID, None, (5, 5, 7)).forward(volume.astype(np.float32))
     return replace(slices, value=value.astype(np.float32))

@@ -72,10 +72,14 @@ def test_each_stack_has_a_width_of_its_own() -> None:
     slices = replace(said, value=render(cloud, planes, cutoff_sigma=6.0).numpy())
     fit = HeldOutFit(cloud, slices, np.ones(int(slices.mask.sum()), np.float32))
     expected = widths / math.prod(widths) ** (1 / 3)
-    np.testing.assert_allclose(fit.relative_widths(), expected, rtol=0.03)
+    np.testing.assert_allclose(fit.relative_widths(np.arange(3)), expected, rtol=0.03)
     few = slices.take(np.r_[0:2, 8:24])  # two slices of a stack say nothing
     of_few = HeldOutFit(cloud, few, np.ones(int(few.mask.sum()), np.float32))
-    np.testing.assert_array_equal(of_few.relative_widths(), 1)
+    np.testing.assert_array_equal(of_few.relative_widths(np.arange(3)), 1)
+    # a stack of which no slice was held out has a width, too: the fit takes one for each stack of the run
+    without = slices.take(slices.stack_id != 1)
+    of_two = HeldOutFit(cloud, without, np.ones(int(without.mask.sum()), np.float32))
+    np.testing.assert_array_equal(of_two.relative_widths(np.arange(3)), np.ones(3))
 
 
 def test_the_lowest_of_a_parabola_lies_between_the_widths() -> None:

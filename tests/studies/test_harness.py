@@ -86,7 +86,10 @@ def test_rows_that_are_renewed_or_were_skipped_are_not_kept(tmp_path: Path) -> N
     path = tmp_path / "record.json"
     assert resumed(path, new, set()) == new
     path.write_text(json.dumps(new | {"rows": {"a": {"x": 1}, "b": {"x": 2}, "c": {"skipped": "no data"}}}))
-    assert resumed(path, new, {"a"})["rows"] == {"b": {"x": 2}}
+    assert resumed(path, new, {"a"})["rows"] == {"b": {"x": 2, "commit": "a"}}
+    own = {"d": {"x": 3, "commit": "b"}, "e": {"x": 4, "commit": None}}
+    path.write_text(json.dumps(new | {"rows": {"b": {"x": 2}, **own}}))
+    assert resumed(path, new, set())["machine"]["commit"] == "a, b, unknown"  # tables say of which commits they are
     path.write_text("[]")
     with pytest.raises(InputError, match="not a record"):
         resumed(path, new, set())

@@ -55,7 +55,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> SimulatedCase:
 
 @pytest.fixture(scope="module")
 def volumes(case: SimulatedCase) -> InitialVolumes:
-    return true_volumes(case)
+    return true_volumes(case)[0]
 
 
 def psnr_db(data: np.ndarray, volumes: InitialVolumes, case: SimulatedCase) -> float:
@@ -191,6 +191,8 @@ def test_tables_and_pictures_of_a_record(case: SimulatedCase, volumes: InitialVo
     assert "| LPIPS" not in texts["paper-methods"]
     assert "| fake | 1 | 5 |" in texts["paper-methods"]
     assert "+0.00 dB over the best volume" in texts["paper-methods"]
+    assert "+0.00 dB over template fill (on 1 subject)" in texts["paper-methods"]
+    assert "g3r refused 1 more, which count for no method" in texts["paper-methods"]
     assert "| as shipped | 30.00 |" in texts["paper-variants"]
     assert "registration | 9.0" in texts["paper-stages"]
     assert set(tables(record | {"subjects": "volumes of atlas"})) == {f"{name}-atlas" for name in texts}

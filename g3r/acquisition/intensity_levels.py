@@ -1,0 +1,66 @@
+"""Stacks whose intensities are on another scale than those of the others, brought to theirs.
+
+Scanners choose a receiver gain for each stack, and programs rescale what they write. Gains of slices are searched for
+near 1, and a slice that is much darker than most counts less, because one that lost its signal is as dark. So a whole
+stack at a third of the others' level would be taken for one that does not fit them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g3r.acquisition.stacks import Stack
+
+LEVEL_RANGE = 1.25
+"""A level within this factor of the usual one is left as it is: gains of slices make up for it."""
+
+
+def same_level(stacks: Sequence[Stack]) -> tuple[Stack, ...]:
+    """The stacks with the same typical intensity inside their masks, up to `LEVEL_RANGE`; the usual one is kept.
+
+    Stacks that are within the range are returned as they are. `Stack.level` of the others says by what they were
+    multiplied.
+
+    Args:
+        stacks: of one head.
+    """
+    typical = [_typical(stack) for stack in stacks]
+    usual = float(np.exp(np.median(np.log(typical))))
+    return tuple(
+        stack if 1 / LEVEL_RANGE <= usual / own <= LEVEL_RANGE else _multiplied(stack, usual / own)
+        for stack, own in zip(stacks, typical, strict=True)
+    )
+
+
+def level_notes(stacks: Sequence[Stack]) -> list[str]:
+    """A line for each stack that was brought to the level of the others."""
+    return [
+        f"{one.name}: intensities times {one.level:.3g}, to match the other stacks" for one in stacks if one.level != 1
+    ]
+
+
+def gain_in_files(
+    gain: NDArray[np.float64], stack_id: NDArray[np.int64], stacks: Sequence[Stack]
+) -> NDArray[np.float64]:
+    """Gains [K] of slices as they belong to the intensities of the files.
+
+    Args:
+        gain: [K] of slices of stacks that were brought to one level.
+        stack_id: [K] number of each slice's stack.
+        stacks: all of them.
+    """
+    return gain / np.array([stack.level for stack in stacks])[stack_id]
+
+
+def _typical(stack: Stack) -> float:
+    """Median of the positive values inside the mask: little depends on how much black or fluid is in it."""
+    inside = stack.image[stack.mask]
+    return float(np.median(inside[inside > 0]))
+
+
+def _multiplied(stack: Stack, factor: float) -> Stack:
+    return replace(stack, image=stack.image * np.float32(factor), level=stack.level * factor)
