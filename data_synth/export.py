@@ -13,7 +13,7 @@ from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack
 from g3r.acquisition.images import save_volume
 from g3r.errors import InputError, cannot_be_written
-from g3r.run.output_folder import OutputFolder
+from g3r.run.output_folder import FOUND_ON_DISKS, OutputFolder
 
 POSE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "void")
 
@@ -67,7 +67,7 @@ def check_output(folder: Path, *, replace: bool) -> None:
         return
     if not folder.is_dir():
         raise InputError(f"{folder}: is a file; expected a folder, choose another --output")
-    content = [entry.name for entry in folder.iterdir()]
+    content = {entry.name for entry in folder.iterdir()} - FOUND_ON_DISKS
     if content and not replace:
         raise InputError(f"{folder}: is not empty; pass --force to replace it, or choose another --output")
     if content and "poses.tsv" not in content:

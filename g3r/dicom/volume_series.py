@@ -16,7 +16,7 @@ from g3r._version import __version__
 from g3r.dicom.headers import ImageHeader, quiet_pydicom
 from g3r.dicom.study import SourceStudy
 from g3r.errors import InputError
-from g3r.run.output_folder import OutputFolder
+from g3r.run.output_folder import FOUND_ON_DISKS, OutputFolder
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
@@ -80,7 +80,7 @@ def check_new_folder(folder: str | os.PathLike[str]) -> None:
     """
     path = Path(folder)
     try:
-        if path.is_dir() and any(path.iterdir()):
+        if path.is_dir() and any(one.name not in FOUND_ON_DISKS for one in path.iterdir()):
             raise InputError(f"{path}: is not empty; expected a new or empty folder, choose another --dicom-out")
         if os.path.lexists(path) and not path.is_dir():
             raise InputError(f"{path}: is not a folder; expected a new or empty one, choose another --dicom-out")

@@ -29,7 +29,7 @@ FOUND_ON_DISKS = {SUFFIX, "lost+found"}
 """Names that an empty file system may hold."""
 
 LAST_NAME = "run.json"
-"""Moved last where files move one by one: a folder that holds it is complete."""
+"""Moved last where files move one by one: a result that has it is complete once it is there."""
 
 
 class OutputFolder:
@@ -40,7 +40,7 @@ class OutputFolder:
     Args:
         output: folder that the result will be.
         names: of files that a result may have; others that are in an earlier result are kept. None replaces
-            the whole folder.
+            the whole folder, but for what file systems hold of their own (`FOUND_ON_DISKS`).
 
     Raises:
         InputError: another run is writing the same output, or the folder cannot be made.
@@ -54,7 +54,7 @@ class OutputFolder:
         self.stages = self.staging / "stages"
         self.names = names
         self._new, self._backup = self.staging / "new", self.staging / "backup"
-        self._half_backup = self.staging / "half-backup"
+        self._half_backup, self._replaced = self.staging / "half-backup", self.staging / "replaced"
         self._lock: FileLock | None = None
         self._made: list[Path] = []
 
@@ -113,6 +113,7 @@ class OutputFolder:
                 _move_files(self.output, self._half_backup, self.names)
                 os.rename(self._half_backup, self._backup)
                 _move_files(self._new, self.output)
+                os.rename(self._backup, self._replaced)  # from here on the new result is whole
             else:
                 if self.output.exists():
                     os.rename(self.output, self._backup)
@@ -138,14 +139,14 @@ class OutputFolder:
         shutil.rmtree(self._backup, ignore_errors=True)
 
     def _clean_mount(self) -> None:
-        if self._half_backup.exists():  # nothing new was moved in yet
+        """The name of the backup says how far the exchange came, so that a clean-up may be cut short, too."""
+        if self._backup.exists():  # some of the new files, or all, were moved in
+            self._new.mkdir(exist_ok=True)
+            _move_files(self.output, self._new, self.names)
+            os.rename(self._backup, self._half_backup)
+        if self._half_backup.exists():  # nothing new is in the output
             _move_files(self._half_backup, self.output)
-        elif self._backup.exists() and not (self.output / LAST_NAME).exists():
-            for path in self.output.iterdir():
-                if self.names is None or path.name in self.names:
-                    path.unlink()
-            _move_files(self._backup, self.output)
-        for folder in (self._new, self._half_backup, self._backup):
+        for folder in (self._new, self._half_backup, self._replaced):
             shutil.rmtree(folder, ignore_errors=True)
 
     def _take_lock(self) -> None:
@@ -230,7 +231,7 @@ def check_output_folder(
 
 
 def _move_files(source: Path, target: Path, names: Collection[str] | None = None) -> None:
-    """Move files within one file system, the record last; only some names where they are given."""
+    """Move files and folders within one file system, the record last; only some names where they are given."""
     found = [path for path in source.iterdir() if path.name not in FOUND_ON_DISKS]
     for path in sorted(found, key=lambda path: path.name == LAST_NAME):
         if names is None or path.name in names:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.export import check_output
 from data_synth.phantom import fetal_brain_phantom
 from g3r._version import __version__
 
@@ -93,6 +94,12 @@ def test_a_phantom_and_what_is_already_there(tmp_path: Path) -> None:
     assert run(*arguments, "--seed", 1, "--force").returncode == 0
     assert (output / "stack-0.nii.gz").read_bytes() != before
     assert [path.name for path in tmp_path.iterdir()] == ["case"]
+
+
+def test_what_an_empty_disk_holds_is_in_nobodys_way(tmp_path: Path) -> None:
+    for name in ("lost+found", ".unfinished"):  # the second is made by the run itself
+        (tmp_path / name).mkdir()
+    check_output(tmp_path, replace=False)
 
 
 def test_force_does_not_delete_other_things(tmp_path: Path) -> None:

@@ -51,6 +51,16 @@ def read(folder: Path) -> list[Any]:
     return [pydicom.dcmread(path) for path in sorted(folder.iterdir())]
 
 
+def test_an_empty_mount_point_is_written(
+    study: SourceStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
+    (tmp_path / "out" / "lost+found").mkdir(parents=True)
+    write_volume_series(tmp_path / "out", *volume(), study, in_scanner_space=True)
+    found = {path.name for path in (tmp_path / "out").iterdir()}
+    assert found == {f"{k + 1:04d}.dcm" for k in range(5)} | {"lost+found"}
+
+
 def test_geometry_and_values_are_read_back(study: SourceStudy, tmp_path: Path) -> None:
     data, affine = volume()
     write_volume_series(tmp_path / "out", data, affine, study, in_scanner_space=True)

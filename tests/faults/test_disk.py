@@ -209,7 +209,7 @@ def test_an_empty_mount_point_is_written_and_an_earlier_result_in_it_replaced(
         assert (small_disk / "volume.nii.gz").read_bytes() == case.volume
 
 
-@pytest.mark.parametrize("moved", range(7))
+@pytest.mark.parametrize("moved", range(9))
 def test_a_run_killed_while_files_move_onto_a_mount_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally, moved: int
 ) -> None:
@@ -241,5 +241,58 @@ def test_a_run_killed_while_files_move_onto_a_mount_point(
         assert len(done) == moved
         folder._clean()  # the next one does
         assert names(out) - {".unfinished"} == result | {"notes"}
-        assert {(out / name).read_text() for name in result} == {"old"}
+        whole = moved == 8  # three files out, the backup named, three in, the backup named anew
+        assert {(out / name).read_text() for name in result} == {"new" if whole else "old"}
         assert (out / "notes").read_text() == "old"
+
+
+def test_a_mount_point_takes_a_result_without_a_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally
+) -> None:
+    """Series of DICOM, exported poses and simulations hold no run.json, and some hold folders."""
+    from g3r.run.output_folder import OutputFolder
+
+    monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
+    out = tmp_path / "out"
+    (out / "lost+found").mkdir(parents=True)
+    (out / "lost+found" / "1").write_text("of the disk")
+    for text in ("first", "second"):
+        with tally.case():
+            with OutputFolder(out) as run, run.result() as staged:
+                (staged / "0001.dcm").write_text(text)
+                (staged / "stack").mkdir()
+                (staged / "stack" / "0.nii").write_text(text)
+            assert names(out) == {"0001.dcm", "stack", "lost+found"}
+            assert {path.read_text() for path in (out / "0001.dcm", out / "stack" / "0.nii")} == {text}
+            assert (out / "lost+found" / "1").read_text() == "of the disk"
+
+
+@pytest.mark.parametrize("moved", range(6))
+def test_a_clean_up_of_a_mount_point_that_is_cut_short_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally, moved: int
+) -> None:
+    from g3r.run.output_folder import OutputFolder
+
+    monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
+    out = tmp_path / "out"
+    for folder, text in (("", "new"), (".unfinished/backup", "old")):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+        for name in ("a", "b"):
+            (out / folder / name).write_text(text)
+    rename, n_done = os.rename, 0
+
+    def killed(source: Path, target: Path) -> None:
+        nonlocal n_done
+        if n_done == moved:
+            raise KeyboardInterrupt
+        n_done += 1
+        rename(source, target)
+
+    with tally.case():
+        folder = OutputFolder(out)
+        with suppress(KeyboardInterrupt), monkeypatch.context() as patch:
+            patch.setattr("os.rename", killed)
+            folder._clean()
+        folder._clean()
+        assert names(out) == {"a", "b", ".unfinished"}
+        assert {(out / name).read_text() for name in ("a", "b")} == {"old"}
