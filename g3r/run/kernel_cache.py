@@ -7,6 +7,7 @@ this user among the temporary files takes their place. Nothing heavy is imported
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import sys
@@ -35,8 +36,23 @@ def needs_compiling(room: str = "") -> bool:
     Args:
         room: package of the kernels that are asked for; all when empty.
     """
-    folders = [Path(given)] if (given := os.environ.get("NUMBA_CACHE_DIR")) else [PACKAGE]
-    return not any(next(folder.rglob(f"{room}*/**/kernels*.nbi"), None) for folder in folders)
+    rooms = [PACKAGE / room] if room else [path for path in PACKAGE.iterdir() if path.is_dir()]
+    return not any(next(kept_in(one).glob("kernels*.nbi"), None) for one in rooms)
+
+
+def kept_in(room: Path) -> Path:
+    """The folder that numba keeps the kernels of a package in.
+
+    A folder for all packages may serve other programs and other copies of g3r, so it has one of its own for each.
+
+    Args:
+        room: folder of the sources.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if not given and may_write(room / "__pycache__"):
+        return room / "__pycache__"
+    name = f"{room.name}_{hashlib.sha1(os.fsencode(room), usedforsecurity=False).hexdigest()}"
+    return (Path(given) if given else _user_cache()) / name
 
 
 def may_write(folder: Path) -> bool:

@@ -26,6 +26,7 @@ from g3r.planning.presets import PRESETS
 from g3r.planning.stages import Stage
 from g3r.planning.time_budget import TimeBudget
 from g3r.prior.maps import Tiling
+from g3r.run.kernel_cache import PACKAGE, kept_in
 from tests.quick import QUICK_FIT
 
 PREVIEW = replace(QUICK_FIT, resolution_mm=1.5)
@@ -208,8 +209,9 @@ def test_the_compiler_counts_where_it_has_work_to_do(
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     first = estimate_memory(slices, PREVIEW).peak
-    (tmp_path / "gaussians_ab").mkdir()
-    (tmp_path / "gaussians_ab" / "kernels.one.nbi").touch()
+    folder = kept_in(PACKAGE / "gaussians")
+    folder.mkdir()
+    (folder / "kernels.one.nbi").touch()
     assert 50 * MB < first - estimate_memory(slices, PREVIEW).peak < 150 * MB
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from g3r.run import kernel_cache as _kernel_cache
-from g3r.run.kernel_cache import ensure_kernel_cache, may_write, needs_compiling
+from g3r.run.kernel_cache import ensure_kernel_cache, kept_in, may_write, needs_compiling
 
 PACKAGE = Path(_kernel_cache.__file__).parents[1]
 
@@ -21,6 +21,10 @@ shapes = np.zeros((1, 10))
 one = np.array([[1.0, 0, 0, 0]])
 derive_shapes(np.ones((1, 3)), np.zeros((1, 3)), one, shapes)
 assert shapes[0].tolist() == [1, 1, 1, 1, 0, 0, 1, 0, 1, 1], shapes
+from pathlib import Path
+from g3r.run.kernel_cache import kept_in, needs_compiling
+assert str(kept_in(Path(g3r.__file__).parent / "gaussians")) == derive_shapes.stats.cache_path
+assert not needs_compiling()
 print(g3r.__file__, derive_shapes.stats.cache_hits)
 """
 
@@ -67,6 +71,15 @@ def test_kernels_run_and_are_kept_with_nothing_to_write_but_temporary_files(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
+def test_kernels_are_kept_and_found_in_the_cache_folder_of_the_user(blocked: dict[str, str], tmp_path: Path) -> None:
+    home = tmp_path / "user"
+    home.mkdir()
+    assert run(blocked | {"HOME": str(home)}, tmp_path)[1] == "Counter()"
+    assert list((home / ".cache" / "numba").rglob("*.nbi")) or sys.platform == "darwin"
+    assert run(blocked | {"HOME": str(home)}, tmp_path)[1] != "Counter()"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="homes are elsewhere")
 def test_a_folder_of_somebody_else_is_not_used(blocked: dict[str, str], tmp_path: Path) -> None:
     """What lies in the cache is run as code, and anybody may make folders among the temporary files."""
     planted = tmp_path / "tmp" / f"g3r-kernels-{os.getuid()}"
@@ -91,22 +104,41 @@ def test_may_write(tmp_path: Path) -> None:
     assert not may_write(tmp_path / "file" / "below")
 
 
-def test_compiled_kernels_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+@pytest.mark.parametrize("place", ["chosen", "package", "user"])
+def test_compiled_kernels_are_found(place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In the folder that was chosen, in the package, or, where that is read-only, in the user's cache folder."""
+    package, home = tmp_path / "g3r", tmp_path / "home"
+    for room in ("acquisition", "gaussians"):
+        (package / room).mkdir(parents=True)
+    monkeypatch.setattr(_kernel_cache, "PACKAGE", package)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(_kernel_cache, "_user_cache", lambda: home)
+    if place == "chosen":
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "chosen"))
+    if place == "user":
+        monkeypatch.setattr(_kernel_cache, "may_write", lambda folder: folder == home)
     assert needs_compiling()
-    (tmp_path / "acquisition_ab").mkdir()
-    (tmp_path / "acquisition_ab" / "kernels.scatter-91.py311.nbi").touch()
+    assert keep(package / "acquisition").is_relative_to(tmp_path / {"package": "g3r", "user": "home"}.get(place, place))
     assert not needs_compiling()
     assert needs_compiling("gaussians")
-    (tmp_path / "gaussians_ab").mkdir()
-    (tmp_path / "gaussians_ab" / "kernels.forward-217.py311.nbi").touch()
+    keep(package / "gaussians")
     assert not needs_compiling("gaussians")
 
 
-def test_compiled_kernels_of_the_package_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(_kernel_cache, "PACKAGE", tmp_path)
+def keep(room: Path) -> Path:
+    """An empty file where numba would keep a kernel of a room."""
+    path = kept_in(room) / "kernels.forward-217.py311.nbi"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    return path
+
+
+def test_kernels_of_another_copy_or_program_in_the_same_folder_do_not_count(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "chosen"))
+    monkeypatch.setattr(_kernel_cache, "PACKAGE", tmp_path / "g3r")
+    (tmp_path / "g3r" / "gaussians").mkdir(parents=True)
+    keep(tmp_path / "elsewhere" / "gaussians")
     assert needs_compiling("gaussians")
-    (tmp_path / "gaussians" / "__pycache__").mkdir(parents=True)
-    (tmp_path / "gaussians" / "__pycache__" / "kernels.forward-217.py311.nbi").touch()
-    assert not needs_compiling("gaussians")
+    assert needs_compiling()
