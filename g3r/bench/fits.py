@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from g3r.acquisition.planes import Slices
@@ -94,7 +94,7 @@ def measured_fit(
 
     Args:
         case: simulated subject.
-        settings: of the reconstruction.
+        settings: of the reconstruction, with a fit to the slices.
         motion: from `shared_registration`; found in this run when None.
 
     Returns:
@@ -117,23 +117,20 @@ def measured_fit(
     }
 
 
-def measured_sweeps(case: SimulatedCase, settings: ReconstructionSettings) -> dict[str, dict[str, Any]]:
+def measured_sweeps(case: SimulatedCase, settings: ReconstructionSettings) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Every sweep around some settings, on one registration; the settings themselves are fitted once.
 
-    Returns:
+    Yields:
         Sweep, label, what `measured_fit` gives, with `same_as_base` where nothing was changed.
     """
     motion = shared_registration(case, settings)
     base = measured_fit(case, settings, motion)
-    measured: dict[str, dict[str, Any]] = {}
     for name, variants in sweeps(settings).items():
-        measured[name] = {}
         for label, changes in variants.items():
             chosen = changed(settings, changes)
             same = chosen == settings
             figures = base if same else measured_fit(case, chosen, motion)
-            measured[name][label] = {**figures, "same_as_base": same}
-    return measured
+            yield name, label, {**figures, "same_as_base": same}
 
 
 def _curve(

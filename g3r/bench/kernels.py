@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from typing import Any
 
 from g3r.bench.record import add_output_arguments, machine, markdown_table, run_measurement
@@ -30,10 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and write what was found; returns the exit code."""
-    return run_measurement(options, "kernels", measure=lambda keep: _measure(options), tables=table)
+    return run_measurement(options, "kernels", measure=lambda keep: _measure(options, keep), tables=table)
 
 
-def _measure(options: argparse.Namespace) -> dict[str, Any]:
+def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """All measurements, by one thread: CPU seconds, the least of several.
 
     The copy and fused-multiply-add rates are measured before each size again, so that a machine that others
@@ -49,7 +50,10 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         step_seconds,
     )
 
-    before, rows = numba.get_num_threads(), []
+    rows: list[dict[str, Any]] = []
+    conditions = {"machine": machine(), "date": time.strftime("%Y-%m-%d"), "repeats": options.repeats}
+    record = conditions | {"rows": rows}
+    before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
         for size in options.sizes:
@@ -59,11 +63,12 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
             }
             rates = numba_rates(size, options.repeats)
             rows.append(_row("numba", size, limits, rates) | step_seconds(size, options.repeats))
+            keep(record)
         rates = reference_rates(REFERENCE_GAUSSIANS, REFERENCE_SLICES, options.repeats)
         rows.append(_row("reference", REFERENCE_GAUSSIANS, limits, rates))
     finally:
         numba.set_num_threads(before)
-    return {"machine": machine(), "date": time.strftime("%Y-%m-%d"), "repeats": options.repeats, "rows": rows}
+    return record
 
 
 def _row(backend: str, n_gaussians: int, limits: dict[str, float], rates: dict[str, float]) -> dict[str, Any]:

@@ -83,24 +83,43 @@ def run_measurement(
         draw: the record as a figure; None where there is none.
 
     Raises:
-        InputError: no earlier record, or files that cannot be written.
+        InputError: no earlier record, one that is damaged, or files that cannot be written.
     """
     path = options.output / f"{name}.json"
+    if draw is not None and options.figure and options.figure.suffix != ".png":
+        raise InputError(f"{options.figure}: expected a name that ends in .png; choose another --figure")
     if options.redraw:
-        if not path.is_file():
-            raise InputError(f"{path}: no such file; measure first, without --redraw")
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record, text = _earlier(path, tables)
     else:
         record = measure(lambda so_far: write_json(path, so_far))
         write_json(path, record)
-    text = tables(record)
+        text = tables(record)
     write_text(options.output / f"{name}.md", text)
     print(text)
     if options.docs:
         put_between_markers(options.docs, name, text)
     if draw is not None and options.figure:
-        draw(record, options.figure)
+        try:
+            draw(record, options.figure)
+        except OSError as error:
+            raise InputError(
+                f"{options.figure}: cannot be written ({error.strerror}); choose another --figure, with --redraw"
+            ) from None
     return 0
+
+
+def _earlier(path: Path, tables: Callable[[dict[str, Any]], str]) -> tuple[dict[str, Any], str]:
+    """The record of an earlier run, and its tables."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; measure first, without --redraw")
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return record, tables(record)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:  # no JSON, or another one
+        raise InputError(
+            f"{path}: holds no record of g3r-bench {path.stem} ({type(error).__name__}: {error}); measure again, "
+            "without --redraw"
+        ) from None
 
 
 def _processor() -> str:

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=3, help="runs of each command; medians are shown")
     parser.add_argument("--presets", nargs="+", choices=PRESET_NAMES, default=PRESET_NAMES, metavar="PRESET")
     parser.add_argument("--sweeps", action="store_true", help="on the first case: sweeps, and curves of fits")
-    parser.add_argument("--base", choices=PRESET_NAMES, default="balanced", help="preset that sweeps vary")
+    parser.add_argument("--base", choices=PRESET_NAMES, default="balanced", help="preset whose fit sweeps vary")
     parser.add_argument("--thickness", type=float, metavar="MM", help="of slices (None: simulation.json)")
     parser.add_argument("--threads", type=int, help="CPU threads (None: all cores)")
 
@@ -45,12 +45,18 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
     from g3r.bench.command_run import infer_arguments, run_infer
     from g3r.bench.record import machine
     from g3r.evaluation.case import load_case
+    from g3r.planning.presets import PRESETS
     from g3r.run.machine import available_cores, use_up_to
 
     if not options.cases:
         raise InputError("no case given; expected folders written by g3r-simulate")
     if options.repeats < 1:
         raise InputError(f"--repeats {options.repeats}; expected at least 1")
+    if not PRESETS[options.base].n_lattices:
+        fitting = ", ".join(name for name, settings in PRESETS.items() if settings.n_lattices)
+        raise InputError(
+            f"--base {options.base}: this preset has no fit that sweeps could vary; choose one of {fitting}"
+        )
     cases = [load_case(folder, options.thickness) for folder in options.cases]
     for case in cases:
         _ = case.truth_mask  # before any work
@@ -76,7 +82,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
                 keep(record)
     if options.sweeps:
         use_up_to(threads)
-        _measure_fits(cases[0], options, record)
+        _measure_fits(cases[0], options, record, keep)
     return record
 
 
@@ -113,18 +119,26 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
     }
 
 
-def _measure_fits(case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any]) -> None:
-    """Curves during the fit of each preset, and the sweeps, into the record of a case."""
+def _measure_fits(
+    case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any], keep: Callable[[dict[str, Any]], None]
+) -> None:
+    """Curves during the fit of each preset that fits, and the sweeps, into the record of a case."""
     from g3r.bench.fits import measured_fit, measured_sweeps
     from g3r.planning.presets import PRESETS
 
     found = record["cases"][case.name]
     found["fits"] = {}
     for preset in options.presets:
+        if not PRESETS[preset].n_lattices:
+            continue
         _say(f"{case.name}: quality during the fit, {preset}")
         found["fits"][preset] = measured_fit(case, PRESETS[preset])
+        keep(record)
     _say(f"{case.name}: sweeps around {options.base}")
-    found["sweeps"] = measured_sweeps(case, PRESETS[options.base])
+    found["sweeps"] = {}
+    for sweep, label, figures in measured_sweeps(case, PRESETS[options.base]):
+        found["sweeps"].setdefault(sweep, {})[label] = figures
+        keep(record)
 
 
 def _say(line: str) -> None:

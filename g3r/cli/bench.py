@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from g3r._version import __version__
-from g3r.cli.failures import missing_extra
-from g3r.errors import G3RError, InputError
+from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
+from g3r.errors import InputError
 
 COMMANDS = {
     "kernels": "pair and pixel rates of the renderer, against what the machine can do",
@@ -26,7 +26,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="g3r-bench",
         description="Measure g3r on this machine.",
-        epilog=f"commands (each has its own --help):\n{lines}\n\nexit codes: 0 done, 2 usage, 3 bad input",
+        epilog=f"commands (each has its own --help):\n{lines}\n\n"
+        "exit codes: 0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -52,11 +53,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         print(f"g3r-bench {name}: {missing_extra(error)}", file=sys.stderr)
         return InputError.exit_code
-    except G3RError as error:
-        print(f"g3r-bench {name}: {error}", file=sys.stderr)
-        return error.exit_code
+    except EXPECTED as error:
+        line, exit_code = line_and_code(error)
+        print(f"g3r-bench {name}: {line}", file=sys.stderr)
+        return exit_code
     except KeyboardInterrupt:
-        print(f"g3r-bench {name}: interrupted; what was measured until now is in --output", file=sys.stderr)
+        print(f"g3r-bench {name}: interrupted; whatever was measured until now is in --output", file=sys.stderr)
         return 130
 
 

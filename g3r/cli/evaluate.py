@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from g3r._version import __version__
 from g3r.cli import held_out
 from g3r.cli.completion import parsed
-from g3r.cli.failures import missing_extra
-from g3r.errors import G3RError, InputError
+from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
+from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from g3r.evaluation.compare import Comparison
@@ -46,7 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit code (0 done, 2 usage, 3 bad input)."""
+    """Run the command; returns its exit code (0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted)."""
     parser = build_parser()
     options = parsed(parser, argv)
     if (options.poses is None) != (options.slices is None):
@@ -57,13 +57,18 @@ def main(argv: list[str] | None = None) -> int:
         record = held_out.run(options) if predicts else _scored(options)
         if options.json:
             _write_json(Path(options.json), record)
-    except G3RError as error:
-        print(f"g3r-evaluate: {error}", file=sys.stderr)
-        return error.exit_code
+    except KeyboardInterrupt:
+        return _failed("interrupted; no scores were written", 130)
     except ModuleNotFoundError as error:
-        print(f"g3r-evaluate: {missing_extra(error)}", file=sys.stderr)
-        return InputError.exit_code
+        return _failed(missing_extra(error), InputError.exit_code)
+    except EXPECTED as error:
+        return _failed(*line_and_code(error))
     return 0
+
+
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-evaluate: {line}", file=sys.stderr)
+    return exit_code
 
 
 def table(comparison: Comparison, pose_error: PoseError | None = None, lpips: float | None = None) -> str:

@@ -42,6 +42,18 @@ def test_the_record_and_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "| numba | 60 |" in capsys.readouterr().out
 
 
+def test_what_was_measured_before_ctrl_c_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("g3r.bench.kernel_timing.reference_rates", interrupted)  # measured last
+    with pytest.raises(KeyboardInterrupt):
+        kernels.run(options("--sizes", "60", "--repeats", "1", "--output", str(tmp_path)))
+    record = json.loads((tmp_path / "kernels.json").read_text())
+    assert [row["n_gaussians"] for row in record["rows"]] == [60]
+    assert "| numba | 60 |" in kernels.table(record)
+
+
 def test_pixels_are_counted_as_the_dense_formula_counts_them() -> None:
     scene = head_scene(20, n_slices=2)
     planes, arrays = scene.slices.planes, CloudArrays.of(scene.cloud)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from data_synth import cli as simulate
 from g3r.bench.scaling import GROWING, measured_growth
 from g3r.bench.scaling_tables import draw_scaling, scaling_tables
+from g3r.bench.trade import _measure_fits
 from g3r.bench.trade_figure import draw_trade
 from g3r.bench.trade_tables import trade_tables
 from g3r.cli import bench
+from g3r.evaluation.case import SimulatedCase
+from g3r.planning.presets import PRESETS
 
 MACHINE = {
     "processor": "made up",
@@ -49,6 +54,8 @@ def test_presets_are_named_once() -> None:
         ["trade"],
         ["trade", "nowhere"],
         ["trade", "nowhere", "--repeats", "0"],
+        ["trade", "nowhere", "--sweeps", "--base", "preview"],
+        ["trade", "nowhere", "--figure", "figure.pdf"],
         ["trade", "--redraw", "--output", "nowhere"],
         ["kernels", "--redraw", "--output", "nowhere"],
         ["scaling", "--sizes", "1"],
@@ -63,6 +70,27 @@ def test_bad_input_is_one_line(
     assert said.err.count("\n") == 1
     assert said.err.startswith(f"g3r-bench {words[0]}: ")
     assert not said.out
+
+
+@pytest.mark.parametrize("text", ['{"machine": ', '{"machine": {}}', "[]", "\x00"])
+@pytest.mark.parametrize("name", ["trade", "scaling", "kernels"])
+def test_a_damaged_record_is_one_line(name: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / f"{name}.json").write_text(text)
+    assert bench.main([name, "--redraw", "--output", str(tmp_path)]) == 3
+    said = capsys.readouterr().err
+    assert f"{name}.json: holds no record of g3r-bench {name} (" in said
+    assert said.count("\n") == 1
+
+
+def test_a_figure_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "trade.json").write_text(json.dumps(made_record()))
+    (tmp_path / "file").write_text("")
+    figure = tmp_path / "file" / "trade.png"
+    assert bench.main(["trade", "--redraw", "--output", str(tmp_path), "--figure", str(figure)]) == 3
+    said = capsys.readouterr().err
+    assert said.startswith(f"g3r-bench trade: {figure}: cannot be written (")
+    assert said.endswith("; choose another --figure, with --redraw\n")
+    assert said.count("\n") == 1
 
 
 def preset(seconds: float, psnr: float) -> dict[str, Any]:
@@ -114,6 +142,28 @@ def test_trade_tables_and_figure(tmp_path: Path) -> None:
     assert (tmp_path / "made" / "trade.png").stat().st_size > 10_000
 
 
+def test_presets_without_a_fit_are_passed_over_and_every_fit_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[str] = []
+    kept: list[str] = []
+    case = cast("SimulatedCase", SimpleNamespace(name="made"))
+    options = argparse.Namespace(presets=["preview", "fast"], base="fast")
+    record: dict[str, Any] = {"cases": {"made": {}}}
+
+    def measured(case: object, settings: object, motion: object = None) -> dict[str, Any]:
+        assert settings != PRESETS["preview"]
+        fitted.append("one")
+        return {}
+
+    monkeypatch.setattr("g3r.bench.fits.measured_fit", measured)
+    monkeypatch.setattr("g3r.bench.fits.shared_registration", lambda case, settings: None)
+    _measure_fits(case, options, record, lambda so_far: kept.append(json.dumps(so_far)))
+    found = record["cases"]["made"]
+    assert list(found["fits"]) == ["fast"]
+    n_labels = sum(map(len, found["sweeps"].values()))
+    assert len(fitted) > 10
+    assert len(set(kept)) == 1 + n_labels  # every time it holds more
+
+
 def test_scaling_measures_what_grows(tmp_path: Path) -> None:
     rows = measured_growth("output voxels", 2)
     assert [row["size"] for row in rows] == [30**3, 38**3]
@@ -148,15 +198,17 @@ def test_trade_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert simulate.main([*words, "--output", str(tmp_path / "case")]) == 0
     page = tmp_path / "page.md"
     page.write_text("<!-- trade:begin -->\n<!-- trade:end -->\n", encoding="utf-8")
-    words = ["trade", str(tmp_path / "case"), "--repeats", "1", "--presets", "preview", "--base", "preview"]
+    words = ["trade", str(tmp_path / "case"), "--repeats", "1", "--presets", "preview", "fast", "--base", "fast"]
     words += ["--sweeps", "--output", str(tmp_path), "--docs", str(page), "--figure", str(tmp_path / "t.png")]
     assert bench.main(words) == 0
     case = json.loads((tmp_path / "trade.json").read_text())["cases"]["case"]
     row = case["presets"]["preview"]
     assert row["seconds"] == pytest.approx(sum(row["stages"].values()), abs=0.1)
     assert row["peak_bytes"] > 1e8
-    assert case["fits"]["preview"]["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.5)
-    assert case["fits"]["preview"]["curve"]["psnr_db"][-1] == pytest.approx(row["psnr_db"], abs=0.5)
+    assert set(case["fits"]) == {"fast"}  # a preview has no fit
+    psnr_db = case["presets"]["fast"]["psnr_db"]
+    assert case["fits"]["fast"]["psnr_db"] == pytest.approx(psnr_db, abs=0.5)
+    assert case["fits"]["fast"]["curve"]["psnr_db"][-1] == pytest.approx(psnr_db, abs=0.5)
     assert set(case["sweeps"]) == {"Gaussians", "iterations", "cut-off", "resolution"}
     assert "`preview`" in page.read_text(encoding="utf-8")
     assert (tmp_path / "t.png").is_file()

@@ -51,6 +51,27 @@ def test_scores_as_a_process(files: Path) -> None:
     assert {p.name for p in files.iterdir() if p.name.startswith(".")} == set()
 
 
+@pytest.mark.parametrize(
+    ("failure", "code", "says"), [(KeyboardInterrupt(), 130, "interrupted"), (MemoryError(), 4, "out of memory")]
+)
+def test_ctrl_c_and_little_memory_end_in_one_line(
+    files: Path,
+    failure: BaseException,
+    code: int,
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def failing(*arguments: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("g3r.cli.evaluate._compare", failing)
+    assert main(options(files)) == code
+    said = capsys.readouterr().err
+    assert said.startswith(f"g3r-evaluate: {says}")
+    assert said.count("\n") == 1
+
+
 def test_lpips_is_reported(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_states(files)
     assert main([*options(files, json="s.json"), "--lpips-weights", str(files)]) == 0

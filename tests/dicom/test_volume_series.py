@@ -51,9 +51,7 @@ def read(folder: Path) -> list[Any]:
     return [pydicom.dcmread(path) for path in sorted(folder.iterdir())]
 
 
-def test_an_empty_mount_point_is_written(
-    study: SourceStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_empty_mount_point_is_written(study: SourceStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
     (tmp_path / "out" / "lost+found").mkdir(parents=True)
     write_volume_series(tmp_path / "out", *volume(), study, in_scanner_space=True)

@@ -275,10 +275,10 @@ def test_a_clean_up_of_a_mount_point_that_is_cut_short_loses_nothing(
 
     monkeypatch.setattr("g3r.run.output_folder.is_mount", lambda folder: True)
     out = tmp_path / "out"
-    for folder, text in (("", "new"), (".unfinished/backup", "old")):
-        (out / folder).mkdir(parents=True, exist_ok=True)
+    for place, text in (("", "new"), (".unfinished/backup", "old")):
+        (out / place).mkdir(parents=True, exist_ok=True)
         for name in ("a", "b"):
-            (out / folder / name).write_text(text)
+            (out / place / name).write_text(text)
     rename, n_done = os.rename, 0
 
     def killed(source: Path, target: Path) -> None:
