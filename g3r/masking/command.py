@@ -21,6 +21,9 @@ STACK, MASK = "{stack}", "{mask}"
 
 PLACE = re.compile("|".join(map(re.escape, (STACK, MASK))))
 
+FOLDERS = re.compile(r"[^=:,;]*[/\\]")
+"""In a word of a command line, all before the name of a file: alone, behind an option's = or in a list."""
+
 TIMEOUT_S = 900.0
 """A masker that takes longer hangs: published networks take up to two minutes for a stack without a GPU."""
 
@@ -76,7 +79,11 @@ class MaskCommand:
                 inside = load_mask(target, volume)
             except InputError as error:
                 raise InputError(f"{volume.name}: --mask-command wrote a mask that cannot be used: {error}") from None
-        return FoundMask(inside=inside, source="command", detail=self.line)
+        return FoundMask(inside=inside, source="command", detail=self.told())
+
+    def told(self) -> str:
+        """The command line without folders, for records: they may name patients."""
+        return " ".join(FOLDERS.sub("", word) for word in shlex.split(self.line))
 
     def _run(self, words: list[str], name: str) -> None:
         try:

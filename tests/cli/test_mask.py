@@ -61,6 +61,7 @@ def test_every_stack_gets_a_mask_and_one_that_fails_stops_no_other(
         record = json.loads((out / f"{name}.json").read_text())
         assert record["Sources"] == [stack.name]
         assert record["MaskSource"] == "command"
+        assert record["MaskDetail"] == f"{Path(sys.executable).name} masker.py {{stack}} {{mask}}"
         assert f"{name}.nii.gz: {record['VolumeMl']:.0f} ml" in said
 
 

@@ -43,7 +43,21 @@ def test_its_mask_is_taken(stack: Path, tmp_path: Path) -> None:
     made = command(tmp_path, GOOD)
     found = made.mask_of(stack, volume)
     np.testing.assert_array_equal(found.inside, volume.data > 5)
-    assert (found.source, found.detail) == ("command", made.line)
+    assert (found.source, found.detail) == ("command", f"{Path(sys.executable).name} masker.py {{stack}} {{mask}}")
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("'/home/Jane Doe/tool.py' --in {stack} --out {mask}", "tool.py --in {stack} --out {mask}"),
+        ("tool --weights=/home/doe/net.pth {stack} {mask}", "tool --weights=net.pth {stack} {mask}"),
+        ("docker run -v /home/doe/net:/net image {stack} {mask}", "docker run -v net:net image {stack} {mask}"),
+        ("sh -c '/home/doe/tool /home/doe/net.pth {stack} {mask}'", "sh -c net.pth {stack} {mask}"),
+        (r"'C:\Users\Doe\tool.exe' {stack} {mask}", "C:tool.exe {stack} {mask}"),
+    ],
+)
+def test_records_name_no_folders(line: str, told: str) -> None:
+    assert MaskCommand(line).told() == told
 
 
 @pytest.mark.parametrize(
