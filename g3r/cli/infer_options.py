@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from g3r._version import __version__
 from g3r.cli.completion import HelpFormatter, parsed
 from g3r.cli.dicom_options import add_dicom_output_options, add_input_options, check_dicom_options
-from g3r.cli.mask_options import add_mask_options, check_mask_options
+from g3r.cli.mask_options import add_mask_options, check_mask_options, check_threads
 from g3r.cli.slice_options import add_slice_options, check_slice_options
 from g3r.planning import PRESET_NAMES
 from g3r.planning.anatomy import ANATOMIES, FETAL_BRAIN, GENERIC
@@ -146,7 +146,8 @@ def _add_effort(parser: argparse.ArgumentParser) -> None:
         "--max-memory",
         type=_size,
         metavar="SIZE",
-        help="as 2G or 1500M; what does not fit is refused (default: what is free)",
+        help="as 2G or 1500M: plan with less, or refuse what does not fit (default: no limit; a warning where more "
+        "is needed than is free)",
     )
 
 
@@ -193,8 +194,7 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"{len(options.thickness)} thicknesses for {n_stacks} stacks; give one, or one per stack")
     if options.seed is not None and options.seed < 0:
         parser.error(f"--seed {options.seed}; expected 0 or above")
-    if options.threads is not None and options.threads < 1:
-        parser.error(f"--threads {options.threads}; expected at least 1")
+    check_threads(parser, options)
     if options.time_budget is not None and not 0 < options.time_budget < float("inf"):
         parser.error(f"--time-budget {options.time_budget:g}; expected a positive number of seconds")
     if options.time_budget is not None and options.preset:

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 from g3r._version import __version__
 from g3r.cli.completion import parsed
 from g3r.cli.failures import EXPECTED, line_and_code
-from g3r.cli.mask_options import add_masker_options, check_masker_options, mask_weights_path, masker_of
+from g3r.cli.mask_options import add_masker_options, check_masker_options, check_threads, mask_weights_path, masker_of
 from g3r.errors import InputError
 from g3r.run.idle_threads import let_threads_sleep
+from g3r.run.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from g3r.acquisition.brain_mask import FoundMask
@@ -32,7 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Find the fetal brain in stacks of slices: a mask and a picture of each. Look at the pictures. "
         "For research only, not for diagnosis.",
         epilog="exit codes: 0 done, 2 usage, 3 a stack could not be read or shows no head (the others are done), "
-        "130 interrupted",
+        "130 or 143 interrupted",
     )
     parser.add_argument("stacks", nargs="+", metavar="STACK", help="NIfTI files, of one subject or of many")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder to write into")
@@ -48,13 +49,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = build_parser()
     options = parsed(parser, argv)
     check_masker_options(parser, options)
+    check_threads(parser, options)
     let_threads_sleep()
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
+    stop_request = StopRequest()
     try:
-        with _silent("g3r.acquisition.slice_profile"):  # the thickness decides nothing here
+        with stop_request, _silent("g3r.acquisition.slice_profile"):  # the thickness decides nothing here
             return _run(options)
     except KeyboardInterrupt:
-        return _said("interrupted; masks that were printed are whole", 130)
+        return _said("interrupted; masks that were printed are whole", stop_request.exit_code)
     except EXPECTED as error:
         return _said(*line_and_code(error))
 

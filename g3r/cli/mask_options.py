@@ -76,6 +76,12 @@ def check_masker_options(parser: argparse.ArgumentParser, options: argparse.Name
             parser.error("--mask-timeout is for --mask-command, which is not given")
 
 
+def check_threads(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the program with 2 where there is no such number of threads."""
+    if options.threads is not None and options.threads < 1:
+        parser.error(f"--threads {options.threads}; expected at least 1")
+
+
 def given_masks(options: argparse.Namespace) -> list[str | None]:
     """The user's file for each stack; None where the mask is to be found."""
     return [None if one == AUTO else one for one in options.masks or [None] * len(options.stacks)]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from g3r.acquisition.images import load_volume
@@ -90,6 +92,27 @@ def test_two_stacks_of_one_name_are_refused(
     assert code == 3
     assert "two stacks would have this mask" in failed[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_number_of_threads_that_cannot_be(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["a.nii", "--output", "out", "--threads", "-1"])
+    assert ended.value.code == 2
+    assert "--threads -1; expected at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM that can be heard")
+def test_a_job_that_is_cancelled_ends_its_masker(stacks: list[Path], tmp_path: Path) -> None:
+    """The masker, in a session of its own, says who it is, cancels the job and hangs."""
+    script = "import os, signal, sys, time; open(sys.argv[3], 'w').write(str(os.getpid())); "
+    script += "os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
+    (tmp_path / "masker.py").write_text(script)
+    masker = f"{sys.executable} {tmp_path / 'masker.py'} {{stack}} {{mask}} {tmp_path / 'process'}"
+    words = [sys.executable, "-m", "g3r.cli.mask", str(stacks[0]), "--output", str(tmp_path / "out")]
+    done = subprocess.run([*words, "--mask-command", masker], capture_output=True, text=True, check=False)
+    assert done.returncode == 143
+    assert done.stderr == "g3r-mask: interrupted; masks that were printed are whole\n"
+    assert not psutil.pid_exists(int((tmp_path / "process").read_text()))
 
 
 def test_a_stack_that_is_not_there(tmp_path: Path, masker: str, capsys: pytest.CaptureFixture[str]) -> None:
