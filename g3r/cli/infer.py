@@ -22,7 +22,8 @@ from g3r._version import __version__
 from g3r.cli.dicom_options import stacks_on_disk, write_dicom
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options, told_options, without_names
-from g3r.cli.infer_task import STARTED_S, Task, check_files, prepared
+from g3r.cli.infer_task import STARTED_S, Task, check_files, earlier_run, prepared
+from g3r.cli.interruption import ended_behind, ended_in_order, nothing_written
 from g3r.cli.terminal import PROGRAM, Terminal
 from g3r.cli.time_left import TimeLeft, expected_seconds
 from g3r.errors import InputError
@@ -58,8 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with stop_request, _terminal(options, stop_request) as terminal:
             return _run(options, stop_request, terminal)
     except KeyboardInterrupt:
-        line = f"interrupted; nothing was written{_way_on(Path(options.output))}"
-        return _failed(line, stop_request.exit_code)
+        return _failed(nothing_written(Path(options.output)), stop_request.exit_code)
     except ModuleNotFoundError as error:
         return _failed(missing_extra(error), InputError.exit_code)
     except EXPECTED as error:
@@ -89,21 +89,18 @@ def _failed(line: str, exit_code: int) -> int:
     return exit_code
 
 
-def _way_on(folder: Path) -> str:
+def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Terminal) -> int:
+    from g3r.output.files import OUTPUT_NAMES
     from g3r.run.output_folder import OutputFolder
 
-    kept = OutputFolder(folder).stages.is_dir()
-    return "; --resume goes on from the last finished stage" if kept else ""
-
-
-def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Terminal) -> int:
     folder = Path(options.output)
     replaces = options.force or (options.resume and _is_partial(folder))
     load_nibabel()
     with terminal.held_back():
         with stacks_on_disk(options, replaces=replaces) as dicom:
+            earlier = earlier_run(options)
             networks = check_files(options, folder, replaces=replaces)  # before an image is read
-            task = prepared(options, networks, terminal)
+            task = prepared(options, networks, earlier, terminal)
         for name, facts in task.told():
             terminal.tell(name, facts)
     task = replace(task, warnings=dicom.warnings + task.warnings, notes=dicom.notes)
@@ -112,19 +109,27 @@ def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Termi
     if options.dry_run:
         terminal.end_bar()
         return _dry_run(task, folder)
-    result = _reconstructed(options, task, folder, stop_request, terminal, replaces=replaces)
-    _warn_of_missed_budget(task.plan)
-    write_dicom(options, result, dicom)
-    terminal.end_bar()
-    code = _interrupted(result, folder, stop_request) if stop_request.is_requested() else 0
-    _conclude(result, folder, terminal)
+    output = OutputFolder(folder, OUTPUT_NAMES)
+    try:
+        result = _reconstructed(options, task, output, stop_request, terminal, replaces=replaces)
+        _warn_of_missed_budget(task.plan)
+        write_dicom(options, result, dicom)
+        terminal.end_bar()
+        stopped = stop_request.is_requested()
+        code = _failed(ended_in_order(result, folder), stop_request.exit_code) if stopped else 0
+        _conclude(result, folder, terminal)
+    except KeyboardInterrupt:  # a second one, which waits for nothing
+        if not output.is_written:
+            raise
+        terminal.end_bar()
+        return _failed(ended_behind(folder, options.dicom_out), stop_request.exit_code)
     return code
 
 
 def _reconstructed(
     options: argparse.Namespace,
     task: Task,
-    folder: Path,
+    output: OutputFolder,
     stop_request: StopRequest,
     terminal: Terminal,
     *,
@@ -133,18 +138,16 @@ def _reconstructed(
     """Run the reconstruction and write its folder."""
     from g3r.output.files import OUTPUT_NAMES
     from g3r.run.context import RunContext
-    from g3r.run.output_folder import OutputFolder, check_output_folder
+    from g3r.run.output_folder import check_output_folder
 
-    with (
-        OutputFolder(folder, OUTPUT_NAMES) as output,
-        _logged(output, terminal.log),
-        _reporter(options, task, terminal) as reporter,
-    ):
+    folder = output.named
+    with output, _logged(output, terminal.log), _reporter(options, task, terminal) as reporter:
         check_output_folder(folder, OUTPUT_NAMES, replace=replaces)  # an earlier result may have come back
         import_ahead(*NEEDED_LATER)
         run = RunContext(store=_store(options, task, output.stages), stop_request=stop_request, reporter=reporter)
         poses = task.slices.poses if task.slices else None
         result: ReconstructionResult = task.reconstructor.reconstruct(task.stacks, poses, plan=task.plan, run=run)
+        run.postpone_stop()  # a volume without a fit is worth keeping, too
         result = _with_command(result, options, task)
         terminal.begun(WRITING)
 
@@ -229,14 +232,6 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
         header_text=[text.record() for text in texts] or None,
     )
     return replace(result, record=record, header_text=texts[0] if texts else None)
-
-
-def _interrupted(result: ReconstructionResult, folder: Path, stop_request: StopRequest) -> int:
-    if result.record.partial:
-        line = f"{result.record.stopped_at}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
-    else:
-        line = f"interrupted when the fit had ended: the result in {folder} is complete"
-    return _failed(line, stop_request.exit_code)
 
 
 def _conclude(result: ReconstructionResult, folder: Path, terminal: Terminal) -> None:

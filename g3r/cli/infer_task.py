@@ -83,6 +83,29 @@ class Task:
             yield "thickness unknown", {"n": n}
 
 
+def earlier_run(options: argparse.Namespace) -> RunRecord | None:
+    """The run that --config names; its anatomy becomes that of the options, by which masks are looked for.
+
+    Args:
+        options: of g3r-infer.
+
+    Raises:
+        InputError: a file that cannot be used, or one of an interrupted run or of another number of stacks.
+    """
+    if not options.config:
+        return None
+    from g3r.output.record import RunRecord
+
+    earlier = RunRecord.read(options.config)
+    if earlier.partial:
+        raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a complete result")
+    n_then, n_now = len(earlier.stacks), len(options.stacks)
+    if n_then != n_now and not options.thickness and not options.slices:
+        raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
+    options.anatomy = earlier.settings.anatomy
+    return earlier
+
+
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
     """Refuse what can be seen without reading an image; returns the files of networks, by kind.
 
@@ -111,22 +134,24 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     if options.tensorboard:
         from g3r.output.tensorboard import check_tensorboard
 
-        check_tensorboard(Path(options.tensorboard))
+        check_tensorboard(Path(options.tensorboard), folder)
     return {kind: read_weights(path, kind) for kind, path in networks.items()}
 
 
-def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], reporter: Reporter) -> Task:
+def prepared(
+    options: argparse.Namespace, networks: dict[str, WeightsFile], earlier: RunRecord | None, reporter: Reporter
+) -> Task:
     """Read and check everything that the run needs.
 
     Args:
         options: of g3r-infer.
         networks: files of networks, by kind.
+        earlier: the run that --config names.
         reporter: is told what is under way.
 
     Raises:
         InputError: something in the files or options cannot be used.
     """
-    earlier = _earlier(options)
     slices, masked = None, None
     if options.slices:
         reporter.begun(LOADING)
@@ -162,21 +187,6 @@ def prepared(options: argparse.Namespace, networks: dict[str, WeightsFile], repo
         slices=slices,
         warnings=(masked.left_out if masked else []) + (earlier.differences(inputs) if earlier else []),
     )
-
-
-def _earlier(options: argparse.Namespace) -> RunRecord | None:
-    """The run that --config names."""
-    if not options.config:
-        return None
-    from g3r.output.record import RunRecord
-
-    earlier = RunRecord.read(options.config)
-    if earlier.partial:
-        raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a complete result")
-    n_then, n_now = len(earlier.stacks), len(options.stacks)
-    if n_then != n_now and not options.thickness and not options.slices:
-        raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
-    return earlier
 
 
 def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord | None) -> list[Stack]:

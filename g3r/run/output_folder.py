@@ -35,7 +35,8 @@ LAST_NAME = "run.json"
 class OutputFolder:
     """The folder of one run; use it as a context, which holds the lock.
 
-    At the end the staging folder goes, unless `stages` holds something to go on from.
+    At the end the staging folder goes, unless `stages` holds something to go on from. `is_written` says whether a
+    result of this run is in place.
 
     Args:
         output: folder that the result will be.
@@ -53,6 +54,7 @@ class OutputFolder:
         self.staging = self.output / SUFFIX if self.is_mount else self.output.with_name(self.output.name + SUFFIX)
         self.stages = self.staging / "stages"
         self.names = names
+        self.is_written = False
         self._new, self._backup = self.staging / "new", self.staging / "backup"
         self._half_backup, self._replaced = self.staging / "half-backup", self.staging / "replaced"
         self._lock: FileLock | None = None
@@ -118,6 +120,7 @@ class OutputFolder:
                 if self.output.exists():
                     os.rename(self.output, self._backup)
                 os.rename(self._new, self.output)
+            self.is_written = True
         finally:
             self._clean()
 

@@ -11,9 +11,16 @@ import pytest
 from data_synth import cli as simulate
 from data_synth.objects import textured_ellipsoids
 from g3r.cli import evaluate, infer
+from g3r.cli.infer_options import parsed_options
+from g3r.cli.infer_task import earlier_run
+from g3r.cli.mask_options import needs_network
 from g3r.output.record import RunRecord
+from g3r.output.stack_record import StackRecord
+from g3r.planning.anatomy import GENERIC
+from g3r.planning.presets import for_anatomy
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import USE
+from tests.faults.small_case import quick_settings
 
 
 def simulated(folder: Path, seed: int, *options: str) -> Path:
@@ -83,6 +90,24 @@ def test_nobody_looks_for_a_brain(subject: Path, tmp_path: Path, capsys: pytest.
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert "no mask says what is to be reconstructed" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_nobody_looks_for_a_brain_in_a_repetition(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stacks = [str(subject / f"stack-{n}.nii.gz") for n in range(3)]
+    record = RunRecord(
+        settings=for_anatomy(quick_settings(), GENERIC),
+        stacks=[StackRecord(name=Path(stack).name, thickness_mm=4.0) for stack in stacks],
+    )
+    (tmp_path / "run.json").write_text(record.to_json())
+    words = ["--config", str(tmp_path / "run.json"), "--stacks", *stacks, "--output", str(tmp_path / "out")]
+    options = parsed_options(words)
+    earlier_run(options)
+    assert not needs_network(options)
+    assert infer.main(words) == 3
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert "no mask says what is to be reconstructed" in line
 
 
 def test_the_object_is_the_same_each_time_and_no_mirror_image_of_itself() -> None:

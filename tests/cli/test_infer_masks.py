@@ -65,8 +65,8 @@ def test_a_masker_makes_what_is_not_given(surrounded: Path, masker: str, tmp_pat
     record = json.loads((tmp_path / "found" / "run.json").read_text())
     assert [stack["mask_from"] for stack in record["stacks"]] == ["file", "command", "file"]
     assert record["stacks"][1]["mask_detail"] == f"{Path(sys.executable).name} masker.py {{stack}} {{mask}}"
-    written = [path.read_text() for path in (tmp_path / "found").iterdir() if path.suffix in (".json", ".txt", ".html")]
-    assert not [text for text in written if str(tmp_path) in text]
+    texts = [path for path in (tmp_path / "found").iterdir() if path.suffix in (".json", ".txt", ".html", ".tsv")]
+    assert not [path.name for path in texts if str(tmp_path) in path.read_text()]
     assert [mask["name"] for mask in record["inputs"]["masks"]] == ["mask-0.nii.gz", "command", "mask-2.nii.gz"]
 
 

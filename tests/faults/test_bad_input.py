@@ -181,6 +181,9 @@ VALUES = {
     "--threads 1000000": "this machine offers .*; choose at most that",
     "--max-memory 1M": "needs at least .*; choose a coarser --resolution",
     "--tensorboard stack.nii.gz": "stack.nii.gz: is a file; expected a folder",
+    "--tensorboard out/board": "lies in out, which is put in place at its end; choose another folder for --tensorboard",
+    "--tensorboard out": "out: is written while the run goes on, and lies in out",
+    "--tensorboard out.unfinished/board": "lies in out.unfinished",
 }
 
 

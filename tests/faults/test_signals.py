@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from g3r.acquisition.images import load_volume
+from g3r.cli.interruption import ended_behind
 from g3r.cli.terminal import Terminal
 from g3r.gaussians import GaussianCloud
-from tests.faults.small_case import WHOLE, SmallCase, names
+from g3r.output.record import RunRecord
+from g3r.report.stage_words import WRITING
+from tests.faults.small_case import WHOLE, SmallCase, names, quick_settings
 from tests.quick import QUICK_FIT
 from tests.tally import Tally
 
@@ -121,6 +125,64 @@ def test_a_second_signal_ends_at_once(
         interrupt_at("nothing", 0)
         assert case.run(tmp_path / "out", "--resume") == 0
         assert names(tmp_path) == {"out"}
+
+
+def test_while_the_result_is_written_it_is_finished(
+    case: SmallCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tally: Tally
+) -> None:
+    """Of a run without a fit, too: nothing before it postpones a stop."""
+    record = RunRecord.read(case.config)
+    config = tmp_path / "run.json"
+    config.write_text(replace(record, settings=replace(record.settings, n_lattices=0)).to_json())
+    begun = Terminal.begun
+
+    def interrupted(self: Terminal, stage: str) -> None:
+        begun(self, stage)
+        if stage == WRITING:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Terminal, "begun", interrupted)
+    with tally.case():
+        out = tmp_path / "out"
+        assert case.run(out, "--config", str(config)) == 130
+        assert f"g3r-infer: interrupted at the end: the result in {out} is complete\n" in capsys.readouterr().err
+        assert {"volume.nii.gz", "run.json", "report.html"} <= names(out)
+        assert names(tmp_path) == {"out", "run.json"}
+
+
+@pytest.mark.parametrize("where", ["g3r.cli.infer.write_dicom", "g3r.run.log_file.LogFile.go_on_in"])
+def test_a_second_signal_when_the_result_is_in_place_says_so(
+    case: SmallCase,
+    where: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tally: Tally,
+) -> None:
+    def interrupted(*arguments: object) -> None:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(where, interrupted)
+    with tally.case():
+        out = tmp_path / "out"
+        assert case.run(out) == 130
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last == f"g3r-infer: interrupted; the result in {out} is complete"
+        assert names(out) == WHOLE
+
+
+def test_what_is_said_of_a_result_that_is_in_place(tmp_path: Path) -> None:
+    record = RunRecord(settings=quick_settings(), stacks=[])
+    (tmp_path / "run.json").write_text(record.to_json())
+    whole = f"interrupted; the result in {tmp_path} is complete"
+    assert ended_behind(tmp_path, None) == whole
+    assert ended_behind(tmp_path, str(tmp_path / "series")) == f"{whole}; --dicom-out was not written"
+    (tmp_path / "series").mkdir()
+    (tmp_path / "series" / "0001.dcm").write_text("")
+    assert ended_behind(tmp_path, str(tmp_path / "series")) == whole
+    (tmp_path / "run.json").write_text(replace(record, partial=True).to_json())
+    assert "marked as partial" in ended_behind(tmp_path, None)
 
 
 def test_signals_are_handled_as_before_afterwards(
