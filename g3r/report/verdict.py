@@ -102,7 +102,8 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
         mm = ", ".join(sorted({f"{stack.thickness_mm:g}" for stack in assumed}))
         yield "thickness assumed", {"stacks": _listed([stack.name for stack in assumed]), "mm": mm}
     if record.partial:
-        yield "partial", {"where": str(record.stopped_at or "interrupted")}
+        name = "partial of a budget" if record.time_budget else "partial"
+        yield name, {"where": str(record.stopped_at or "interrupted")}
     elif not record.settings.n_lattices:
         kind = "the prior volume" if record.settings.use_prior else "a least-squares volume of the slices"
         yield "not fitted" if record.time_budget else "preview", {"what": kind}

@@ -117,6 +117,11 @@ MESSAGES = {
         "the run was {where}: this is the volume so far, without uncertainty",
         "Finish it with --resume before using it.",
     ),
+    "partial of a budget": Message(
+        CHECK,
+        "the run was {where}: this is the volume so far, without uncertainty",
+        "A run with --time-budget keeps no stages: run it again from the start, with --force, before using it.",
+    ),
     "not fitted": Message(
         CHECK,
         "there was no time for a fit: this is {what}, without uncertainty",

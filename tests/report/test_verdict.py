@@ -10,6 +10,7 @@ import pytest
 from g3r.bids.outcome import TRUSTED, _verdict
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
+from g3r.planning.plan import BudgetRecord
 from g3r.registration.quality import PARALLEL
 from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import verdict_of
@@ -158,6 +159,17 @@ def test_the_index_of_a_cohort_refuses_the_same(name: str) -> None:
 def test_what_the_index_trusts_may_be_used() -> None:
     assert _verdict(to_plain(record())) == TRUSTED
     assert verdict_of(record()).word == USE
+
+
+def test_the_way_on_from_an_interrupted_run_is_one_that_there_is() -> None:
+    """--resume excludes --time-budget."""
+    stopped = record(partial=True, stopped_at=StoppedAt("fit to slices", 3, 40))
+    (plain,) = verdict_of(stopped).reasons
+    assert "--resume" in plain.advice
+    (budgeted,) = verdict_of(replace(stopped, time_budget=BudgetRecord(seconds=20.0))).reasons
+    assert budgeted.text == plain.text
+    assert "--resume" not in budgeted.advice
+    assert "--force" in budgeted.advice
 
 
 def test_the_worst_comes_first_and_the_line_has_only_that() -> None:
