@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -62,6 +63,18 @@ def load_volume(path: str | os.PathLike[str]) -> Volume:
     grid = checked_grid(image, name)
     data = voxels(image, grid.shape, name)
     return Volume(data, grid.affine, name, (*repairs, *orientation_remarks(image, grid)))
+
+
+def names_of(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Names of files by which people can tell stacks apart: without folders, which may name patients.
+
+    Where a name is there several times, the number of the stack follows it, from 1 in the order given.
+
+    Args:
+        paths: of all stacks of a run.
+    """
+    names = [Path(path).name for path in paths]
+    return [f"{name} (stack {n + 1})" if names.count(name) > 1 else name for n, name in enumerate(names)]
 
 
 def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.bool_]:

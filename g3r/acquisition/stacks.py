@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import FoundMask, MaskSource, required_mask
 from g3r.acquisition.file_axes import AS_IN_FILE, FileAxes, settled
-from g3r.acquisition.images import Volume, load_mask, load_volume
+from g3r.acquisition.images import Volume, load_mask, load_volume, names_of
 from g3r.acquisition.psf import IN_PLANE_FWHM_RANGE_PIXELS, THICKNESS_RANGE_MM
 from g3r.acquisition.slice_profile import NOMINAL_FWHM_PIXELS, NOT_SAID, ProfileOrigin, SliceProfile, find_slice_profile
 from g3r.errors import InputError
@@ -176,6 +176,7 @@ def load_stack(
     mask: MaskOfStack = required_mask,
     thickness_mm: float | None = None,
     profile: SliceProfile | None = None,
+    name: str | None = None,
 ) -> Stack:
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
@@ -190,12 +191,14 @@ def load_stack(
         thickness_mm: of the slices; without one that of the sidecar is taken, or else the slice spacing, with a
             warning, because a header does not show gaps.
         profile: of a run that is to be repeated, in place of the sidecar's.
+        name: by which people know it; the file's when None.
 
     Raises:
         InputError: what `load_volume`, `load_mask`, `required_mask`, `read_sidecar` and `Stack` refuse, or a sidecar
             that is about slices at another distance.
     """
     volume = load_volume(path)
+    volume = replace(volume, name=name or volume.name)
     for remark in volume.remarks:
         logger.warning("%s: %s", volume.name, remark)
     if isinstance(mask, FoundMask):
@@ -238,6 +241,7 @@ def load_stacks(
     masks: Sequence[MaskOfStack] | None = None,
     thickness_mm: Sequence[float | None] | None = None,
     profiles: Sequence[SliceProfile | None] | None = None,
+    names: Sequence[str] | None = None,
 ) -> list[Stack]:
     """Read the stacks of one head, see `load_stack`.
 
@@ -246,17 +250,20 @@ def load_stacks(
         masks: one for each stack, or none.
         thickness_mm: one for each stack, or none.
         profiles: one for each stack, or none.
+        names: one for each stack; those of their files, told apart by `names_of`, when None.
 
     Raises:
         InputError: a stack that cannot be used, the same image twice, or stacks too far apart.
-        ValueError: another number of masks, thicknesses or profiles than of stacks.
+        ValueError: another number of masks, thicknesses, profiles or names than of stacks.
     """
     inside = masks or [required_mask] * len(paths)
     thickness = thickness_mm or [None] * len(paths)
     known = profiles or [None] * len(paths)
     stacks: list[Stack] = []
-    for path, mask, own_mm, profile in zip(paths, inside, thickness, known, strict=True):
-        stack = load_stack(path, mask, own_mm, profile)
+    for path, name, mask, own_mm, profile in zip(
+        paths, names or names_of(paths), inside, thickness, known, strict=True
+    ):
+        stack = load_stack(path, mask, own_mm, profile, name)
         for other, other_path in zip(stacks, paths, strict=False):
             _check_pair(stack, other, Path(path), Path(other_path))
         stacks.append(stack)

@@ -190,6 +190,7 @@ def prepared(
 
 
 def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord | None) -> list[Stack]:
+    from g3r.acquisition.images import names_of
     from g3r.acquisition.stacks import load_stacks
 
     thickness = options.thickness
@@ -198,7 +199,9 @@ def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord 
     repeats = earlier is not None and len(earlier.stacks) == len(masked.kept)
     profiles = [stack.profile() for stack in earlier.stacks] if earlier and repeats else None
     paths = [options.stacks[n] for n in masked.kept]
-    return load_stacks(paths, masked.masks, [thickness[n] for n in masked.kept] if thickness else None, profiles)
+    told = names_of(options.stacks)  # of all that were given, so that numbers are those of the command line
+    names = [told[n] for n in masked.kept]
+    return load_stacks(paths, masked.masks, [thickness[n] for n in masked.kept] if thickness else None, profiles, names)
 
 
 def _settings(options: argparse.Namespace) -> ReconstructionSettings:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.brain_mask import WAYS_ON, FoundMask, without_surroundings
-from g3r.acquisition.images import Volume, load_volume
+from g3r.acquisition.images import Volume, load_volume, names_of
 from g3r.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,8 @@ def find_masks(
     files = given or [None] * len(paths)
     masks: dict[int, str | os.PathLike[str] | FoundMask] = {n: own for n, own in enumerate(files) if own is not None}
     # all are read before the first mask is made, which may take minutes
-    volumes = {n: load_volume(path) for n, path in enumerate(paths) if n not in masks}
+    told = names_of(paths)
+    volumes = {n: replace(load_volume(path), name=told[n]) for n, path in enumerate(paths) if n not in masks}
     found_ml: dict[int, float] = {}
     left_out: list[str] = []
     for n, volume in volumes.items():

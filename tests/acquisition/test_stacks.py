@@ -8,7 +8,7 @@ import pytest
 
 from g3r.acquisition.brain_mask import whole_image
 from g3r.acquisition.slicing import slices_from_stacks
-from g3r.acquisition.stacks import Stack, load_stack
+from g3r.acquisition.stacks import Stack, load_stack, load_stacks
 from g3r.errors import InputError
 from tests.acquisition.nifti_files import AXES, affine_of, arrays, write
 
@@ -42,6 +42,19 @@ def test_a_mask_may_be_found_by_any_function(tmp_path: Path) -> None:
     stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])), whole_image)
     np.testing.assert_array_equal(stack.mask, mask)
     assert stack.mask_source == "whole image"
+
+
+def test_stacks_whose_files_have_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:
+    image, mask = arrays()
+    paths = []
+    for n, name in enumerate(("ax/T2.nii.gz", "cor/T2.nii.gz", "sag.nii.gz")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        paths.append(write(tmp_path / name, (image + n) * mask, affine_of(AXES["RAS"])))
+    stacks = load_stacks(paths, [whole_image] * 3)
+    assert [stack.name for stack in stacks] == ["T2.nii.gz (stack 1)", "T2.nii.gz (stack 2)", "sag.nii.gz"]
+    write(paths[1], image * mask, affine_of(AXES["RAS"]))
+    with pytest.raises(InputError, match=r"^T2\.nii\.gz \(stack 2\): holds the same image as T2\.nii\.gz \(stack 1\)"):
+        load_stacks(paths, [whole_image] * 3)
 
 
 def test_a_mask_as_in_the_file_is_on_the_grid_of_the_file(tmp_path: Path) -> None:

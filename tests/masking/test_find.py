@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import nibabel as nib
@@ -10,6 +11,7 @@ import pytest
 
 from g3r.acquisition.brain_mask import FoundMask
 from g3r.acquisition.images import Volume
+from g3r.cli.infer_task import _load
 from g3r.errors import InputError
 from g3r.masking.find import MaskedStacks, find_masks
 
@@ -63,6 +65,18 @@ def test_a_stack_without_a_head_is_left_out_with_the_reason(three: list[Path]) -
     found = find(three, {"a.nii": ball(9), "b.nii": "no head was found", "c.nii": ball(9)})
     assert found.kept == [0, 2]
     assert found.left_out == ["b.nii: left out, no head was found"]
+
+
+def test_stacks_of_one_name_are_told_apart_and_keep_their_numbers(tmp_path: Path) -> None:
+    """From the sentence on one that is left out to the names of those that are used."""
+    paths = []
+    for n, folder in enumerate("abc"):
+        (tmp_path / folder).mkdir()
+        paths.append(write(tmp_path / folder, "T2.nii", around=1.0 + 0.1 * n))
+    found = find(paths, {"T2.nii (stack 1)": "no head", "T2.nii (stack 2)": ball(10), "T2.nii (stack 3)": ball(10)})
+    assert found.left_out == ["T2.nii (stack 1): left out, no head"]
+    stacks = _load(argparse.Namespace(stacks=paths, thickness=[5.0]), found, None)
+    assert [stack.name for stack in stacks] == ["T2.nii (stack 2)", "T2.nii (stack 3)"]
 
 
 def test_no_head_at_all_is_refused(three: list[Path]) -> None:
