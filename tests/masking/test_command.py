@@ -49,10 +49,10 @@ def test_its_mask_is_taken(stack: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("'/home/Jane Doe/tool.py' --in {stack} --out {mask}", "tool.py --in {stack} --out {mask}"),
-        ("tool --weights=/home/doe/net.pth {stack} {mask}", "tool --weights=net.pth {stack} {mask}"),
-        ("docker run -v /home/doe/net:/net image {stack} {mask}", "docker run -v net:net image {stack} {mask}"),
-        ("sh -c '/home/doe/tool /home/doe/net.pth {stack} {mask}'", "sh -c net.pth {stack} {mask}"),
+        ("'/data/Jane Doe/tool.py' --in {stack} --out {mask}", "tool.py --in {stack} --out {mask}"),
+        ("tool --weights=/data/doe/net.pth {stack} {mask}", "tool --weights=net.pth {stack} {mask}"),
+        ("docker run -v /data/doe/net:/net image {stack} {mask}", "docker run -v net:net image {stack} {mask}"),
+        ("sh -c '/data/doe/tool /data/doe/net.pth {stack} {mask}'", "sh -c net.pth {stack} {mask}"),
         (r"'C:\Users\Doe\tool.exe' {stack} {mask}", "C:tool.exe {stack} {mask}"),
     ],
 )
