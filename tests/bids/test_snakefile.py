@@ -77,7 +77,7 @@ def test_what_failed_is_in_the_table_and_is_tried_again(tmp_path: Path, raw: Pat
     assert snakemake(tmp_path, raw, g3r, "--keep-going").returncode == 1
     out = tmp_path / "out"
     assert {name: row["verdict"] for name, row in rows(out).items()} == {
-        "sub-01": "trusted", "sub-02": "failed", "sub-03": "trusted"
+        "sub-01": "use", "sub-02": "failed", "sub-03": "trusted"
     }  # fmt: skip
     made = volumes(out)
     (raw / "sub-02" / "anat" / "sub-02_run-1_T2w.nii.gz").write_bytes(b"mended")
@@ -85,4 +85,4 @@ def test_what_failed_is_in_the_table_and_is_tried_again(tmp_path: Path, raw: Pat
     assert done.returncode == 0, done.stderr
     assert len(volumes(out)) == 3
     assert made.items() <= volumes(out).items()
-    assert rows(out)["sub-02"]["verdict"] == "trusted"
+    assert rows(out)["sub-02"]["verdict"] == "use"
