@@ -17,7 +17,8 @@ PREFIX = "g3r-dicom-"
 def private_folder() -> Iterator[Path]:
     """A new folder below the system's for temporary files (TMPDIR).
 
-    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run on the same machine removes it.
+    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run on the same machine removes
+    it.
 
     Raises:
         OSError: it cannot be made.
