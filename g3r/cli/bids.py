@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit code where a session failed; the others are done."""
 
-OURS = ("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard")
+OURS = (
+    *("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard"),
+    *("dicom_out", "dicom_reference"),  # one examination for all would put every volume under one patient's name
+)
 """Options of g3r-infer that this command decides itself, or that make no sense for many."""
 
 

@@ -35,6 +35,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, st
         (["--", "--output", "there"], "--output after --: g3r-bids decides that"),
         (["--", "--stacks", "a", "b"], "--stacks after --"),
         (["--", "--masks", "a"], "--masks after --"),
+        (["--", "--dicom-out", "D", "--dicom-reference", "PAT_A"], "--dicom-out, --dicom-reference after --"),
         (["--", "--force", "--dry-run"], "--force, --dry-run after --"),
         (["--", "--seed", "-1"], "--seed -1"),
         (["--", "--preset", "none"], "invalid choice"),
