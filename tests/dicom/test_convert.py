@@ -26,7 +26,7 @@ CORNERS = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)
 
 
 def series_of(folder: Path) -> dict[str, Series]:
-    return {series.label: series for series in grouped(read_images(folder)[0])}
+    return {series.label: series for series in grouped(read_images(folder).images)}
 
 
 def test_stacks_are_where_the_nifti_files_put_them(examination: Examination, tmp_path: Path) -> None:
