@@ -74,7 +74,7 @@ def test_folders_that_cannot_be(raw: Path, tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize("end", ["", "/", "/../raw/."])
 def test_the_description_names_no_folder_above(raw: Path, tmp_path: Path, end: str) -> None:
     """Whatever way the paths are written, those of g3r-infer, too; other words stay as they are."""
-    out, secret = tmp_path / "out", "/home/secret/of study"
+    out, secret = tmp_path / "out", "/data/secret/of study"
     words = ["group", "--slurm", f"partition=a,container={secret}/x", f"--mask-derivative={secret}/m"]
     infer = ["--preset", "fast", "--mask-command", f"{secret}/tool {{stack}} {{mask}}", f"--ckpt={secret}/prior.st"]
     infer += ["--pose-ckpt", f"{secret}/pose.st"]
