@@ -9,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import pytest
 from g3r._version import __version__
 from tests.bids.data_sets import add_session
 from tests.container_recipe import APPTAINER, DOCKERFILE, argument, directives, environment, pip_commands, sections
+from tests.document_commands import blocks
 from tests.rooms import REPOSITORY
 
 READ_ONLY = """
@@ -71,6 +73,14 @@ def test_the_recipe_of_apptainer_is_kept_like_the_dockerfile() -> None:
     assert f'PIP_ARGS="{argument("PIP_ARGS")}"' in post
     assert set(pip_commands()) <= set(post)
     assert found["runscript"] == ['exec g3r-bids "$@"']
+
+
+def test_the_documented_commands_make_the_output_folder_first() -> None:
+    """Docker would make it as root's, Apptainer refuses to bind what is not there."""
+    text = (REPOSITORY / "docs" / "cohort.md").read_text(encoding="utf-8")
+    runs = ["\n".join(lines) for _, lines in blocks(text) if re.search(r"out:/out\b", "\n".join(lines))]
+    assert len(runs) == 2
+    assert all(run.find("mkdir -p out ") in range(run.index(" run ")) for run in runs)
 
 
 def test_both_pass_their_checkers() -> None:

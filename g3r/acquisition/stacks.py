@@ -57,6 +57,7 @@ class Stack:
         file_affine: [4, 4] of the file, of which `affine` is the settled one; None where there is no file.
         mask_source, mask_detail: who made the mask, and with what.
         level: what the intensities of the file were multiplied by (`acquisition.intensity_levels`).
+        remarks: what is doubtful in its files, for the verdict.
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
@@ -76,6 +77,7 @@ class Stack:
     mask_source: MaskSource = "file"
     mask_detail: str = ""
     level: float = 1.0
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image, dtype=np.float32)
@@ -199,21 +201,25 @@ def load_stack(
     """
     volume = load_volume(path)
     volume = replace(volume, name=name or volume.name)
-    for remark in volume.remarks:
-        logger.warning("%s: %s", volume.name, remark)
     if isinstance(mask, FoundMask):
         found = mask
     elif callable(mask):
         found = mask(volume)
     else:
         found = FoundMask(inside=load_mask(mask, volume), source="file")
-    if found.source != "whole image" and found.inside.all():
-        logger.warning("%s: its mask marks every voxel; expected the brain alone", volume.name)
     axes = FileAxes.of(volume.grid)
     grid = settled(axes.grid_from_file(volume.grid))
     spacing = axes.grid_to_file(grid).spacing_mm
     profile = find_slice_profile(path, spacing, axes.slice_axis, thickness_mm, profile)
-    stack = Stack(
+    remarks = list(volume.remarks)
+    if found.source != "whole image" and found.inside.all():
+        remarks.append("its mask marks every voxel; expected the brain alone")
+    if profile.thickness_mm < spacing[:2].min():
+        pixels = spaced(spacing[:2])
+        remarks.append(f"thickness {profile.thickness_mm:g} mm is less than the pixels' {pixels} mm; check --thickness")
+    for remark in remarks:
+        logger.warning("%s: %s", volume.name, remark)
+    return Stack(
         image=axes.from_file(volume.data),
         mask=axes.from_file(found.inside),
         affine=grid.affine,
@@ -225,15 +231,8 @@ def load_stack(
         file_affine=volume.affine,
         mask_source=found.source,
         mask_detail=found.detail,
+        remarks=tuple(remarks),
     )
-    if stack.thickness_mm < stack.spacing_mm[:2].min():
-        logger.warning(
-            "%s: thickness %g mm is less than the pixels' %s mm; check --thickness",
-            stack.name,
-            stack.thickness_mm,
-            spaced(stack.spacing_mm[:2]),
-        )
-    return stack
 
 
 def load_stacks(

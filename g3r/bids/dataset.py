@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from g3r.bids.description import is_own_derivative
 from g3r.bids.names import BidsName, parsed_name
 from g3r.errors import InputError
 
@@ -57,13 +58,14 @@ def find_sessions(
     folders = _chosen(bids_dir, "sub", participants, f"{bids_dir}")
     if not folders:
         raise InputError(f"{bids_dir}: holds no folder sub-*; expected a BIDS data set, check the path")
+    wanted = None if sessions is None else [_bare(label, "ses") for label in sessions]
+    visits = {participant: _labelled(folder, "ses") for participant, folder in folders.items()}
+    _check_labels(wanted or [], [label for own in visits.values() for label in own], "ses", f"{bids_dir}")
     found = []
     for participant, folder in folders.items():
-        visits = _labelled(folder, "ses")
         own = None if sessions else _session(folder, participant, None)
         found += [own] if own else []
-        wanted = None if sessions is None else {_bare(label, "ses") for label in sessions}
-        for label, visit in visits.items():
+        for label, visit in visits[participant].items():
             if wanted is None or label in wanted:
                 own = _session(visit, participant, label)
                 found += [own] if own else []
@@ -76,6 +78,8 @@ def find_sessions(
 def find_masks(session: Session, bids_dir: Path, out_dir: Path, derivative: str | None = None) -> list[Path | None]:
     """The brain mask of each stack of a session; None where no derivative has one.
 
+    Masks that g3r found are not taken for the user's own: data sets that it made are passed by unless they are named.
+
     Args:
         session: whose stacks.
         bids_dir: whose `derivatives/*/` are looked through.
@@ -83,33 +87,55 @@ def find_masks(session: Session, bids_dir: Path, out_dir: Path, derivative: str 
         derivative: name of the only folder of `derivatives/` to look in.
 
     Raises:
-        InputError: two derivatives have masks of one stack.
+        InputError: one stack has two masks, or the folder that is named cannot be looked in.
     """
     root = bids_dir / "derivatives"
-    masks: dict[frozenset[tuple[str, str]], dict[str, Path]] = {}
-    if derivative is not None and not (root / derivative).is_dir():
-        raise InputError(f"{root / derivative}: is no folder; pass --mask-derivative a name below derivatives/")
-    for folder in sorted(root.iterdir()) if root.is_dir() else []:
-        if not folder.is_dir() or folder.resolve() == out_dir.resolve() or derivative not in (None, folder.name):
-            continue
-        # plain _mask first, so that one with a description replaces it
-        for path in sorted(
-            (folder / session.folder).rglob("*_mask.nii*"), key=lambda path: ("_desc-" in path.name, path)
-        ):
+    masks: dict[frozenset[tuple[str, str]], list[Path]] = {}
+    for folder in _mask_folders(root, out_dir, derivative):
+        for path in sorted((folder / session.folder).rglob("*_mask.nii*")):
             name = parsed_name(path)
             if name is not None and _is_brain_mask(name):
-                masks.setdefault(name.scan, {})[folder.name] = path
+                masks.setdefault(name.scan, []).append(path.relative_to(root))
     found: list[Path | None] = []
     for stack in session.stacks:
         name = parsed_name(stack)
-        own = masks.get(name.scan, {}) if name else {}
+        own = masks.get(name.scan, []) if name else []
         if len(own) > 1:
-            raise InputError(
-                f"{stack.name}: has masks in derivatives/{' and derivatives/'.join(own)}; expected one, pass "
-                f"--mask-derivative {next(iter(own))} or another"
-            )
-        found.append(next(iter(own.values()), None))
+            raise _several_masks(stack, own)
+        found.append(root / own[0] if own else None)
     return found
+
+
+def _mask_folders(root: Path, out_dir: Path, derivative: str | None) -> list[Path]:
+    """The folders below `derivatives/` whose masks are the user's own; see `find_masks`."""
+    if derivative is None:
+        folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+        return [path for path in folders if not (_is_same(path, out_dir) or is_own_derivative(path))]
+    folder = root / derivative
+    if folder.parent != root or derivative == ".." or not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; pass --mask-derivative a name below derivatives/")
+    if _is_same(folder, out_dir):
+        raise InputError(f"{folder}: is OUT_DIR, too, where masks are replaced; copy those to keep to another folder")
+    return [folder]
+
+
+def _is_same(folder: Path, other: Path) -> bool:
+    """Whether two paths are one folder, by whatever link or spelling."""
+    return other.exists() and folder.samefile(other)
+
+
+def _several_masks(stack: Path, masks: list[Path]) -> InputError:
+    """The refusal of a stack with several masks, by what can be done about it."""
+    folders = list(dict.fromkeys(path.parts[0] for path in masks))
+    if len(folders) > 1:
+        named = " and ".join(f"derivatives/{folder}" for folder in folders)
+        return InputError(
+            f"{stack.name}: has masks in {named}; expected one, pass --mask-derivative {folders[0]} or another"
+        )
+    named = " and ".join(f"derivatives/{path.as_posix()}" for path in masks)
+    return InputError(
+        f"{stack.name}: has masks {named}; expected one, remove the others or pass --mask-derivative another folder"
+    )
 
 
 def _is_brain_mask(name: BidsName) -> bool:
@@ -142,11 +168,21 @@ def _chosen(folder: Path, key: str, labels: Sequence[str] | None, where: str) ->
     if labels is None:
         return found
     wanted = [_bare(label, key) for label in labels]
+    _check_labels(wanted, found, key, where)
+    return {label: found[label] for label in dict.fromkeys(wanted)}
+
+
+def _check_labels(wanted: Sequence[str], found: Collection[str], key: str, where: str) -> None:
+    """Refuse a label that is not there.
+
+    Raises:
+        InputError: see above.
+    """
     missing = [label for label in wanted if label not in found]
     if missing:
-        there = f"{key}-{next(iter(found))} and {len(found) - 1} more" if found else f"no {key}-*"
+        n_more = len(set(found)) - 1
+        there = f"{key}-{next(iter(found))} and {n_more} more" if found else f"no {key}-*"
         raise InputError(f"{where}: has no {key}-{missing[0]}; found {there}, check the label")
-    return {label: found[label] for label in dict.fromkeys(wanted)}
 
 
 def _labelled(folder: Path, key: str) -> dict[str, Path]:

@@ -48,9 +48,9 @@ IMAGES = {
 }
 """By the name in the folder of a result."""
 
-SECTIONS, THUMBNAIL = "desc-sections_T2w.png", "desc-thumbnail_T2w.png"
+SECTIONS, THUMBNAIL, REPORT = "desc-sections_T2w.png", "desc-thumbnail_T2w.png", "desc-report_T2w.html"
 
-FIGURES = {"sections.png": SECTIONS, "masks.png": "desc-masks_T2w.png"}
+FIGURES = {"sections.png": SECTIONS, "masks.png": "desc-masks_T2w.png", "report.html": REPORT}
 
 WORDS = {
     "standard": "in standard orientation (RAS, mid-sagittal plane at x = 0), not in scanner space",

@@ -7,13 +7,13 @@ from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
-from g3r.bids.derivative import THUMBNAIL, figure_path
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, TRUSTED, Outcome, log_path
+from g3r.bids.derivative import REPORT, THUMBNAIL, figure_path
+from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, NOT_RUN, USE, Outcome, log_path
 from g3r.run.atomic_file import write_text
 
 PAGE = "index.html"
 
-WORST_FIRST = (FAILED, DO_NOT_USE, CHECK, NOT_RUN, TRUSTED)
+WORST_FIRST = (FAILED, DO_NOT_USE, CHECK, NOT_RUN, USE)
 
 TITLES = ("session", "verdict", "slices", "unseen", "why", "picture")
 
@@ -71,7 +71,7 @@ def write_index(outcomes: Sequence[Outcome], out_dir: Path) -> None:
 def _row(one: Outcome, out_dir: Path) -> str:
     cells = [
         escape(one.session.stem),
-        f'<span class="{one.verdict.replace(" ", "-")}">{escape(one.verdict)}</span>',
+        _verdict(one, out_dir),
         "" if one.n_slices is None else f"{one.n_used} of {one.n_slices}",
         "" if one.unseen_share is None else f"{100 * one.unseen_share:.1f} %",
         _why(one, out_dir),
@@ -80,9 +80,16 @@ def _row(one: Outcome, out_dir: Path) -> str:
     return f"<tr>{''.join(f'<td class={title}>{cell}</td>' for title, cell in zip(TITLES, cells, strict=True))}</tr>"
 
 
+def _verdict(one: Outcome, out_dir: Path) -> str:
+    """The word, leading to the page of the session where there is one."""
+    word = f'<span class="{one.verdict.replace(" ", "-")}">{escape(one.verdict)}</span>'
+    report = figure_path(one.session, out_dir, REPORT)
+    return f'<a href="{_link(report, out_dir)}">{word}</a>' if report.is_file() else word
+
+
 def _why(one: Outcome, out_dir: Path) -> str:
-    """Warnings or the reason; beside a reason a link to what the run said."""
-    words = escape("; ".join(one.warnings) or one.reason or "")
+    """The reasons; beside those of a failure a link to what the run said."""
+    words = escape("; ".join(one.reasons))
     log = log_path(one.session, out_dir)
     if one.verdict != FAILED or not log.is_file():
         return words

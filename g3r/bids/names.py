@@ -24,11 +24,6 @@ class BidsName:
     words: tuple[str, ...]
 
     @property
-    def suffix(self) -> str:
-        """What kind of file it is, such as T2w."""
-        return self.words[-1]
-
-    @property
     def scan(self) -> frozenset[tuple[str, str]]:
         """The entities that a scan and what was made of it share; run-01 is run-1."""
         return frozenset(

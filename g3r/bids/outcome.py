@@ -13,7 +13,8 @@ from g3r.errors import InputError
 from g3r.run.atomic_file import write_text
 
 FAILED, NOT_RUN = "failed", "not run"
-DO_NOT_USE, CHECK, TRUSTED = "do not use", "check", "trusted"
+DO_NOT_USE, CHECK, USE = "do not use", "check", "use"
+"""Words of the verdict in run.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,12 +23,12 @@ class Outcome:
 
     Attributes:
         session: of the data set.
-        verdict: one of the words above.
+        verdict: that of run.json, "failed" or "not run".
         seconds: of the run.
-        n_stacks, n_slices, n_used: stacks, slices in them, and slices of at least half the full weight.
+        n_stacks, n_slices, n_used: stacks in the volume, slices of all stacks, and slices of at least half the full
+            weight.
         unseen_share: of the brain.
-        warnings: of the run.
-        reason: why it failed.
+        reasons: of the verdict; why it failed.
     """
 
     session: Session
@@ -37,8 +38,7 @@ class Outcome:
     n_slices: int | None = None
     n_used: int | None = None
     unseen_share: float | None = None
-    warnings: tuple[str, ...] = ()
-    reason: str | None = None
+    reasons: tuple[str, ...] = ()
 
 
 def log_path(session: Session, out_dir: Path) -> Path:
@@ -80,35 +80,29 @@ def outcome_of(session: Session, out_dir: Path) -> Outcome:
         if failure.exists():
             said = read_object(failure)
             return Outcome(
-                session=session, verdict=FAILED, seconds=said.get("seconds"), reason=str(said.get("reason", ""))
+                session=session, verdict=FAILED, seconds=said.get("seconds"), reasons=(str(said.get("reason", "")),)
             )
         if record.exists():
-            return _of_record(session, read_object(record))
+            return _of_record(session, read_object(record), record.name)
     except (InputError, AttributeError, TypeError) as error:  # somebody changed the file
-        return Outcome(session=session, verdict=FAILED, reason=f"{error}; run it again with --force")
+        return Outcome(session=session, verdict=FAILED, reasons=(f"{error}; run it again with --force",))
     return Outcome(session=session, verdict=NOT_RUN)
 
 
-def _of_record(session: Session, record: dict[str, Any]) -> Outcome:
+def _of_record(session: Session, record: dict[str, Any], name: str) -> Outcome:
     stacks = record.get("stacks") or []
     n_slices = sum(one.get("n_slices", 0) for one in stacks)
     unseen = record.get("unseen") or {}
+    verdict = record.get("verdict")
+    if verdict not in (DO_NOT_USE, CHECK, USE):
+        raise InputError(f"{name}: holds no verdict; an earlier version of g3r wrote it")
     return Outcome(
         session=session,
-        verdict=_verdict(record),
+        verdict=verdict,
         seconds=round(sum((record.get("seconds") or {}).values()), 1),
-        n_stacks=len(stacks),
+        n_stacks=sum(not (one.get("quality") or {}).get("left_out") for one in stacks),
         n_slices=n_slices,
         n_used=n_slices - sum(one.get("n_downweighted_slices", 0) for one in stacks),
         unseen_share=unseen.get("share"),
-        warnings=tuple(map(str, record.get("warnings") or [])),
+        reasons=tuple(map(str, record.get("reasons") or [])),
     )
-
-
-def _verdict(record: dict[str, Any]) -> str:
-    """In words: unreliable poses or too much unseen brain, anything to look at, or nothing."""
-    reliable = (record.get("registration") or {}).get("reliable")
-    if reliable is False or not (record.get("unseen") or {}).get("usable", True):
-        return DO_NOT_USE
-    found_masks = any(one.get("mask_from") != "file" for one in record.get("stacks") or [])
-    return TRUSTED if reliable and not record.get("warnings") and not found_masks else CHECK

@@ -25,7 +25,7 @@ MINUTES = 120
 CORES = 2
 """Of each session, unless `cpus_per_task` or --threads says otherwise."""
 
-TIME = re.compile(r"(?:(?P<days>\d+)-)?(?:(?P<hours>\d+):)?(?P<minutes>\d+)(?::\d\d)?")
+TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<clock>\d+(?::\d+){0,2})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +66,15 @@ def parsed_request(text: str) -> SlurmRequest:
 
 
 def _minutes(text: str) -> int:
-    """Minutes in Slurm's ways of saying a time: 90, 90:00, 1:30:00, 1-12:30.
+    """Minutes in Slurm's ways of saying a time: 90, 90:00, 1:30:00; behind days hours come first: 1-12, 1-12:30.
 
     Raises:
         ValueError: it is no time.
     """
     found = TIME.fullmatch(text)
-    parts = text.split("-")[-1].split(":")
-    if not found or not any(part.strip("0") for part in re.findall(r"\d+", text)):
-        raise ValueError(f"time={text}; expected minutes, or HOURS:MINUTES:SECONDS")
-    days, hours, minutes = (int(found[name] or 0) for name in ("days", "hours", "minutes"))
-    if not found["days"] and len(parts) == 2:  # MINUTES:SECONDS
-        hours, minutes = 0, int(parts[0])
-    return max(1, days * 1440 + hours * 60 + minutes)
+    if not found or not any(map(int, re.findall(r"\d+", text))):
+        raise ValueError(f"time={text}; expected minutes, HOURS:MINUTES:SECONDS, or DAYS-HOURS")
+    clock = [int(part) for part in found["clock"].split(":")]
+    hours_first = found["days"] is not None or len(clock) == 3
+    hours, minutes = (*clock, 0)[:2] if hours_first else (0, clock[0])
+    return max(1, int(found["days"] or 0) * 1440 + hours * 60 + minutes)

@@ -14,15 +14,13 @@ TABLE, DICTIONARY = "participants_g3r.tsv", "participants_g3r.json"
 COLUMNS = {
     "participant_id": "participant",
     "session_id": "session; n/a where the data set has none",
-    "verdict": "trusted; check (look at the figures: one stack alone, a warning, or masks that were found); do not use "
-    "(unreliable poses, or too much of the brain unseen); failed; not run",
+    "verdict": "use, check (look at the figures) or do not use, as in run.json and on the terminal; failed; not run",
     "seconds": "of the run",
-    "stacks": "stacks that were used",
+    "stacks": "stacks in the volume, without those that were left out",
     "slices_used": "slices of at least half the full weight",
     "slices": "slices that show the brain",
     "unseen_share": "share of the brain that no slice saw, 0 to 1",
-    "warnings": "of the run",
-    "reason": "why it failed",
+    "reasons": "of the verdict, or why it failed",
 }
 
 
@@ -50,7 +48,6 @@ def _row(one: Outcome) -> list[str]:
         one.n_used,
         one.n_slices,
         None if one.unseen_share is None else round(one.unseen_share, 4),
-        "; ".join(one.warnings),
-        one.reason,
+        "; ".join(one.reasons),
     ]
     return [" ".join(str(cell).split()) if cell not in (None, "") else "n/a" for cell in cells]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit code where a session failed; the others are done."""
 
-OURS = ("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard")
+OURS = (
+    *("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard"),
+    *("dicom_out", "dicom_reference"),  # one examination for all would put every volume under one patient's name
+)
 """Options of g3r-infer that this command decides itself, or that make no sense for many."""
 
 
@@ -86,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     stop_request = StopRequest()
     try:
         with stop_request:
-            return _run(options, infer, tuple(words[cut + 1 :]), _command(options, words))
+            return _run(options, infer, tuple(words[cut + 1 :]), _command(words))
     except KeyboardInterrupt:
         return _said("interrupted; what was done stays, and the same command goes on", stop_request.exit_code)
     except ModuleNotFoundError as error:
@@ -115,10 +119,18 @@ def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> arg
     return infer
 
 
-def _command(options: argparse.Namespace, words: Sequence[str]) -> str:
-    """The command line with names of folders alone."""
-    folders = {str(path): path.resolve().name for path in (options.bids_dir, options.out_dir)}
-    return shlex.join(["g3r-bids", *(folders.get(word, word) for word in words)])
+def _command(words: Sequence[str]) -> str:
+    """The command line with names of files and folders alone: it stays in a data set that is passed on."""
+    return shlex.join(["g3r-bids", *map(_without_folders, words)])
+
+
+def _without_folders(word: str) -> str:
+    """A word, or the value in --option=value, without the folders that a path names."""
+    option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    separators = [one for one in (os.sep, os.altsep) if one]
+    if value in (os.curdir, os.pardir) or any(one in value for one in separators):
+        value = os.path.basename(os.path.abspath(value)) or os.sep  # abspath: of data/ and of . the name, too
+    return option + equals + value
 
 
 def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tuple[str, ...], command: str) -> int:

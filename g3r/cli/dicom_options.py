@@ -146,8 +146,8 @@ def _chosen(options: argparse.Namespace) -> tuple[list[Judged], list[str]]:
     from g3r.dicom.series import grouped
     from g3r.dicom.table import table_of
 
-    images, n_damaged = read_images(options.dicom)
-    verdicts = judged(grouped(images), options.series)
+    found = read_images(options.dicom)
+    verdicts = judged(grouped(found.images), options.series)
     taken = [one for one in verdicts if one.is_taken]
     print(table_of(verdicts, descriptions=sys.stdout.isatty()), flush=True)
     if not taken:
@@ -158,8 +158,12 @@ def _chosen(options: argparse.Namespace) -> tuple[list[Judged], list[str]]:
     if options.series:
         taken.sort(key=lambda one: options.series.index(one.series.label))
     warnings = [f"{one.series.name}: left out, {one.reason}" for one in verdicts if one.is_broken]
-    if n_damaged:
-        warnings.append(f"--dicom: {n_damaged} damaged DICOM files are left out; copy the folder again")
+    if found.n_damaged:
+        warnings.append(f"--dicom: {found.n_damaged} damaged DICOM files are left out; copy the folder again")
+    if found.n_unreadable:
+        warnings.append(
+            f"--dicom: {found.n_unreadable} files and folders cannot be read and are left out; check their permissions"
+        )
     if len({image.frame_uid for one in taken for image in one.series.images}) > 1:
         warnings.append("--dicom: the series have several frames of reference; their places may not agree")
     return taken, warnings
@@ -184,7 +188,7 @@ def _check_dicom_out(options: argparse.Namespace) -> None:
 
 def _refuse_dicom(options: argparse.Namespace) -> None:
     """Raise `InputError` for DICOM among the stacks, with the line that works."""
-    from g3r.dicom.headers import holds_dicom, is_dicom
+    from g3r.dicom.files import holds_dicom, is_dicom
 
     for path in options.stacks:
         is_folder = os.path.isdir(path)

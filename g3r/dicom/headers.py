@@ -5,31 +5,24 @@ from __future__ import annotations
 import logging
 import math
 import os
-import stat
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g3r.dicom.files import dicom_files
 from g3r.errors import InputError
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-PREAMBLE_BYTES, MAGIC = 128, b"DICM"
-"""A DICOM file says what it is behind a preamble of this length."""
-
 FARTHEST_MM = 1e5
 """From the middle of the scanner."""
-
-LOOKED_AT = 1000
-"""Files that are looked at to see what a folder holds."""
 
 TEXTS = {
     "sop_class_uid": "SOPClassUID",
@@ -113,32 +106,23 @@ class ImageHeader:
     scanning_sequence: tuple[str, ...]
 
 
-def is_dicom(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is DICOM by its first bytes."""
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
-            return False
-        with open(path, "rb") as stream:
-            return stream.read(PREAMBLE_BYTES + len(MAGIC))[PREAMBLE_BYTES:] == MAGIC
-    except (OSError, ValueError):
-        return False
+@dataclass(frozen=True)
+class FoundImages:
+    """What is below a folder.
+
+    Attributes:
+        images: each once.
+        n_damaged: DICOM files that are left out, because their headers cannot be read.
+        n_unreadable: files and folders that the system does not let be read: nobody knows what they are.
+    """
+
+    images: list[ImageHeader]
+    n_damaged: int
+    n_unreadable: int
 
 
-def dicom_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """The DICOM files below a folder, in the order of their paths."""
-    for parent, folders, names in os.walk(folder):
-        folders.sort()
-        yield from (Path(parent, name) for name in sorted(names) if is_dicom(Path(parent, name)))
-
-
-def holds_dicom(folder: str | os.PathLike[str]) -> bool:
-    """Whether there is DICOM among the first files below a folder, which may be the whole disk."""
-    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
-    return any(map(is_dicom, islice(paths, LOOKED_AT)))
-
-
-def read_images(folder: str | os.PathLike[str]) -> tuple[list[ImageHeader], int]:
-    """The images below a folder, each once, and the number of DICOM files that cannot be read.
+def read_images(folder: str | os.PathLike[str]) -> FoundImages:
+    """The images below a folder, and how much could not be read.
 
     Files without pixels (DICOMDIR, reports) are left out.
 
@@ -149,8 +133,9 @@ def read_images(folder: str | os.PathLike[str]) -> tuple[list[ImageHeader], int]
         found = "is a file" if Path(folder).exists() else "does not exist"
         raise InputError(f"{folder}: {found}; expected a folder of DICOM images, pass it to --dicom")
     images: dict[str, ImageHeader] = {}
+    unreadable: list[OSError] = []
     n_damaged = 0
-    for path in dicom_files(folder):
+    for path in dicom_files(folder, unreadable):
         try:
             image = read_header(path)
         except ModuleNotFoundError:
@@ -163,9 +148,13 @@ def read_images(folder: str | os.PathLike[str]) -> tuple[list[ImageHeader], int]
         elif not image.sop_class_uid or image.sop_class_uid.startswith(MR_CLASSES):
             n_damaged += 1
     if not images:
-        damaged = f", {n_damaged} DICOM files that cannot be read" if n_damaged else ""
-        raise InputError(f"{folder}: holds no DICOM image{damaged}; expected the folder that the scanner exported")
-    return list(images.values()), n_damaged
+        damaged = f", {n_damaged} damaged DICOM files" if n_damaged else ""
+        closed = f", {len(unreadable)} files and folders that cannot be read" if unreadable else ""
+        hint = "; check their permissions" if closed else ""
+        raise InputError(
+            f"{folder}: holds no DICOM image{damaged}{closed}; expected the folder that the scanner exported{hint}"
+        )
+    return FoundImages(list(images.values()), n_damaged, len(unreadable))
 
 
 def read_header(path: Path) -> ImageHeader:

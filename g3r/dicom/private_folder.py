@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
+from g3r.run.process_mark import is_left_over, process_mark
 
 PREFIX = "g3r-dicom-"
 
@@ -18,19 +17,22 @@ PREFIX = "g3r-dicom-"
 def private_folder() -> Iterator[Path]:
     """A new folder below the system's for temporary files (TMPDIR).
 
-    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run removes it.
+    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run on the same machine removes
+    it.
 
     Raises:
         OSError: it cannot be made.
     """
     _remove_leftovers(Path(tempfile.gettempdir()))
-    with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{process_mark()}-", ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove the folders of processes that ended without doing so; other users' cannot be removed, and stay."""
+    """Remove the folders of processes that ended without doing so.
+
+    Other users' cannot be removed, and stay; so do those of other machines and containers, which may be running.
+    """
     for folder in parent.glob(f"{PREFIX}*"):
-        process = folder.name[len(PREFIX) :].split("-")[0]
-        if process.isdigit() and not psutil.pid_exists(int(process)) and not folder.is_symlink():
+        if is_left_over(folder.name.removeprefix(PREFIX)) and not folder.is_symlink():
             shutil.rmtree(folder, ignore_errors=True)

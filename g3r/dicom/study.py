@@ -114,5 +114,5 @@ def read_study(folder: str | os.PathLike[str]) -> SourceStudy:
     Raises:
         InputError: as `read_images` and `study_of`.
     """
-    images, _ = read_images(Path(folder))
+    images = read_images(Path(folder)).images
     return study_of([image for image in images if image.modality == "MR"] or images, folder)

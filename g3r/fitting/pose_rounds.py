@@ -194,11 +194,12 @@ def _registered_to_fit(
     model = SamplingModel(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
     gain: NDArray[np.float64] = fit.gain
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
-    weight = slice_weights(model.losses(slices.planes, gain, width), gain, slices.n_stacks)
+    at_start = model.evaluate(slices.planes, gain, width)
+    weight = slice_weights(at_start.loss, gain, slices.n_stacks)
     # the slices of a single stack have no others to be found in
     n_found = 0
     if slices.n_stacks > 1:
-        slices, n_found = find_strays(slices, gain, weight, registration.ncc, rng)
+        slices, n_found = find_strays(slices, gain, weight, at_start.ncc, rng)
     slices, n_moved = try_neighbours(model, slices, gain, width=width)
     slices, gain, at_end = register_slices(model, slices, gain, n_steps=n_steps, width=width)
     moved = replace(

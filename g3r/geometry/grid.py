@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -61,6 +62,18 @@ class VolumeGrid:
         affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
         affine[:3, 3] = (low + high) / 2 - (shape - 1) / 2 * spacing_mm
         return cls((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+    @classmethod
+    def centred(cls, shape: Sequence[int], spacing_mm: float) -> VolumeGrid:
+        """The axis-aligned RAS grid with cubic voxels whose middle is the origin.
+
+        Args:
+            shape: [3] voxels along the axes.
+            spacing_mm: edge of the voxels.
+        """
+        affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
+        affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing_mm
+        return cls((shape[0], shape[1], shape[2]), affine)
 
     def respaced(self, spacing_mm: float) -> VolumeGrid:
         """The axis-aligned grid of cubic voxels of another size over the same box; this one if its voxels have it."""

@@ -31,12 +31,10 @@ def cleaned(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) -> NDArra
         mask: [I, J, K].
         spacing_mm: [3].
     """
-    index = np.argwhere(mask)
-    if not len(index):
+    if not mask.any():
         return mask
     reach = np.maximum(np.round(JOIN_MM / 2 / spacing_mm[:2]).astype(int), 1)
-    low, high = index.min(0), index.max(0) + 1
-    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    part = bounding_box(mask)
     result = np.zeros_like(mask)
     result[part] = _joined(mask[part], reach)
     return result

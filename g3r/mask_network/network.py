@@ -92,7 +92,8 @@ def normalised(image: Tensor) -> Tensor:
     """Images [B, 1, I, J, K] in units of their bright quantile: between 0 and about 1, a little more where brighter."""
     flat = image.flatten(1).float()
     rank = max(1, int(BRIGHT_SHARE * flat.shape[1]))
-    bright = flat.kthvalue(rank, dim=1).values.clamp_min(1e-6)
+    # images come in any units; a black one stays black
+    bright = flat.kthvalue(rank, dim=1).values.clamp_min(torch.finfo(torch.float32).tiny)
     scaled = image.float() / bright[:, None, None, None, None]
     return scaled.clamp(0.0, 2.0)
 

@@ -176,11 +176,14 @@ class RunRecord:
         loss: by stage, figures of each step.
         unseen: the part of the brain that no slice saw.
         uncertainty: what `uncertainty.nii.gz` means; None where the run was interrupted.
+        verdict, reasons: of the report: whether the volume may be used, and why; None where nobody has judged it.
         resumed: stages that were taken from an earlier run.
         partial: whether the run was interrupted, at `stopped_at`.
     """
 
     g3r: str = __version__
+    verdict: str | None = None
+    reasons: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=versions)
     settings: ReconstructionSettings
     inputs: Inputs | None = None

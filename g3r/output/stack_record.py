@@ -34,6 +34,7 @@ class StackRecord:
         mask_from, mask_detail: who made the mask, and with what.
         mask_ml: what is marked.
         left_out_share: of what the image shows, see `acquisition.mask_extent`.
+        remarks: what is doubtful in its files.
         quality, interleave, n_segments: None where the stack had no slices.
         standard_from_scanner: [4, 4] robust mean motion (RAS, mm) of its slices, from where its header puts them; None
             in scanner space, and where the stack had no slices.
@@ -50,6 +51,7 @@ class StackRecord:
     mask_detail: str = ""
     mask_ml: float = 0.0
     left_out_share: float = 0.0
+    remarks: list[str] = field(default_factory=list)
     n_slices: int = 0
     quality: StackQuality | None = None
     interleave: int | None = None
@@ -112,6 +114,7 @@ def stack_records(
             mask_detail=stack.mask_detail,
             mask_ml=round(float(stack.mask.sum()) * stack.grid.voxel_volume_mm3 / 1000, 1),
             left_out_share=round(left_out_share(stack), 3),
+            remarks=list(stack.remarks),
             n_slices=int((stack_id == n).sum()),
             quality=qualities[n],
             interleave=registration.interleave[place[n]] if n in place else None,

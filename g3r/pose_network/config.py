@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from g3r.geometry import VolumeGrid
 
 MAX_SHAPE, MAX_SPACING_MM = 1024, 100.0
@@ -27,7 +25,8 @@ class PoseNetworkConfig:
         width: of a token; a multiple of `n_heads`.
         n_blocks: transformer blocks per step.
         n_heads: attention heads.
-        n_refinements: refinements, all with the same weights.
+        n_refinements: refinements, all with the same weights, where a call does not say how many. Training draws them,
+            and `poses_of` makes `N_REFINEMENTS`.
 
     Raises:
         ValueError: a value out of range.
@@ -56,10 +55,7 @@ class PoseNetworkConfig:
     @property
     def template_grid(self) -> VolumeGrid:
         """The template's grid, centred on the origin of the atlas frame."""
-        shape, spacing = self.template_shape[1:], self.template_spacing_mm
-        affine = np.diag([spacing, spacing, spacing, 1.0])
-        affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing
-        return VolumeGrid((shape[0], shape[1], shape[2]), affine)
+        return VolumeGrid.centred(self.template_shape[1:], self.template_spacing_mm)
 
     def min_values(self) -> float:
         """A lower bound on the number of the network's weights: template, token layers, units and blocks."""

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 from g3r.acquisition.slice_images import SliceImages
 from g3r.geometry import RigidPose
-from g3r.geometry.rigid import fit_rigid, orthonormal
+from g3r.geometry.rigid import orthonormal
 from g3r.pose_network.network import PoseNetwork, SliceBatch
 
-SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0], [25, 25, 0]], dtype=float)
-"""Points of a slice over which a pose error is averaged."""
 N_REFINEMENTS = 2
 VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
 """Rotations by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
@@ -23,8 +21,6 @@ VIEW_SCALE_MM = 3.0
 """Views further than this from the mean count less in it, in proportion."""
 ROTATION_ARM_MM = 25.0
 """Distance from a slice's centre at which a rotation is measured in mm."""
-ROBUST_SCALE_MM = 3.0
-"""Slices further than this from their stack's common motion count less in it, in proportion."""
 ROBUST_STEPS = 12
 
 
@@ -75,42 +71,3 @@ def slice_batch(sets: Sequence[SliceImages]) -> SliceBatch:
 def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:
     """A network's float32 motions as exact ones."""
     return RigidPose(orthonormal(rotation.double().cpu().numpy()), translation_mm.double().cpu().numpy())
-
-
-def stack_motions(atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]) -> RigidPose:
-    """One motion per stack, atlas frame from world, that most of its slices agree with.
-
-    The start is the slice whose own motion suits the others best in the median, so that a minority of
-    slices that are upside down has no effect; then weighted least squares with weights 1 / distance.
-
-    Args:
-        atlas_from_slice: predicted poses [K].
-        world_from_slice: the headers' poses [K] of the same frames.
-        stack_id: [K] 0, 1, ... without gaps.
-    """
-    points = np.broadcast_to(SLICE_POINTS_MM, (len(stack_id), *SLICE_POINTS_MM.shape))
-    predicted, header = atlas_from_slice.apply(points), world_from_slice.apply(points)
-    own = atlas_from_slice @ world_from_slice.inverse()
-    rotation, translation = [], []
-    for stack in range(int(stack_id.max()) + 1):
-        rows = np.flatnonzero(stack_id == stack)
-        source, target = header[rows], predicted[rows]
-        candidates = own.take(rows)
-        moved = candidates.apply(np.broadcast_to(source.reshape(-1, 3), (len(rows), source[..., 0].size, 3)))
-        distance = np.linalg.norm(moved - target.reshape(-1, 3), axis=-1).reshape(len(rows), len(rows), -1)
-        best = int(np.median(distance.mean(-1), axis=1).argmin())
-        motion = candidates.take([best])
-        for _ in range(ROBUST_STEPS):
-            off = np.linalg.norm(motion.apply(source.reshape(1, -1, 3))[0] - target.reshape(-1, 3), axis=-1)
-            weight = 1 / np.maximum(off.reshape(len(rows), -1).mean(1), ROBUST_SCALE_MM)
-            motion = fit_rigid(source.reshape(-1, 3), target.reshape(-1, 3), np.repeat(weight, len(SLICE_POINTS_MM)))
-        rotation.append(motion.rotation[0])
-        translation.append(motion.translation_mm[0])
-    return RigidPose(np.array(rotation), np.array(translation))
-
-
-def pose_errors(predicted: RigidPose, true: RigidPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean distance (mm) of five slice points, and angle (degrees), of each of K poses."""
-    points = np.broadcast_to(SLICE_POINTS_MM, (len(true), *SLICE_POINTS_MM.shape))
-    distance_mm = np.linalg.norm(predicted.apply(points) - true.apply(points), axis=-1).mean(1)
-    return distance_mm, np.rad2deg(np.linalg.norm((predicted.inverse() @ true).rotvec_rad(), axis=1))

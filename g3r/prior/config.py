@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from g3r.geometry import VolumeGrid
 
 MAX_LEVELS = 16
@@ -76,10 +74,7 @@ class PriorNetworkConfig:
     @property
     def template_grid(self) -> VolumeGrid:
         """The template's grid, centred on the origin of the atlas frame."""
-        shape, spacing = self.template_shape[1:], self.template_spacing_mm
-        affine = np.diag([spacing, spacing, spacing, 1.0])
-        affine[:3, 3] = -(np.array(shape) - 1) / 2 * spacing
-        return VolumeGrid((shape[0], shape[1], shape[2]), affine)
+        return VolumeGrid.centred(self.template_shape[1:], self.template_spacing_mm)
 
     @property
     def stride(self) -> int:

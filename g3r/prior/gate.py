@@ -38,7 +38,7 @@ class DensityGate(nn.Module):
 
     Numerics: exp(-M) and expm1(-M) are bounded for every M >= 0, so the value and its gradient
         (alpha - beta) exp(-M) are finite for M = 0, 1e-30 and 1e6. M must not be negative: that is a
-        precondition, kept by `acquisition.scatter`, not checked per voxel here.
+        precondition, kept by `acquisition.coarse_volume`, not checked per voxel here.
     """
 
     def __init__(self, alpha: float = 0.05, beta: float = 1.0) -> None:

@@ -39,7 +39,7 @@ def estimate_prior(
     Numerics: tiles begin at multiples of the network's stride, so a tile sees the same sub-sampled grid as
         the whole volume, and no layer has statistics of its own. The error comes from what is beyond the halo:
         none but rounding for a halo of the receptive radius, below 1e-3 of the intensity scale for 64 voxels
-        (tests/prior/test_inference.py).
+        (tests/prior/test_prior_inference.py).
     """
     if not 1 <= n_views <= len(VIEWS):
         raise ValueError(f"{n_views} views; expected 1 to {len(VIEWS)}")

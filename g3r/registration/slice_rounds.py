@@ -18,7 +18,6 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.normal_equations import SliceModel
 from g3r.registration.settings import RegistrationSettings
-from g3r.registration.similarity import GAIN_RANGE
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
 from g3r.run.deadline import Deadline, timed_steps
@@ -32,6 +31,9 @@ MIN_ROUNDS = 3
 N_ROUNDS_IN_PLACE = 3
 """Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
 volume is made without them."""
+
+GAIN_RANGE_IN_PLACE = (0.05, 20.0)
+"""Of slices whose poses are given: wide, so that one that lost its signal is seen to have done so."""
 
 ROUNDS_AFTER_SEARCH = 3
 """Where slices were astray, the others have not found their places either: one round gave six volumes in severe motion
@@ -196,7 +198,7 @@ def fitted_in_place(
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         fit = model.evaluate(slices.planes, gain, width)
         yy, mm, ym = fit.moments[:, 3:].T
-        log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE))
+        log_gain = np.log(np.clip(ym / np.maximum(mm, 1e-12 * yy + 1e-30), *GAIN_RANGE_IN_PLACE))
         gain = np.exp(log_gain - log_gain.mean())
         fit = model.evaluate(slices.planes, gain, width)
         weight = slice_weights(fit.loss, gain, slices.n_stacks)

@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from dataclasses import replace as changed
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,12 @@ class ReportedResult(ReconstructionResult):
             if also is not None:
                 also(staged)
 
-        super().save(folder, replace=replace, run=run, also=more)
+        super(ReportedResult, self._judged()).save(folder, replace=replace, run=run, also=more)
+
+    def _judged(self) -> ReportedResult:
+        """The same with the verdict in its record."""
+        verdict = verdict_of(self.record)
+        return changed(self, record=changed(self.record, verdict=verdict.word, reasons=verdict.deciding))
 
     def _add_page(self, folder: Path) -> None:
         """Write the page; without it the volume is no worse, so its failure is told and no more."""
@@ -125,7 +131,7 @@ class ReportedResult(ReconstructionResult):
         # the page is made of the files, as everyone else has them
         with tempfile.TemporaryDirectory(prefix="g3r-report-") as folder:
             saved = Path(folder) / "result"
-            super().save(saved)
+            super(ReportedResult, self._judged()).save(saved)
             write_report(saved, self.slices, path)
 
     def _sections(self) -> tuple[tuple[str, str], ...]:

@@ -49,10 +49,14 @@ class Verdict:
         """What the word means, as a sentence."""
         return HEADLINES[self.word]
 
+    @property
+    def deciding(self) -> list[str]:
+        """The reasons of the word's weight."""
+        return [reason.text for reason in self.reasons if reason.word == self.word]
+
     def line(self) -> str:
         """The word and all reasons of its weight in one line, for the terminal."""
-        told = [reason.text for reason in self.reasons if reason.word == self.word]
-        return f"{self.word}: {'; '.join(told)}"
+        return f"{self.word}: {'; '.join(self.deciding)}"
 
 
 def verdict_of(record: RunRecord) -> Verdict:
@@ -118,6 +122,8 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
     if quality and quality.left_out:
         yield "mirrored left out" if is_mirrored(quality) else "left out", {"stack": stack.name, "why": misfit(quality)}
         return
+    for remark in stack.remarks:
+        yield "file doubtful", {"stack": stack.name, "remark": remark}
     if stack.left_out_share:
         yield "mask too small", {"stack": stack.name, "share": f"{100 * stack.left_out_share:.0f} %"}
     if quality is None:

@@ -102,6 +102,12 @@ MESSAGES = {
     "whole image": Message(
         CHECK, "no mask was used for {stacks}: the whole image was taken for brain", "Check that only brain is shown."
     ),
+    "file doubtful": Message(
+        CHECK,
+        "{stack}: {remark}",
+        "The volume follows the file as it is: compare sides and sizes with the scanner's own pictures, or export the "
+        "file again.",
+    ),
     "mask too small": Message(
         CHECK,
         "the mask of {stack} leaves out {share} of what the image shows, and nothing but a brain seems to be in it",

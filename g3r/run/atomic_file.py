@@ -6,8 +6,9 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
-import psutil
+from g3r.run.process_mark import is_left_over, process_mark
 
 
 @contextmanager
@@ -23,8 +24,9 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
         OSError: the file cannot be written or renamed.
     """
     path = Path(path)
-    # hidden, of this process, and with the whole name at the end: writers choose the format by the suffix
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    # Hidden, and with the whole name at the end: writers choose the format by the suffix. At random, because two
+    # containers on one file system may both be process 1; made by the writer, so that its umask holds.
+    temporary = path.with_name(f".{process_mark()}-{uuid4().hex[:8]}.{path.name}")
     try:
         yield temporary
         if durable:
@@ -46,15 +48,14 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def remove_leftovers(folder: Path, suffix: str) -> None:
-    """Remove the temporary files of `atomic_path` in a folder whose process was killed.
+    """Remove the temporary files of `atomic_path` in a folder whose process was killed, here and not elsewhere.
 
     Args:
         folder: to look in.
         suffix: of the files that were being written; others are left alone.
     """
     for temporary in folder.glob(f".*{suffix}"):
-        process = temporary.name.split(".")[1]
-        if process.isdigit() and not psutil.pid_exists(int(process)):
+        if is_left_over(temporary.name.split(".")[1]):
             temporary.unlink(missing_ok=True)
 
 

@@ -1,7 +1,7 @@
 """Training of the pose network."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from torch import Tensor
 
 from g3r.checkpoints.trained_model import TRAINING_ENTRY
 from g3r.errors import InputError
-from g3r.geometry import RigidPose
 from g3r.pose_network.config import PoseNetworkConfig
-from g3r.pose_network.geometry import moved_points, pixel_points_mm, rotation_from_vector, sample_rows
-from g3r.pose_network.inference import SLICE_POINTS_MM, as_pose, pose_errors, poses_of, stack_motions
+from g3r.pose_network.geometry import moved_points, rotation_from_vector
+from g3r.pose_network.inference import as_pose, poses_of
 from g3r.pose_network.model import PoseModel
 from g3r.pose_network.network import PoseNetwork, PoseStep
 from g3r.training.annealed_module import AnnealedModule
+from g3r.training.pose_scores import SLICE_POINTS_MM, panel, scores_of, summary
 
 logger = logging.getLogger(__name__)
 
@@ -37,8 +37,6 @@ STACK_ROTATION_RAD, STACK_TRANSLATION_MM = 0.3, 6.0
 SLICE_ROTATION_RAD, SLICE_TRANSLATION_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
 """Weight of the votes' squared error (0 to 3, no unit) relative to the distances."""
-N_PANEL_SLICES = 12
-RIGHT_WITHIN_DEG = 20.0
 
 
 class PoseModule(AnnealedModule):
@@ -153,7 +151,7 @@ class PoseModule(AnnealedModule):
             if not np.allclose(template.affine, self.network.config.template_grid.affine, atol=1e-3):
                 raise InputError(
                     f"data: the template is not on a grid of {config.template_spacing_mm:g} mm about the origin; "
-                    "pass --model.network.config.template_spacing_mm"
+                    "pass --model.network.template_spacing_mm"
                 )
             self.weeks = [float(week) for week in template.weeks]
 
@@ -171,6 +169,8 @@ class PoseModule(AnnealedModule):
             taken = {name.removeprefix("network."): value for name, value in state.items()}
             taken = {name: v for name, v in taken.items() if name in own and v.shape == own[name].shape}
             fresh = sorted(own.keys() - taken.keys() - {"template"})
+            if len(fresh) == len(own) - 1:
+                raise ValueError("no array of it fits")
             if fresh:
                 logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
             self.network.load_state_dict({**own, **taken, "template": own["template"]})
@@ -227,66 +227,3 @@ def vote_loss(step: PoseStep, batch: Batch) -> Tensor:
     weight = (batch["area_mm2"] / FULL_AREA_MM2).clamp(0.1, 1.0)
     squared = (step.vote - batch["true_rotation"]).square().sum((1, 2))
     return (weight * squared).mean() / weight.mean()
-
-
-def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.ndarray]:
-    """Errors (mm, degrees) of one head's slices after the first and the last step, and of its stacks.
-
-    Args:
-        first: [S] poses after the first step.
-        last: [S] poses after the last step.
-        batch: of this one head; see `PoseDataModule`.
-
-    Returns:
-        [S] or [T] errors by name, for S slices in T stacks.
-    """
-    true = as_pose(batch["true_rotation"], batch["true_translation_mm"])
-    stack = batch["stack"].cpu().numpy()
-    rotation = batch["header_rotation"].double().cpu().numpy()
-    header = as_pose(
-        batch["header_rotation"],
-        torch.from_numpy(rotation[:, :, 2] * batch["position_mm"].double().cpu().numpy()[:, None]),
-    )
-    fitted, ideal = stack_motions(last, header, stack), stack_motions(true, header, stack)
-    middle = RigidPose(rotation[np.unique(stack, return_index=True)[1]], np.zeros((stack.max() + 1, 3)))
-    slice_mm, slice_deg = pose_errors(last, true)
-    stack_mm, stack_deg = pose_errors(fitted @ middle, ideal @ middle)
-    return {
-        "slice_mm": slice_mm,
-        "slice_deg": slice_deg,
-        "slice_mm_first": pose_errors(first, true)[0],
-        "stack_mm": stack_mm,
-        "stack_deg": stack_deg,
-    }
-
-
-def summary(scores: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Medians over all heads, and of slices and stacks for each number of stacks."""
-    result = {name: float(np.median(np.concatenate([s[name] for s in scores]))) for name in scores[0]}
-    angles = np.concatenate([s["stack_deg"] for s in scores])
-    result["stacks_within_20deg"] = float((angles <= RIGHT_WITHIN_DEG).mean())
-    for n_stacks in sorted({len(s["stack_deg"]) for s in scores}):
-        some = [s for s in scores if len(s["stack_deg"]) == n_stacks]
-        for name in ("slice_mm", "slice_deg", "stack_mm", "stack_deg"):
-            result[f"{name}_{n_stacks}"] = float(np.median(np.concatenate([s[name] for s in some])))
-    return result
-
-
-def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
-    """Picture of slices of the first head above the atlas template at their poses.
-
-    Args:
-        pose: rotations [S, 3, 3] and translations [S, 3] in mm.
-        batch: that holds the slices.
-        network: that holds the template.
-
-    Returns:
-        [H, W] in [0, 1].
-    """
-    rows = torch.linspace(0, len(batch["image"]) - 1, N_PANEL_SLICES).round().long().unique()
-    image = batch["image"][rows, 0].float().cpu()
-    points = pixel_points_mm(network.config.image_size, network.config.pixel_mm, pose[0])
-    where = moved_points(pose[0][rows], pose[1][rows], points)
-    heads = sample_rows(network.template, where, network.config.template_spacing_mm)
-    shown = heads[..., heads.shape[-1] // 2].reshape(image.shape).float().cpu()
-    return torch.cat([torch.cat(list(image), 1), torch.cat(list(shown), 1)], 0).clamp(0.0, 1.0)

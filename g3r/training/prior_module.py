@@ -93,7 +93,6 @@ class PriorModule(AnnealedModule):
         self.background_weight = background_weight
         self.augment_orientation = augment_orientation
         self.voxel_mm = voxel_mm
-        self._scores = ValidationScores()
         self._panels: dict[int, Tensor] = {}
         self.weeks = [0.0] * network.template_shape[0]
 
@@ -123,7 +122,8 @@ class PriorModule(AnnealedModule):
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last epoch's scores and images."""
-        self._scores, self._panels = ValidationScores(), {}
+        assert self.voxel_mm is not None  # set with the data
+        self._scores, self._panels = ValidationScores(self.voxel_mm), {}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the prior of every sample in its mask, and V_sharp and V_coarse for comparison."""

@@ -23,15 +23,19 @@ PANEL_TAG = "coarse, sharp, template, confidence, gate, prior, truth, 4 x error"
 CONFIDENCE_BINS = {"unseen": 0.05, "hardly_seen": 0.3, "thinly_seen": 0.6, "seen": np.inf}
 """Bins of the confidence c by name, with their upper ends."""
 RIM_MM = 3.0
-ASSUMED_VOXEL_MM = 0.8
 PLACES = ("rim", "deep")
 """The outermost `RIM_MM` of the brain, and the rest."""
 
 
 class ValidationScores:
-    """Sums and numbers of the scores of one epoch; row 0 is over all volumes, row n over those of n stacks."""
+    """Sums and numbers of the scores of one epoch; row 0 is over all volumes, row n over those of n stacks.
 
-    def __init__(self) -> None:
+    Args:
+        voxel_mm: of the volumes.
+    """
+
+    def __init__(self, voxel_mm: float) -> None:
+        self.voxel_mm = voxel_mm
         self.sums = torch.zeros(MAX_STACKS + 1, len(VALIDATED), len(METRICS), 2, dtype=torch.float64)
         self.squares = torch.zeros(len(CONFIDENCE_BINS), len(PLACES), len(VALIDATED), 2, dtype=torch.float64)
 
@@ -52,7 +56,7 @@ class ValidationScores:
                             self.sums[row, v, m] += torch.tensor([found[metric], 1.0], dtype=torch.float64)
                 squared = (volumes[name][b, 0] - batch["truth"][b, 0]).double().cpu() ** 2
                 for k, bins in enumerate(confidence_bins(batch["density"][b, 0].cpu())):
-                    for p, place in enumerate(_places(batch["mask"][b, 0])):
+                    for p, place in enumerate(_places(batch["mask"][b, 0], self.voxel_mm)):
                         chosen = squared[bins & place]
                         self.squares[k, p, v] += torch.tensor([float(chosen.sum()), len(chosen)], dtype=torch.float64)
 
@@ -97,10 +101,10 @@ def psnr_by_bin(squares: Tensor) -> dict[str, float]:
     return {name: 10 * math.log10(count / total) for name, (total, count) in bins if count and total > 0}
 
 
-def _places(mask: Tensor) -> list[Tensor]:
-    """Masks of the rim and of the rest of a brain [I, J, K], whose voxels are taken to be of `ASSUMED_VOXEL_MM`."""
+def _places(mask: Tensor, voxel_mm: float) -> list[Tensor]:
+    """Masks of the rim and of the rest of a brain [I, J, K]."""
     inside = (mask > 0.5).cpu().numpy()
-    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1, 1:-1] * ASSUMED_VOXEL_MM
+    depth = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1, 1:-1] * voxel_mm
     return [torch.from_numpy(inside & (depth <= RIM_MM)), torch.from_numpy(inside & (depth > RIM_MM))]
 
 

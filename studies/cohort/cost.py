@@ -19,7 +19,7 @@ from g3r.bench.record import machine_line
 from g3r.bids.dataset import Session
 from g3r.bids.derivative import SECTIONS, THUMBNAIL, figure_path
 from g3r.bids.index_page import PAGE, write_index
-from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, TRUSTED, Outcome
+from g3r.bids.outcome import CHECK, DO_NOT_USE, FAILED, USE, Outcome
 from g3r.bids.table import TABLE, write_table
 from g3r.errors import InputError
 from studies.harness import Record, Row, Study, Task, positive
@@ -85,7 +85,7 @@ def page(folder: Path, n: int) -> Row:
     """Table and page of so many sessions, one in ten with something to look at; its pictures are empty files."""
     out = folder / "page"
     shutil.rmtree(out, ignore_errors=True)
-    verdicts = [FAILED, DO_NOT_USE, CHECK, *[TRUSTED] * 27]
+    verdicts = [FAILED, DO_NOT_USE, CHECK, *[USE] * 27]
     outcomes = [_outcome(number, verdicts[number % len(verdicts)]) for number in range(n)]
     for one in outcomes:
         for end in (SECTIONS, THUMBNAIL) if one.verdict != FAILED else ():
@@ -111,11 +111,12 @@ def _session(label: str) -> Session:
 def _outcome(number: int, verdict: str) -> Outcome:
     session = _session(f"{number:04d}")
     if verdict == FAILED:
-        return Outcome(session=session, verdict=verdict, reason=f"{session.stem}_run-2_T2w.nii.gz: cannot be read " * 3)
-    warnings = () if verdict == TRUSTED else ("registration probably failed; do not rely on the volume",)
+        why = f"{session.stem}_run-2_T2w.nii.gz: cannot be read " * 3
+        return Outcome(session=session, verdict=verdict, reasons=(why,))
+    reasons = () if verdict == USE else ("registration probably failed; do not rely on the volume",)
     return Outcome(
         session=session, verdict=verdict, seconds=60.0, n_stacks=3, n_slices=100, n_used=95, unseen_share=0.01,
-        warnings=warnings
+        reasons=reasons
     )  # fmt: skip
 
 

@@ -130,7 +130,7 @@ def scores(made: Sequence[Tensor], volumes: Sequence[Mapping[str, Tensor]]) -> d
 
     from g3r.training.prior_validation import VALIDATED, ValidationScores, psnr_by_bin, validation_means
 
-    kept = ValidationScores()
+    kept = ValidationScores(voxel_mm=1.0)  # rim and depth are pooled, whatever the size
     for volume, one in zip(made, volumes, strict=True):
         inside = (one["mask"] > 0.5).to(torch.float32)
         kept.add({name: volume for name in VALIDATED}, one, inside)

@@ -21,11 +21,11 @@ class Damage:
 
     Attributes:
         apply: to its stacks; gets those of another subject and a generator, too.
-        without_truth: stacks that have no true place any more.
+        last_without_truth: whether the last stack has no true place any more.
     """
 
     apply: Callable[[Stacks, Stacks, np.random.Generator], Stacks]
-    without_truth: frozenset[int] = frozenset()
+    last_without_truth: bool = False
 
 
 def first_stacks(n: int) -> Damage:
@@ -87,7 +87,7 @@ def slices_reversed() -> Damage:
     def reversed_(stack: Stack) -> Stack:
         return replace(stack, image=stack.image[:, :, ::-1], mask=stack.mask[:, :, ::-1])
 
-    return Damage(lambda stacks, other, rng: (*stacks[:-1], reversed_(stacks[-1])), frozenset({2}))
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], reversed_(stacks[-1])), last_without_truth=True)
 
 
 def halves_swapped() -> Damage:
@@ -97,12 +97,12 @@ def halves_swapped() -> Damage:
         order = [*range(0, stack.image.shape[2], 2), *range(1, stack.image.shape[2], 2)]
         return replace(stack, image=stack.image[:, :, order], mask=stack.mask[:, :, order])
 
-    return Damage(lambda stacks, other, rng: (*stacks[:-1], swapped(stacks[-1])), frozenset({2}))
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], swapped(stacks[-1])), last_without_truth=True)
 
 
 def stack_of_another() -> Damage:
     """The last stack is one of another head."""
-    return Damage(lambda stacks, other, rng: (*stacks[:-1], other[len(stacks) - 1]), frozenset({2}))
+    return Damage(lambda stacks, other, rng: (*stacks[:-1], other[len(stacks) - 1]), last_without_truth=True)
 
 
 def nothing() -> Damage:

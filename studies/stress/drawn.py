@@ -202,12 +202,14 @@ def measure(n: int, options: argparse.Namespace) -> Row:
     other = simulated_case(one.other, options.cache).stacks if one.spoilt == "another head" else case.stacks
     stacks, last = case.stacks, one.n_stacks - 1
     rng = np.random.default_rng([FIRST_SEED, n])
+    lies = False
     for each in one.damages():
         stacks = damage.applied(each, stacks, other, rng)
-    lies = one.spoilt in ("reverse order", "sorted by time", "another head")
+        lies |= each.last_without_truth
     known = {key: at for key, at in case.points_mm.items() if key[0] <= last and not (lies and key[0] == last)}
     row = outcome(replace(case, stacks=stacks, points_mm=known), options)
-    return {"drawn": one.text(), "spoilt": stacks[last].name if one.spoilt else ""} | row
+    spoilt = stacks[last].name if one.spoilt else ""
+    return {"drawn": one.text(), "spoilt": spoilt, "mask_pixels": one.mask_pixels} | row
 
 
 def line(key: str, row: Row) -> str:
@@ -219,10 +221,10 @@ def line(key: str, row: Row) -> str:
 def tables(record: Record) -> dict[str, str]:
     """Two sentences on all; every subject below."""
     rows = list(record["rows"].values())
-    kept = [row for row in rows if row["spoilt"] and not lacks_a_stack(row)]
+    kept = [row for row in rows if row["spoilt"] and row["spoilt"] not in row.get("left_out", [])]
     psnr_db = [row["psnr_db"] for row in rows if "psnr_db" in row]
     text = (
-        f"Preset `{record['preset']}`, {len(rows)} subjects, {median(psnr_db):.2f} dB in the median. "
+        f"Preset `{record['preset']}`, {len(rows)} subjects, {median(psnr_db):.2f} dB in the median of {len(psnr_db)}. "
         f"{verdicts(rows, _warning)} Of {count(rows, lambda row: bool(row['spoilt']))} stacks that do not belong "
         f"{count(rows, _lacks_the_spoilt)} were left out; of {count(rows, lambda row: not row['spoilt'])} sets without "
         f"one {count(rows, lambda row: not row['spoilt'] and lacks_a_stack(row))} lost a stack. Where it stayed the "
@@ -240,7 +242,8 @@ def _warning(row: Row) -> str:
     """Whether a warning is about a bad result or names what is wrong here; empty where there is none."""
     if is_use(row):
         return ""
-    names_a_fault = (row["spoilt"] and row["spoilt"] in row["reason"]) or "the mask of" in row["reason"]
+    masks = "the mask of" in row["reason"] and row.get("mask_pixels", 0) < 0
+    names_a_fault = (row["spoilt"] and row["spoilt"] in row["reason"]) or masks
     return TRUE if row["bad"] or says_unseen(row) or names_a_fault else FALSE
 
 

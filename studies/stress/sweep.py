@@ -146,7 +146,8 @@ def measure(name: str, n: int, options: argparse.Namespace) -> Row:
     other = simulated_case(subject_of(CONDITIONS[0], n + 1), options.cache)
     rng = np.random.default_rng([FIRST_SEED, n])
     stacks = damage.applied(condition.damage, case.stacks, other.stacks, rng)
-    known = {key: at for key, at in case.points_mm.items() if key[0] not in condition.damage.without_truth}
+    lies = len(stacks) - 1 if condition.damage.last_without_truth else None
+    known = {key: at for key, at in case.points_mm.items() if key[0] != lies}
     found = outcome(replace(case, stacks=stacks, points_mm=known), options)
     return {"what": condition.what, "level": condition.level} | found
 

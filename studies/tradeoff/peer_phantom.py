@@ -82,7 +82,7 @@ def small_head(seed: int) -> TruthVolume:
 
 
 def in_shape(one: SimulatedStack) -> SimulatedStack:
-    """A stack cut or filled with zeros, about its middle, to the wanted number of pixels."""
+    """A stack cut or filled with zeros, about its middle, to the wanted number of pixels; its slices are cut alone."""
     stack = one.stack
     low = [(n - wanted) // 2 for n, wanted in zip(stack.image.shape, STACK_SHAPE, strict=True)]
     first, last = max(0, low[2]), min(stack.image.shape[2], low[2] + STACK_SHAPE[2])

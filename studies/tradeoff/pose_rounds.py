@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from g3r.fitting.pose_rounds import PoseRoundSettings
 from g3r.planning.presets import PRESETS
 from g3r.reconstruct import GaussianReconstructor
 from studies.harness import FITS, Record, Row, Study, Task
@@ -40,8 +39,9 @@ def measure(folder: Path, n_stacks: int, options: argparse.Namespace) -> Row:
     registration = GaussianReconstructor(options.ckpt, PRESETS[options.preset]).register_stacks(case.stacks)
     found: Row = {"case": folder.name, "n_stacks": n_stacks, "poses_mm": {}, "volume": {}, "prior": {}, "kept": {}}
     for n in ROUNDS:
-        rounds = PoseRoundSettings(single_stack=n, two_stacks=n, more_stacks=n)
-        settings = replace(PRESETS[options.preset], pose_rounds=rounds)
+        preset = PRESETS[options.preset]
+        rounds = replace(preset.pose_rounds, single_stack=n, two_stacks=n, more_stacks=n)
+        settings = replace(preset, pose_rounds=rounds)
         result = GaussianReconstructor(options.ckpt, settings).reconstruct(case.stacks, registration)
         error, name = case.pose_error(result.slices), str(n)
         found["poses_mm"][name] = round(error.median_mm, 3)

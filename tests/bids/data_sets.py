@@ -72,13 +72,15 @@ def ready_result(folder: Path) -> Path:
         nib.save(nib.Nifti1Image(np.ones((3, 4, 5), np.float32), np.eye(4)), folder / f"{name}.nii.gz")
     (folder / "slices.tsv").write_text("stack\tslice\n0\t0\n")
     (folder / "sections.png").write_bytes(b"picture")
+    (folder / "report.html").write_text("page")
     record = {
         "partial": False,
         "registration": {"reliable": True, "space": "standard", "standard_from_scanner": np.eye(4).tolist()},
         "stacks": [{"name": "-", "n_slices": 9, "n_downweighted_slices": 2, "mask_from": "file"}],
         "seconds": {"registration": 1.5, "volume": 2.0},
         "unseen": {"share": 0.0125, "usable": True},
-        "warnings": [],
+        "verdict": "use",
+        "reasons": ["3 of 3 stacks agree with each other"],
     }
     (folder / "run.json").write_text(json.dumps(record))
     return folder

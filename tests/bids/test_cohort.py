@@ -62,13 +62,13 @@ def test_one_bad_subject_stops_nobody_and_what_is_done_stays(
     assert len(made) == N - 1
     table = rows(out)
     assert table["sub-04"]["verdict"] == "failed"
-    assert table["sub-04"]["reason"].startswith("sub-04_run-1_T2w.nii.gz: not a readable NIfTI file")
+    assert table["sub-04"]["reasons"].startswith("sub-04_run-1_T2w.nii.gz: not a readable NIfTI file")
     assert table["sub-01"] | {"seconds": ""} == {
-        "participant_id": "sub-01", "session_id": "ses-1", "verdict": "trusted", "seconds": "", "stacks": "1",
-        "slices_used": "7", "slices": "9", "unseen_share": "0.0125", "warnings": "n/a", "reason": "n/a"
+        "participant_id": "sub-01", "session_id": "ses-1", "verdict": "use", "seconds": "", "stacks": "1",
+        "slices_used": "7", "slices": "9", "unseen_share": "0.0125", "reasons": "3 of 3 stacks agree with each other"
     }  # fmt: skip
     assert table["sub-01"]["seconds"] == "3.5"
-    assert "4 trusted" not in capsys.readouterr().err
+    assert "4 use" not in capsys.readouterr().err
     assert not list(out.glob(".g3r/sub-01*"))
     assert "not a readable" in (out / "logs" / "g3r-sub-04.log").read_text()
 
@@ -82,7 +82,7 @@ def test_one_bad_subject_stops_nobody_and_what_is_done_stays(
     assert len(volumes(out)) == N
     assert made.items() <= volumes(out).items()
     assert main([str(raw), str(out), "group"]) == 0
-    assert rows(out)["sub-04"]["verdict"] == "trusted"
+    assert rows(out)["sub-04"]["verdict"] == "use"
 
 
 def test_force_replaces_and_keeps_what_others_put_there(raw: Path, use: Use, tmp_path: Path) -> None:

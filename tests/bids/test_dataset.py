@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -56,12 +57,34 @@ def test_a_number_with_zeros_is_the_same_run(tmp_path: Path) -> None:
     assert find_masks(find_sessions(tmp_path)[0], tmp_path, tmp_path / "out")[0] is not None
 
 
-def test_a_described_mask_goes_before_a_plain_one(tmp_path: Path) -> None:
+def test_two_masks_in_one_derivative_are_not_chosen_from(tmp_path: Path) -> None:
     for pattern in ("desc", "plain"):
         add_session(tmp_path, "01", None, [("run-1", b"x", b"m")], pattern)
-    (mask,) = find_masks(find_sessions(tmp_path)[0], tmp_path, tmp_path / "out")
-    assert mask
-    assert mask.name.endswith("_desc-brain_mask.nii.gz")
+    (session,) = find_sessions(tmp_path)
+    both = (
+        r"sub-01_run-1_T2w.nii.gz: has masks derivatives/masks/sub-01/anat/sub-01_run-1_desc-brain_mask.nii.gz and "
+        r"derivatives/masks/sub-01/anat/sub-01_run-1_mask.nii.gz; expected one, remove the others"
+    )
+    with pytest.raises(InputError, match=both):
+        find_masks(session, tmp_path, tmp_path / "out")
+    with pytest.raises(InputError, match=both):
+        find_masks(session, tmp_path, tmp_path / "out", "masks")
+
+
+@pytest.mark.parametrize("makers", [[{"Name": "g3r"}], [{"Name": "a tool"}, {"Name": "g3r", "Version": "0.1"}]])
+def test_masks_that_g3r_found_are_not_the_users(tmp_path: Path, makers: list[dict[str, str]]) -> None:
+    add_session(tmp_path, "01", None, STACKS, derivative="g3r-before")
+    description = tmp_path / "derivatives" / "g3r-before" / "dataset_description.json"
+    (session,) = find_sessions(tmp_path)
+    for text in ("{", "[]", '{"GeneratedBy": 1}', '{"GeneratedBy": [{"Name": "a tool"}]}'):
+        description.write_text(text)
+        assert None not in find_masks(session, tmp_path, tmp_path / "out")
+    description.write_text(json.dumps({"GeneratedBy": makers}))
+    assert find_masks(session, tmp_path, tmp_path / "out") == [None, None]
+    # somebody may have corrected them there, and says so
+    assert None not in find_masks(session, tmp_path, tmp_path / "out", "g3r-before")
+    add_session(tmp_path, "01", None, STACKS, derivative="mine")
+    assert all(mask and "mine" in mask.parts for mask in find_masks(session, tmp_path, tmp_path / "out"))
 
 
 def test_two_derivatives_with_masks_are_not_chosen_from(tmp_path: Path) -> None:
@@ -74,8 +97,11 @@ def test_two_derivatives_with_masks_are_not_chosen_from(tmp_path: Path) -> None:
     assert all(mask and "right" in mask.parts for mask in chosen)
     # what this command wrote before is no second derivative
     assert find_masks(session, tmp_path, tmp_path / "derivatives" / "left") == chosen
-    with pytest.raises(InputError, match="--mask-derivative"):
-        find_masks(session, tmp_path, tmp_path / "out", "middle")
+    for name in ("middle", ".", "..", "left/sub-01", str(tmp_path)):
+        with pytest.raises(InputError, match="is no folder; pass --mask-derivative a name"):
+            find_masks(session, tmp_path, tmp_path / "out", name)
+    with pytest.raises(InputError, match="is OUT_DIR, too"):
+        find_masks(session, tmp_path, tmp_path / "derivatives" / "left", "left")
 
 
 def test_refusals(tmp_path: Path) -> None:
@@ -86,5 +112,12 @@ def test_refusals(tmp_path: Path) -> None:
     add_session(tmp_path, "01", "1", STACKS)
     with pytest.raises(InputError, match=r"has no sub-7; found sub-01"):
         find_sessions(tmp_path, ["7"])
+    add_session(tmp_path, "02", "2", STACKS)
+    (tmp_path / "sub-02" / "ses-3").mkdir()
+    assert [one.stem for one in find_sessions(tmp_path, None, ["1", "ses-2"])] == ["sub-01_ses-1", "sub-02_ses-2"]
+    with pytest.raises(InputError, match=r"has no ses-9; found ses-1 and 2 more, check the label"):
+        find_sessions(tmp_path, None, ["1", "9"])
+    with pytest.raises(InputError, match=r"has no ses-1; found ses-2 and 1 more"):
+        find_sessions(tmp_path, ["02"], ["1"])
     with pytest.raises(InputError, match="no T2w image for these"):
-        find_sessions(tmp_path, None, ["9"])
+        find_sessions(tmp_path, None, ["3"])

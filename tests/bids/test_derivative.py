@@ -72,16 +72,21 @@ def test_a_session_is_there_whole_or_not_at_all(written: Path) -> None:
         f"{begin}_rec-g3r_{XFM}",
         *(f"{begin}_acq-haste_run-{n}_{XFM}" for n in (1, 2, 3)),
         *(f"ses-a/figures/sub-01_ses-a_rec-g3r_desc-{kind}_T2w.png" for kind in ("sections", "thumbnail")),
+        "ses-a/figures/sub-01_ses-a_rec-g3r_desc-report_T2w.html",
     }
     assert not (written / "sub-03").exists()
     assert not (written / "sub-04").exists()
     with (written / "participants_g3r.tsv").open() as file:
         rows = {row["participant_id"]: row for row in csv.DictReader(file, delimiter="\t")}
-    assert [row["verdict"] for row in rows.values()] == ["trusted", "check", "failed", "failed"]
-    assert rows["sub-03"]["reason"].startswith("sub-03_T2w.nii.gz: ")
+    assert [row["verdict"] for row in rows.values()] == ["use", "check", "failed", "failed"]
+    assert rows["sub-03"]["reasons"].startswith("sub-03_T2w.nii.gz: ")
     assert rows["sub-03"]["stacks"] == "n/a"
-    assert "700 mm from sub-04_run-1_T2w.nii.gz" in rows["sub-04"]["reason"]
+    assert "700 mm from sub-04_run-1_T2w.nii.gz" in rows["sub-04"]["reasons"]
     assert int(rows["sub-01"]["slices_used"]) <= int(rows["sub-01"]["slices"])
+    record = json.loads((written / "sub-01/ses-a/anat/sub-01_ses-a_rec-g3r_run.json").read_text())
+    assert record["verdict"] == "use"
+    assert rows["sub-01"]["reasons"] == "; ".join(record["reasons"])
+    assert rows["sub-02"]["reasons"].startswith("there is a single stack")
 
 
 def test_pybids_finds_one_volume_for_each_session(written: Path) -> None:

@@ -42,8 +42,8 @@ def test_six_volumes_and_two_reasons(subject: Path, tmp_path: Path) -> None:
     assert len(made) == 6
     table = rows(out)
     assert [label for label, row in table.items() if row["verdict"] == "failed"] == ["sub-03", "sub-08"]
-    assert "sub-03_run-1_T2w.nii.gz: voxels cannot be read" in table["sub-03"]["reason"]
-    assert "expected scans of one head" in table["sub-08"]["reason"]
+    assert "sub-03_run-1_T2w.nii.gz: voxels cannot be read" in table["sub-03"]["reasons"]
+    assert "expected scans of one head" in table["sub-08"]["reasons"]
     page = (out / "index.html").read_text()
     assert re.findall(r"<td class=session>(sub-\d\d)", page)[:2] == ["sub-03", "sub-08"]
     links = re.findall(r'(?:href|src)="([^"]+)"', page)

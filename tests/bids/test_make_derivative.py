@@ -65,7 +65,8 @@ def test_a_new_result_leaves_nothing_of_the_old_one(session: Session, result: Pa
     assert "sub-01_rec-g3r_dseg.nii.gz" in names
     assert not {name for name in names if "run-2_desc" in name or "priorshare" in name}
     assert {path.name for path in (anat.parent / "figures").iterdir()} == {
-        f"sub-01_rec-g3r_desc-{kind}_T2w.png" for kind in ("sections", "thumbnail")
+        f"sub-01_rec-g3r_desc-{kind}_T2w.{ending}"
+        for kind, ending in (("sections", "png"), ("thumbnail", "png"), ("report", "html"))
     }
 
 

@@ -21,7 +21,6 @@ def test_names_of_bids(name: str, words: tuple[str, ...]) -> None:
     found = parsed_name(Path("anywhere") / name)
     assert found is not None
     assert found.words == words
-    assert found.suffix == words[-1]
     assert found.entities["sub"] == "01"
 
 

@@ -36,7 +36,7 @@ def test_sessions_in_an_array(raw: Path, tmp_path: Path, monkeypatch: pytest.Mon
     out = tmp_path / "out"
     assert main([str(raw), str(out), *LINE]) == 1
     assert len(volumes(out)) == 2
-    assert rows(out)["sub-02"]["reason"].startswith("sub-02_run-1_T2w.nii.gz: not a readable NIfTI file")
+    assert rows(out)["sub-02"]["reasons"].startswith("sub-02_run-1_T2w.nii.gz: not a readable NIfTI file")
     assert not (out / ".g3r" / "slurm").exists()
     n_events = len(list((tmp_path / "events").iterdir()))
     assert main([str(raw), str(out), *LINE]) == 1
@@ -48,7 +48,7 @@ def test_a_process_that_cannot_be_started(raw: Path, tmp_path: Path, monkeypatch
     monkeypatch.setattr(slurm, "SlurmArrays", functools.partial(slurm.SlurmArrays, cluster="debug"))
     monkeypatch.setattr("g3r.bids.cohort.INFER", ("no-such-command",))
     assert main([str(raw), str(tmp_path / "out"), *LINE]) == 1
-    assert "could not be started" in rows(tmp_path / "out")["sub-01"]["reason"]
+    assert "could not be started" in rows(tmp_path / "out")["sub-01"]["reasons"]
 
 
 def test_what_sbatch_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

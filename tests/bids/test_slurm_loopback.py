@@ -73,7 +73,7 @@ def test_an_array_of_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     line = [str(raw), str(out), "participant", "--jobs", "2", *SLURM]
     assert main(line) == 1
     assert len(volumes(out)) == 5
-    assert rows(out)["sub-04"]["reason"].startswith("sub-04_run-1_T2w.nii.gz: not a readable NIfTI file")
+    assert rows(out)["sub-04"]["reasons"].startswith("sub-04_run-1_T2w.nii.gz: not a readable NIfTI file")
     assert float(rows(out)["sub-04"]["seconds"]) < 30
     spans = [(one["began"], one["ended"]) for one in events(tmp_path) if one["ended"]]
     assert max(sum(begin <= moment < end for begin, end in spans) for moment, _ in spans) == 2
@@ -93,11 +93,11 @@ def test_tasks_that_slurm_ends(
     assert main([str(raw), str(tmp_path / "out"), "participant", *SLURM]) == 1
     table = rows(tmp_path / "out")
     assert {name: row["verdict"] for name, row in table.items()} == {
-        "sub-01": "trusted", "sub-02": "failed", "sub-03": "failed"
+        "sub-01": "use", "sub-02": "failed", "sub-03": "failed"
     }  # fmt: skip
-    assert "took longer than 1 min; pass --slurm ...,time=MINUTES" in table["sub-02"]["reason"]
-    assert "memory" in table["sub-03"]["reason"]
-    assert "mem=SIZE" in table["sub-03"]["reason"]
+    assert "took longer than 1 min; pass --slurm ...,time=MINUTES" in table["sub-02"]["reasons"]
+    assert "memory" in table["sub-03"]["reasons"]
+    assert "mem=SIZE" in table["sub-03"]["reasons"]
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -109,7 +109,7 @@ def test_slurms_signal_comes_before_the_limit(tmp_path: Path, monkeypatch: pytes
     began_s = time.monotonic()
     assert main([str(raw), str(tmp_path / "out"), "participant", *SLURM]) == 1
     assert time.monotonic() - began_s < 55
-    assert "took longer than 1 min" in rows(tmp_path / "out")["sub-01"]["reason"]
+    assert "took longer than 1 min" in rows(tmp_path / "out")["sub-01"]["reasons"]
 
 
 def test_a_task_that_somebody_cancels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +126,7 @@ def test_a_task_that_somebody_cancels(tmp_path: Path, monkeypatch: pytest.Monkey
     somebody.start()
     assert main([str(raw), str(out), "participant", *SLURM]) == 1
     somebody.join()
-    assert all("was cancelled in Slurm" in row["reason"] for row in rows(out).values())
+    assert all("was cancelled in Slurm" in row["reasons"] for row in rows(out).values())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -19,7 +19,18 @@ def test_words_become_options_of_sbatch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "minutes"), [("90", 90), ("90:30", 90), ("1:30:00", 90), ("2-0", 2880), ("0:30", 1), ("1-12:30:00", 2190)]
+    ("text", "minutes"),
+    [
+        ("90", 90),
+        ("90:30", 90),
+        ("1:30:00", 90),
+        ("0:30", 1),
+        ("2-0", 2880),
+        ("0-2", 120),
+        ("1-12", 2160),
+        ("1-12:30", 2190),
+        ("1-12:30:00", 2190),
+    ],
 )
 def test_slurms_ways_of_saying_a_time(text: str, minutes: int) -> None:
     assert parsed_request(f"time={text}").minutes == minutes
@@ -36,6 +47,9 @@ def test_slurms_ways_of_saying_a_time(text: str, minutes: int) -> None:
         ("cpus_per_task=0", "expected a number of cores"),
         ("time=soon", "expected minutes"),
         ("time=0", "expected minutes"),
+        ("time=0-0:00", "expected minutes"),
+        ("time=1-", "expected minutes"),
+        ("time=1:2:3:4", "expected minutes"),
     ],
 )
 def test_words_that_cannot_be(text: str, said: str) -> None:

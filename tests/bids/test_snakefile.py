@@ -8,9 +8,11 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from g3r.bids.dataset import find_sessions
 from g3r.bids.pool import NEEDED_BYTES
 from g3r.bids.slurm_request import CORES, MINUTES
 from tests.bids.cohorts import rows, volumes
@@ -31,6 +33,7 @@ def raw(tmp_path: Path) -> Path:
     for label in ("01", "02", "03"):
         content = BROKEN if label == "02" else b"image"
         add_session(tmp_path / "raw", label, "a" if label == "03" else None, [("run-1", content, b"mask")])
+    (tmp_path / "raw" / "sub-04" / "func").mkdir(parents=True)  # not for g3r
     return tmp_path / "raw"
 
 
@@ -61,6 +64,24 @@ def test_it_states_what_g3r_bids_reckons_with() -> None:
     assert f"threads: {CORES}" in text
 
 
+def test_participants_without_a_stack_are_not_listed(tmp_path: Path) -> None:
+    """g3r-bids refuses them, and one refusal would leave the workflow unfinished."""
+    for label, session, name in (
+        ("04", None, "run-1"), ("01", "a", ""), ("02", "b", "acq-x_run-1"), ("05", None, "rec-a"), ("06", "a", "echo-1")
+    ):  # fmt: skip
+        add_session(tmp_path, label, session, [(name, b"image", b"mask")])
+    for folder in ("sub-03/func", "sub-07/anat", "sub-08/ses-a/anat"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "sub-07" / "anat" / "sub-07_T1w.nii.gz").write_bytes(b"of another kind")
+    (tmp_path / "sub-04" / "anat" / "sub-04_run-1_T2w.nii.gz").rename(tmp_path / "sub-04" / "anat" / "sub-04_T2w.nii")
+    (tmp_path / "sub-09").write_text("a file")
+    listing = SNAKEFILE.read_text(encoding="utf-8").split("\nrule ")[0]  # plain Python as far as the first rule
+    found: dict[str, Any] = {"config": {"bids": str(tmp_path), "out": "out"}}
+    exec(compile(listing, str(SNAKEFILE), "exec"), found)
+    assert found["PARTICIPANTS"] == ["01", "02", "04"]
+    assert found["PARTICIPANTS"] == sorted({one.participant for one in find_sessions(tmp_path)})
+
+
 @needs_snakemake
 def test_a_job_for_each_participant_and_one_at_the_end(tmp_path: Path, raw: Path, g3r: Path) -> None:
     done = snakemake(tmp_path, raw, g3r, "--dry-run")
@@ -77,7 +98,7 @@ def test_what_failed_is_in_the_table_and_is_tried_again(tmp_path: Path, raw: Pat
     assert snakemake(tmp_path, raw, g3r, "--keep-going").returncode == 1
     out = tmp_path / "out"
     assert {name: row["verdict"] for name, row in rows(out).items()} == {
-        "sub-01": "trusted", "sub-02": "failed", "sub-03": "trusted"
+        "sub-01": "use", "sub-02": "failed", "sub-03": "trusted"
     }  # fmt: skip
     made = volumes(out)
     (raw / "sub-02" / "anat" / "sub-02_run-1_T2w.nii.gz").write_bytes(b"mended")
@@ -85,4 +106,4 @@ def test_what_failed_is_in_the_table_and_is_tried_again(tmp_path: Path, raw: Pat
     assert done.returncode == 0, done.stderr
     assert len(volumes(out)) == 3
     assert made.items() <= volumes(out).items()
-    assert rows(out)["sub-02"]["verdict"] == "trusted"
+    assert rows(out)["sub-02"]["verdict"] == "use"

@@ -35,6 +35,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, st
         (["--", "--output", "there"], "--output after --: g3r-bids decides that"),
         (["--", "--stacks", "a", "b"], "--stacks after --"),
         (["--", "--masks", "a"], "--masks after --"),
+        (["--", "--dicom-out", "D", "--dicom-reference", "PAT_A"], "--dicom-out, --dicom-reference after --"),
         (["--", "--force", "--dry-run"], "--force, --dry-run after --"),
         (["--", "--seed", "-1"], "--seed -1"),
         (["--", "--preset", "none"], "invalid choice"),
@@ -68,6 +69,26 @@ def test_folders_that_cannot_be(raw: Path, tmp_path: Path, capsys: pytest.Captur
     assert (raw / "dataset_description.json").read_text() == before
     code, line = refused(capsys, raw, tmp_path / "out", "participant", "--participant-label", "07")
     assert (code, "has no sub-07; found sub-01" in line) == (3, True)
+
+
+@pytest.mark.parametrize("end", ["", "/", "/../raw/."])
+def test_the_description_names_no_folder_above(raw: Path, tmp_path: Path, end: str) -> None:
+    """Whatever way the paths are written, those of g3r-infer, too; other words stay as they are."""
+    out, secret = tmp_path / "out", "/data/secret/of study"
+    words = ["group", "--slurm", f"partition=a,container={secret}/x", f"--mask-derivative={secret}/m"]
+    infer = ["--preset", "fast", "--mask-command", f"{secret}/tool {{stack}} {{mask}}", f"--ckpt={secret}/prior.st"]
+    infer += ["--pose-ckpt", f"{secret}/pose.st"]
+    assert main([f"{raw}{end}", f"{out}/", *words, "--", *infer]) == 0
+    text = (out / "dataset_description.json").read_text()
+    assert not [word for word in ("secret", "study", tmp_path.name) if word in text]
+    assert "Command: g3r-bids raw out group" in text
+    assert "-- --preset fast --mask-command 'tool {stack} {mask}' --ckpt=prior.st --pose-ckpt pose.st" in text
+
+
+def test_here_is_named_by_its_name(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(raw)
+    assert main([".", "../out", "group"]) == 0
+    assert "Command: g3r-bids raw out group" in (tmp_path / "out" / "dataset_description.json").read_text()
 
 
 def test_group_without_a_run_writes_the_table(raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

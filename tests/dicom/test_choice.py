@@ -19,8 +19,7 @@ from tests.dicom.dicom_files import CANARY, Study, pydicom
 
 
 def verdicts(folder: Path, *asked_for: str) -> dict[str, Judged]:
-    images, _ = read_images(folder)
-    return {one.series.label: one for one in judged(grouped(images), asked_for or None)}
+    return {one.series.label: one for one in judged(grouped(read_images(folder).images), asked_for or None)}
 
 
 def test_the_stacks_are_taken_and_nothing_else(examination: Examination) -> None:
@@ -184,9 +183,9 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path) -> None:
     paths = Study(tmp_path).write(*block(), 2)
     paths[3].write_bytes(paths[3].read_bytes()[:-300])
     paths[5].write_bytes(paths[5].read_bytes()[:140])
-    images, n_damaged = read_images(tmp_path)
-    (found,) = judged(grouped(images))
-    assert n_damaged == 1
+    below = read_images(tmp_path)
+    (found,) = judged(grouped(below.images))
+    assert (below.n_damaged, below.n_unreadable) == (1, 0)
     assert found.reason == "the file of image number 4 is cut off"
 
 

@@ -149,7 +149,7 @@ def read_moved(folder: Path) -> tuple[Any, ...]:
     """Images of a patient who got up in between."""
     (folder / "second").mkdir()
     Study(folder / "second").write(*block(), 5)
-    return tuple(read_images(folder / "second")[0])
+    return tuple(read_images(folder / "second").images)
 
 
 def test_it_repeats_the_patient_and_the_study_and_nothing_else(study: SourceStudy, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from g3r.errors import InputError
+from g3r.run.process_mark import process_mark
 from tests.tally import Tally
 
 pytest.importorskip("lightning.pytorch", reason="the training extra is not installed")
@@ -123,11 +124,12 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
         assert [one.name for one in tmp_path.iterdir()] == ["last.ckpt"]
         one.refused()
     with tally.case():
-        for process in ("4194399", str(os.getpid())):  # nobody's, and a living one's
-            (tmp_path / f".{process}.last.ckpt").write_text("")
+        living = process_mark()
+        for mark in (f"{living.partition('-')[0]}-4194399", living):  # nobody's, and a living one's
+            (tmp_path / f".{mark}-0.last.ckpt").write_text("")
         assert torch.equal(keeper.load_checkpoint(path, weights_only=True)["a"], torch.ones(3))
         left = {one.name for one in tmp_path.iterdir()}
-        assert left == {"last.ckpt", f".{os.getpid()}.last.ckpt"}
+        assert left == {"last.ckpt", f".{living}-0.last.ckpt"}
 
 
 CONFIG = """

@@ -211,7 +211,9 @@ def test_a_mask(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, tal
         assert outcome.code == 0, outcome.err
         assert [MASKS[name][1] in one for one in caplog.messages] == [True] * bool(MASKS[name][1])
         expected = np.ones(SHAPE, bool) if name == "of every voxel" else ball() > 0
-        np.testing.assert_array_equal(load_stack(stack, mask).mask, expected)
+        found = load_stack(stack, mask)
+        np.testing.assert_array_equal(found.mask, expected)
+        assert [MASKS[name][1] in one for one in found.remarks] == [True] * bool(MASKS[name][1])  # for the verdict
 
 
 def test_twelve_stacks(tmp_path: Path, tally: Tally) -> None:

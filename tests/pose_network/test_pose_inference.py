@@ -15,9 +15,10 @@ from g3r.acquisition.slicing import slices_from_stacks
 from g3r.acquisition.stacks import Stack
 from g3r.geometry import RigidPose
 from g3r.pose_network.config import PoseNetworkConfig
-from g3r.pose_network.inference import VIEWS, mean_pose, pose_errors, poses_of, slice_batch, stack_motions
+from g3r.pose_network.inference import VIEWS, mean_pose, poses_of, slice_batch
 from g3r.pose_network.model import PoseModel
 from g3r.pose_network.network import PoseNetwork
+from g3r.training.pose_scores import pose_errors, stack_motions
 
 SHAPE = (2, 9, 9, 9)
 

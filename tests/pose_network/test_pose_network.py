@@ -175,7 +175,7 @@ def test_heads_of_a_batch_do_not_see_each_other() -> None:
 
 def test_a_tiny_set_can_be_learnt() -> None:
     from g3r.pose_network.geometry import moved_points
-    from g3r.pose_network.inference import SLICE_POINTS_MM
+    from g3r.training.pose_scores import SLICE_POINTS_MM
 
     torch.manual_seed(0)
     batch = random_batch(n_slices=4, sets=(2,))

@@ -11,8 +11,8 @@ from g3r.acquisition.slicing import slices_from_stacks
 from g3r.checkpoints.shipped import weights_path
 from g3r.evaluation.case import load_case
 from g3r.geometry import RigidPose
-from g3r.pose_network.inference import pose_errors, stack_motions
 from g3r.pose_network.model import PoseModel
+from g3r.training.pose_scores import pose_errors, stack_motions
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from data_synth.simulator import SimulatedStack
 from g3r.acquisition.bounding_grid import grid_around
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.registration import RegistrationSettings, slice_rounds
-from g3r.registration.slice_rounds import CARRIED_ON_MM, carried_on, continued_outwards, refine_slices
+from g3r.registration.slice_rounds import CARRIED_ON_MM, carried_on, continued_outwards, fitted_in_place, refine_slices
 from tests.registration.moving_heads import as_slices, off_mm, pixel_errors_mm, slices_disturbed
 
 
@@ -53,6 +53,17 @@ def test_a_slice_without_signal_counts_for_nothing(still: list[SimulatedStack]) 
     assert found.gain[black] < 0.3 * np.median(found.gain)
     assert found.weight[black] < 0.2  # the gain falls from 1, round by round
     assert np.median(np.delete(found.weight, black)) == 1.0
+
+
+@pytest.mark.parametrize("signal", [0.45, 2.5])
+def test_the_gain_of_a_slice_that_stays_is_what_it_is(still: list[SimulatedStack], signal: float) -> None:
+    slices, truth = as_slices(still)
+    slices = slices.with_motion(truth)
+    odd = int(np.flatnonzero(slices.stack_id == 1)[np.count_nonzero(slices.stack_id == 1) // 2])
+    factor = np.where(slices.planes.plane_id() == odd, signal, 1.0).astype(np.float32)
+    found = fitted_in_place(replace(slices, value=slices.value * factor), RegistrationSettings(finest_voxel_mm=1.8))
+    usual = np.median(np.delete(found.gain, odd))
+    assert found.gain[odd] / usual == pytest.approx(signal, rel=0.08)
 
 
 @pytest.mark.parametrize("value", [1.0, -3.0, 0.0])

@@ -28,6 +28,7 @@ FILLED_IN = {
     "what": "brain",
     "handedness": "N",
     "angle": "N",
+    "remark": "what is doubtful in its header, mask or thickness",
     "shortfalls": "what is bad of it, and what is good",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from g3r.acquisition.brain_mask import MaskSource
@@ -25,6 +26,7 @@ def stack(
     thickness_from: ThicknessSource = "sidecar",
     mask_from: MaskSource = "file",
     left_out_share: float = 0.0,
+    remarks: Sequence[str] = (),
 ) -> StackRecord:
     return StackRecord(
         name=name,
@@ -34,6 +36,7 @@ def stack(
         mask_from=mask_from,
         mask_ml=280.0,
         left_out_share=left_out_share,
+        remarks=list(remarks),
         n_slices=30,
         n_downweighted_slices=2,
         quality=found or quality(),

@@ -11,6 +11,7 @@ import pytest
 
 from g3r import GaussianReconstructor, load_stack
 from g3r.errors import InputError
+from g3r.output.record import RunRecord
 from g3r.report.reported_result import ReportedResult
 from g3r.report.verdict import verdict_of
 from tests.faults.small_case import quick_settings
@@ -68,7 +69,11 @@ def test_arrays_and_their_grid_are_the_file(result: ReportedResult, tmp_path: Pa
 def test_saving_writes_the_page_too(result: ReportedResult, tmp_path: Path) -> None:
     result.save(tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert f"<h1>{result.report().verdict.word.capitalize()}</h1>" in page
+    verdict = result.report().verdict
+    assert f"<h1>{verdict.word.capitalize()}</h1>" in page
+    record = RunRecord.read(tmp_path / "out" / "run.json")
+    assert record.verdict == verdict.word
+    assert record.reasons == verdict.deciding
 
 
 def test_a_page_that_cannot_be_made_costs_no_volume(

@@ -1,4 +1,4 @@
-"""The verdict: what leads to which word, in which order, and that the index of a cohort agrees."""
+"""The verdict: what leads to which word, and in which order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from g3r.bids.outcome import TRUSTED, _verdict
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
 from g3r.planning.plan import BudgetRecord
@@ -16,7 +15,6 @@ from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import verdict_of
 from g3r.report.verdict_messages import CHECK, DO_NOT_USE, HEADLINES, MESSAGES, MILDEST_FIRST, USE
 from g3r.run.context import StoppedAt
-from g3r.run.json_record import to_plain
 from g3r.uncertainty.unseen import DO_NOT_USE_ABOVE, MENTIONED_ABOVE
 from tests.report.records import quality, record, stack, unseen
 
@@ -124,6 +122,11 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         CHECK,
         "the mask of c.nii leaves out 21 % of what the image shows",
     ),
+    "file": (
+        stacks_with(stack("c.nii", remarks=["sform and qform differ by up to 3 mm; the sform is used"])),
+        CHECK,
+        "c.nii: sform and qform differ by up to 3 mm",
+    ),
     "whole image": (stacks_with(stack("c.nii", mask_from="whole image")), CHECK, "no mask was used for c.nii"),
     "thickness": (
         record(*(stack(f"{n}.nii", thickness_from="spacing") for n in "abc")),
@@ -148,17 +151,6 @@ def test_each_fault_is_said_and_decides(name: str) -> None:
     assert verdict.headline == HEADLINES[verdict.word]
     assert all(reason.advice for reason in verdict.reasons) or name == "left out" or word == USE
     assert "\n" not in verdict.line()
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_index_of_a_cohort_refuses_the_same(name: str) -> None:
-    found, word, _ = CASES[name]
-    assert (_verdict(to_plain(found)) == DO_NOT_USE) == (word == DO_NOT_USE)
-
-
-def test_what_the_index_trusts_may_be_used() -> None:
-    assert _verdict(to_plain(record())) == TRUSTED
-    assert verdict_of(record()).word == USE
 
 
 def test_the_way_on_from_an_interrupted_run_is_one_that_there_is() -> None:

@@ -143,8 +143,16 @@ def test_the_table_of_draws_counts_stacks_that_were_spoilt() -> None:
     record = {"preset": "fast", "first": 0, "rows": {str(n): row for n, row in enumerate(rows)}}
     text = drawn.tables(record)["stress-drawn"]
     assert drawn.tables(record | {"first": 100})["stress-drawn-later"] == text
-    assert "7 subjects, 30.00 dB in the median. Of 2 bad ones" in text
+    assert "7 subjects, 30.00 dB in the median of 6. Of 2 bad ones" in text
     assert "or a refusal, in 1, *check* in 0 and *use* in 1. Of 5 good ones it was *use* in 3, *check* in 2" in text
     assert "1 name what is wrong with the stacks, 1 are false alarms" in text
     assert "Of 4 stacks that do not belong 1 were left out; of 3 sets without one 1 lost a stack." in text
     assert "Where it stayed the verdict was *use* in 1 of 3." in text
+    # a sound stack that was left out does not hide the spoilt one that stayed
+    worst = good | use | {"spoilt": "b", "left_out": ["a"]}
+    rows = {"rows": {**record["rows"], "7": worst}}
+    assert "Where it stayed the verdict was *use* in 2 of 4." in drawn.tables(record | rows)["stress-drawn"]
+    masks = good | {"word": "check", "reason": "check: the mask of a leaves out 14 %"}
+    for pixels, said in ((2, "0 name what is wrong with the stacks, 1 are"), (-2, "1 name what is wrong")):
+        rows = {"rows": {"0": masks | {"mask_pixels": pixels}}}
+        assert said in drawn.tables(record | rows)["stress-drawn"]

@@ -25,7 +25,8 @@ from torch.utils.data import DataLoader
 
 from g3r.pose_network.inference import as_pose
 from g3r.pose_network.network import PoseStep
-from g3r.training.pose_module import PoseModule, disturbed, point_loss, scores_of, summary, vote_loss
+from g3r.training.pose_module import PoseModule, disturbed, point_loss, vote_loss
+from g3r.training.pose_scores import scores_of, summary
 from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)

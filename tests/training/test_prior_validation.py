@@ -6,7 +6,6 @@ import torch
 
 from g3r.evaluation.metrics import score
 from g3r.training.prior_validation import (
-    ASSUMED_VOXEL_MM,
     RIM_MM,
     ValidationScores,
     confidence_bins,
@@ -29,19 +28,20 @@ def test_errors_by_confidence_are_of_the_brain_alone() -> None:
     assert l1_by_confidence(error, seen).keys() == {"seen"}
 
 
-def test_validation_tells_rim_from_depth_and_seen_from_unseen() -> None:
+@pytest.mark.parametrize("voxel_mm", [0.8, 1.2])
+def test_validation_tells_rim_from_depth_and_seen_from_unseen(voxel_mm: float) -> None:
     """An error of 0.1 in the rim and of 0.01 within; the upper half is unseen."""
     mask = torch.zeros(1, 1, 24, 24, 24)
     mask[:, :, 2:22, 2:22, 2:22] = 1
     deep = torch.zeros_like(mask)
-    n_rim = int(RIM_MM / ASSUMED_VOXEL_MM)
+    n_rim = int(RIM_MM / voxel_mm)
     deep[:, :, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim, 2 + n_rim : 22 - n_rim] = 1
     density = torch.full_like(mask, 3.0)
     density[..., 12:] = 0
     truth = torch.rand(mask.shape)
     made = truth + 0.1 + deep * (0.01 - 0.1)
     volumes = dict.fromkeys(("prior", "sharp", "coarse", "template"), made)
-    scores = ValidationScores()
+    scores = ValidationScores(voxel_mm)
     scores.add(volumes, {"truth": truth, "mask": mask, "density": density}, mask)
     found = psnr_by_place(scores.squares)
     assert found["psnr_prior_unseen_rim"] == pytest.approx(20, abs=0.01)

@@ -1,0 +1,55 @@
+"""The DICOM files below a folder, told by their first bytes."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+PREAMBLE_BYTES, MAGIC = 128, b"DICM"
+"""A DICOM file says what it is behind a preamble of this length."""
+
+LOOKED_AT = 1000
+"""Files that are looked at to see what a folder holds."""
+
+
+def is_dicom(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is DICOM by its first bytes; one that cannot be read is not."""
+    try:
+        return _begins_as_dicom(path)
+    except (OSError, ValueError):
+        return False
+
+
+def _begins_as_dicom(path: str | os.PathLike[str]) -> bool:
+    if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+        return False
+    with open(path, "rb") as stream:
+        return stream.read(PREAMBLE_BYTES + len(MAGIC))[PREAMBLE_BYTES:] == MAGIC
+
+
+def dicom_files(folder: str | os.PathLike[str], unreadable: list[OSError]) -> Iterator[Path]:
+    """The DICOM files below a folder, in the order of their paths.
+
+    Args:
+        folder: to look in.
+        unreadable: gets what the system says of each file and folder that cannot be read.
+    """
+    for parent, folders, names in os.walk(folder, onerror=unreadable.append):
+        folders.sort()
+        for path in (Path(parent, name) for name in sorted(names)):
+            try:
+                found = _begins_as_dicom(path)
+            except OSError as error:
+                unreadable.append(error)
+                continue
+            if found:
+                yield path
+
+
+def holds_dicom(folder: str | os.PathLike[str]) -> bool:
+    """Whether there is DICOM among the first files below a folder, which may be the whole disk."""
+    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
+    return any(map(is_dicom, islice(paths, LOOKED_AT)))
