@@ -150,9 +150,9 @@ def test_the_table_of_draws_counts_stacks_that_were_spoilt() -> None:
     assert "Where it stayed the verdict was *use* in 1 of 3." in text
     # a sound stack that was left out does not hide the spoilt one that stayed
     worst = good | use | {"spoilt": "b", "left_out": ["a"]}
-    rows = {"rows": {**record["rows"], "7": worst}}
-    assert "Where it stayed the verdict was *use* in 2 of 4." in drawn.tables(record | rows)["stress-drawn"]
+    more = {str(n): row for n, row in enumerate([*rows, worst])}
+    assert "Where it stayed the verdict was *use* in 2 of 4." in drawn.tables(record | {"rows": more})["stress-drawn"]
     masks = good | {"word": "check", "reason": "check: the mask of a leaves out 14 %"}
     for pixels, said in ((2, "0 name what is wrong with the stacks, 1 are"), (-2, "1 name what is wrong")):
-        rows = {"rows": {"0": masks | {"mask_pixels": pixels}}}
-        assert said in drawn.tables(record | rows)["stress-drawn"]
+        only = {"rows": {"0": masks | {"mask_pixels": pixels}}}
+        assert said in drawn.tables(record | only)["stress-drawn"]
