@@ -24,6 +24,9 @@ STEPS = (10, 20, 40, 80, 160, 320)
 
 NEAR_DB = 0.1
 
+_GAUSSIANS_ALONE = {"held_out": None, "prior_weight": 0.0, "voxel_correction": None}
+"""What comes after the fit makes good on voxels what too few steps have left, and takes no steps."""
+
 _NO_AMPLITUDES = {"prior_stage.amplitude_iterations": 0, "slice_stage.amplitude_iterations": 0}
 _UNFITTED = {"use_prior": False, "prior_stage.n_steps": 0}
 
@@ -75,7 +78,7 @@ def measure(folder: Path, way: str, n_steps: int, options: argparse.Namespace) -
     """
     case = read_case(folder)
     motion = registered_once(folder, options.preset, options.ckpt)
-    own = changed(PRESETS[options.preset], {**WAYS[way], "slice_stage.n_steps": n_steps})
+    own = changed(PRESETS[options.preset], {**_GAUSSIANS_ALONE, **WAYS[way], "slice_stage.n_steps": n_steps})
     result = GaussianReconstructor(options.ckpt, own).reconstruct(case.stacks, motion)
     found = quality(case, result.volume, result.grid.affine, pose_table(result.slices))
     seconds = result.record.cpu_seconds
