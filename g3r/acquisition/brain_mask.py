@@ -52,7 +52,7 @@ class FoundMask:
         return FileHash(self.source, hashlib.sha256(np.packbits(self.inside).tobytes()).hexdigest())
 
 
-def without_surroundings(volume: Volume) -> FoundMask | None:
+def empty_background_mask(volume: Volume) -> FoundMask | None:
     """The positive voxels of an image that shows the brain alone; None where tissue surrounds it.
 
     Args:
@@ -88,7 +88,7 @@ def required_mask(volume: Volume) -> FoundMask:
     Raises:
         InputError: there are surroundings, and nobody says what is brain.
     """
-    found = without_surroundings(volume)
+    found = empty_background_mask(volume)
     if found is None:
         zeros = 100 * float(np.mean(np.nan_to_num(volume.data) == 0))
         raise InputError(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-UNRELIABLE = "registration unreliable: do not rely on this volume"
+
 
 AUTO = ["auto"]
 """Masks of all series are to be found."""
@@ -225,14 +225,16 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
         return
     from g3r.dicom.volume_series import write_volume_series
 
+        from g3r.report.verdict import verdict_of
+
     registration = result.record.registration
-    unreliable = registration is not None and registration.reliable is False
+
     write_volume_series(
         options.dicom_out,
         result.volume,
         result.grid.affine,
         dicom.study,
         in_scanner_space=registration is not None and registration.space == "scanner",
-        remark=UNRELIABLE if unreliable else "",
+        remark=f"verdict: {verdict_of(result.record).line()}",
     )
     print(f"DICOM:   {options.dicom_out} (names the patient)")

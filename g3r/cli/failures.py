@@ -51,7 +51,7 @@ def missing_extra(error: ModuleNotFoundError) -> str:
     """
     for extra, packages in EXTRAS.items():
         if (error.name or "").split(".")[0] in packages:
-            return f"{error.name} is not installed; install the {extra} extra: pip install 'g3r[{extra}]'"
+            return f"{error.name} is not installed; install the {extra} extra: pip install '.[{extra}]' in a checkout"
     raise error
 
 

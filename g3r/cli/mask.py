@@ -115,13 +115,13 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
     Raises:
         InputError: the stack cannot be read, shows no head, or the masker failed.
     """
-    from g3r.acquisition.brain_mask import without_surroundings
+    from g3r.acquisition.brain_mask import empty_background_mask
     from g3r.acquisition.images import load_volume, save_volume
     from g3r.acquisition.stacks import load_stack
     from g3r.output.mask_picture import save_mask_picture
 
     volume = load_volume(path)
-    found = without_surroundings(volume) or masker(path, volume)
+    found = empty_background_mask(volume) or masker(path, volume)
     if isinstance(found, str):
         raise InputError(f"{volume.name}: {found}")
     stack = load_stack(path, found, float(volume.grid.spacing_mm.max()))

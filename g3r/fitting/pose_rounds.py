@@ -25,7 +25,7 @@ from g3r.gaussians import render
 from g3r.registration import Registration
 from g3r.registration.held_out import fine_held_out_correlations
 from g3r.registration.motion_shear import without_excess_shear
-from g3r.registration.normal_equations import SliceModel as SamplingModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
 
@@ -191,7 +191,7 @@ def _registered_to_fit(
     grid = prior.volumes.grid
     volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * prior.support
     slices: Slices = prior.volumes.slices.with_pose(fit.slices.planes.pose)
-    model = SamplingModel(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
+    model = SampledSlices(slices, volume, grid, stride=max(1, len(slices.pixel_index) // MAX_PIXELS))
     gain: NDArray[np.float64] = fit.gain
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     at_start = model.evaluate(slices.planes, gain, width)

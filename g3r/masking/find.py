@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g3r.acquisition.brain_mask import WAYS_ON, FoundMask, without_surroundings
+from g3r.acquisition.brain_mask import WAYS_ON, FoundMask, empty_background_mask
 from g3r.acquisition.images import Volume, load_volume, names_of
 from g3r.errors import InputError
 
@@ -61,7 +61,7 @@ def find_masks(
     found_ml: dict[int, float] = {}
     left_out: list[str] = []
     for n, volume in volumes.items():
-        found = without_surroundings(volume) or masker(paths[n], volume)
+        found = empty_background_mask(volume) or masker(paths[n], volume)
         if isinstance(found, str):
             left_out.append(f"{volume.name}: left out, {found}")
             continue

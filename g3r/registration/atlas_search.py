@@ -21,7 +21,7 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.held_out import predict
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.pose_sampling import angle_deg, rotations_about, uniform_rotations
-from g3r.registration.similarity import StackSamples, correlation, own_moments
+from g3r.registration.similarity import StackSamples, correlation
 from g3r.registration.so3_search import N_ORIENTATIONS, best_orientations, place_around, stack_orientations
 
 logger = logging.getLogger(__name__)
@@ -71,13 +71,11 @@ class AtlasPlacement:
         placement: of each stack.
         template: the one used.
         templates: those of about the subject's size.
-        correlation: of all slices with it, as placed.
     """
 
     placement: list[Placement]
     template: FittedTemplate
     templates: list[FittedTemplate]
-    correlation: float
 
     def motion(self, n_slices: int, samples: list[StackSamples]) -> RigidPose:
         """Motions [K] of all slices (world from header)."""
@@ -114,11 +112,7 @@ def place_in_atlas(
             _refined(sample, one, fitted, rotation_deg, translation_mm, rng)
             for sample, one in zip(samples, placement, strict=True)
         ]
-    moments = [
-        own_moments(sample.pixels, fitted.volume, fitted.grid, one.motion)
-        for sample, one in zip(samples, placement, strict=True)
-    ]
-    return AtlasPlacement(placement, fitted, templates, float(correlation(np.concatenate(moments).sum(0))))
+    return AtlasPlacement(placement, fitted, templates)
 
 
 def template_fits(slices: Slices, template: AtlasTemplate) -> bool:

@@ -78,7 +78,7 @@ class GlobalSearch:
         if self.settings.network:
             initialisations |= dict(proposals)
         if self.settings.stacks:
-            initialisations["stacks"] = register_stacks(self.slices)[0].world_from_header()
+            initialisations["stacks"] = register_stacks(self.slices).world_from_header()
         best: SearchResult | None = None
         for attempt in range(max(1, self.settings.attempts)):
             rng = np.random.default_rng([self.settings.seed, attempt])
@@ -113,7 +113,7 @@ class GlobalSearch:
             others = [aligned_to(slices, motion, other) for key, other in initialisations.items() if key != name]
             segmented, placements = refine_segments(slices, samples, motion, others, rng, deadline, fill, score)
             interleave = [placement.segments.interleave for placement in placements]
-            segmented, _ = collapse_to_rigid(slices, samples, segmented, interleave, fill)
+            segmented = collapse_to_rigid(slices, samples, segmented, interleave, fill)
             after = held_out_score(slices, samples, segmented, fill)
             # in parts of a head, segments gain less; what the template alone placed has nothing to lose by the others
             needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN

@@ -21,7 +21,7 @@ from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.held_out import fine_volume_without
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.pose_sampling import perturbed
 from g3r.registration.similarity import SearchPixels, correlation
 from g3r.registration.slice_registration import register_slices
@@ -118,7 +118,7 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry
     mirrored = VolumeGrid(grid.shape, MIRROR @ grid.affine)
     moved = _moved_as_one(own, volume, mirrored, rng)
     stride = max(1, len(own.pixel_index) // MAX_PIXELS)
-    here, there = SliceModel(own, volume, grid, stride=stride), SliceModel(moved, volume, mirrored, stride=stride)
+    here, there = SampledSlices(own, volume, grid, stride=stride), SampledSlices(moved, volume, mirrored, stride=stride)
     # where the others saw one side alone, the stack is like the side that is not zero
     seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
     value, plane = here.value[seen], here.operator.plane[seen]
@@ -139,7 +139,7 @@ def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rn
     return own.with_pose(motion.take(np.zeros(len(own), int)) @ own.planes.pose)
 
 
-def _registered(model: SliceModel, slices: Slices) -> NDArray[np.float32]:
+def _registered(model: SampledSlices, slices: Slices) -> NDArray[np.float32]:
     """What a volume says of the pixels after each slice was registered to it."""
     gain = np.ones(len(slices))
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)

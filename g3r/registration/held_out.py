@@ -113,11 +113,6 @@ class Prediction:
         """Over all pixels, outline included."""
         return float(correlation(self.moments.sum(0)))
 
-    @property
-    def slice_correlation(self) -> NDArray[np.float64]:
-        """Of each slice [K]."""
-        return correlation(self.moments)
-
     def agreement(self, weight: NDArray[np.float64]) -> float:
         """Correlation over the pixels of the slices that count, where those that do not are few; else over all.
 

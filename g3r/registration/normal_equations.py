@@ -46,7 +46,7 @@ class NormalEquations:
         return correlation(self.moments)
 
 
-class SliceModel:
+class SampledSlices:
     """Data that stay the same while poses change: pixels, PSF nodes, the volume.
 
     Args:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.slice_registration import register_slices
 from g3r.registration.slice_rounds import OVER_RELAXATION, carried_on
 from g3r.registration.thresholds import MIN_PRIOR_LOSS_REMOVED
@@ -41,7 +41,7 @@ def register_to_prior(
     Returns:
         Slices, gains, and whether they were moved; the given ones where the loss fell too little.
     """
-    model = SliceModel(slices, prior, grid, stride=max(1, len(slices.pixel_index) // 100_000))
+    model = SampledSlices(slices, prior, grid, stride=max(1, len(slices.pixel_index) // 100_000))
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     before = model.evaluate(slices.planes, gain, width)
     moved, new_gain, after = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)

@@ -18,7 +18,7 @@ from g3r.registration.held_out import (
     predict,
     volume_without,
 )
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.placement import Placement, refine_placement
 from g3r.registration.similarity import StackSamples
 from g3r.registration.so3_search import place_around, stack_orientations
@@ -160,8 +160,8 @@ def collapse_to_rigid(
     motion: RigidPose,
     interleave: list[int],
     fill: TemplateFill | None = None,
-) -> tuple[RigidPose, list[bool]]:
-    """Give each stack one motion for all its slices where that predicts them as well.
+) -> RigidPose:
+    """Motions [K] in which each stack has one for all its slices where that predicts them as well.
 
     Args:
         slices: of two or more stacks.
@@ -169,17 +169,12 @@ def collapse_to_rigid(
         motion: [K] world from header, in segments.
         interleave: acquisition order of each stack.
         fill: see `volume_without`.
-
-    Returns:
-        Motions [K], and for each stack whether it is rigid now.
     """
-    rigid = []
     for sample, order in zip(samples, interleave, strict=True):
         volume, grid = volume_without(slices.with_motion(motion), sample.stack, RIGID_VOXEL_MM, fill)
-        own, is_rigid = rigid_or_segments(slices, sample, motion.take(sample.rows), order, volume, grid)
+        own, _ = rigid_or_segments(slices, sample, motion.take(sample.rows), order, volume, grid)
         motion = motion.with_rows(sample.rows, own)
-        rigid.append(is_rigid)
-    return motion, rigid
+    return motion
 
 
 def rigid_or_segments(
@@ -220,6 +215,6 @@ def _rigid_motion(stack: Slices, motion: RigidPose, volume: NDArray[np.float32],
     """The best single motion [K, all the same] near motions [K]."""
     identity = RigidPose.identity(len(stack))
     mean = aligned_to(stack, motion, identity)
-    model = SliceModel(stack, volume, grid, stride=max(1, len(stack.pixel_index) // 15_000), psf_points=3)
+    model = SampledSlices(stack, volume, grid, stride=max(1, len(stack.pixel_index) // 15_000), psf_points=3)
     pose = refine_stack(model, stack, mean @ stack.header_pose, n_steps=10)
     return pose @ stack.header_pose.inverse()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import orthonormal, rotation_matrix
-from g3r.registration.normal_equations import NormalEquations, SliceModel
+from g3r.registration.normal_equations import NormalEquations, SampledSlices
 
 MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.06, 2.0
 """Trust region of one step of a slice."""
@@ -36,7 +36,7 @@ passes of an interleaved stack, neighbours are elsewhere for good reason."""
 
 
 def register_slices(
-    model: SliceModel,
+    model: SampledSlices,
     slices: Slices,
     gain: NDArray[np.float64],
     *,
@@ -78,7 +78,9 @@ def register_slices(
     return slices.with_pose(pose), np.exp(log_gain - log_gain.mean()), current
 
 
-def try_neighbours(model: SliceModel, slices: Slices, gain: NDArray[np.float64], *, width: float) -> tuple[Slices, int]:
+def try_neighbours(
+    model: SampledSlices, slices: Slices, gain: NDArray[np.float64], *, width: float
+) -> tuple[Slices, int]:
     """Give every slice the motion of a neighbour in the stack where that fits clearly better.
 
     A slice in a wrong local minimum sees no gradient towards its place; its neighbours are mostly near it.

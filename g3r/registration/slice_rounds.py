@@ -16,7 +16,7 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width, slice_weights
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.slice_registration import UNSEEN_NORMAL_TIE, register_slices, try_neighbours
 from g3r.registration.stray_slices import find_strays
@@ -140,7 +140,7 @@ class _Rounds:
         n_wanted = settings.max_pixels / (voxel / settings.finest_voxel_mm)
         stride = max(1, round(len(self.slices.pixel_index) / n_wanted))
         self.volume = _volume_of(self.slices, self.grid, self.gain, self.weight, self.volume, smoothness, stride)
-        model = SliceModel(self.slices, self.volume, self.grid, stride=stride)
+        model = SampledSlices(self.slices, self.volume, self.grid, stride=stride)
         width = robust_width(model.residuals(self.slices.planes, self.gain), n_sigma=2)
         moved = n_found
         if 0.1 < fraction < 0.8:
@@ -194,7 +194,7 @@ def fitted_in_place(
     for number in range(n_rounds):
         progress(number, n_rounds)
         volume = _volume_of(slices, grid, gain, weight, volume, 0.03, stride)
-        model = SliceModel(slices, volume, grid, stride=stride)
+        model = SampledSlices(slices, volume, grid, stride=stride)
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         fit = model.evaluate(slices.planes, gain, width)
         yy, mm, ym = fit.moments[:, 3:].T
@@ -263,4 +263,4 @@ def correlation_with_all(
     """
     grid, stride = grid_around(slices, voxel_mm), max(1, round(len(slices.pixel_index) / max_pixels))
     volume = _volume_of(slices, grid, gain, weight, None, 0.03, stride)
-    return SliceModel(slices, volume, grid, stride=stride).evaluate(slices.planes, gain, 1.0).ncc
+    return SampledSlices(slices, volume, grid, stride=stride).evaluate(slices.planes, gain, 1.0).ncc

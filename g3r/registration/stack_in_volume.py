@@ -19,7 +19,7 @@ from g3r.acquisition.smooth_fill import smooth_fill
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.grid import bounding_box, on_grid
 from g3r.registration.held_out import HELD_OUT_VOXEL_MM, estimate_interleave, predict
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.placement import refine_placement
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_registration import register_slices
@@ -60,7 +60,7 @@ def place_in_volume(
     continued = smooth_fill(volume, (volume != 0).astype(np.float32))
     for sigma_mm in BLUR_MM:
         blurred = gaussian_filter(continued, sigma_mm / grid.spacing_mm) if sigma_mm else continued
-        model = SliceModel(slices, blurred, grid)
+        model = SampledSlices(slices, blurred, grid)
         width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
         slices, gain, _ = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)
     return slices, correlation

@@ -22,7 +22,7 @@ from g3r.acquisition.robust import robust_width
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose
 from g3r.geometry.rigid import rotation_matrix
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.similarity import correlation
 
 logger = logging.getLogger(__name__)
@@ -34,31 +34,25 @@ MAX_ROTATION_RAD, MAX_TRANSLATION_MM = 0.12, 4.0
 """Trust region of one Gauss-Newton step of a stack."""
 
 
-def register_stacks(slices: Slices) -> tuple[Slices, list[float]]:
+def register_stacks(slices: Slices) -> Slices:
     """Bring all stacks into the frame of the most self-consistent one.
 
     Args:
         slices: slices of all stacks at their header poses, normalised.
-
-    Returns:
-        The slices in new poses, and for each stack its correlation with the volume of the stacks that were
-        registered before it (1.0 for the first).
     """
     stacks = np.unique(slices.stack_id)
     if len(stacks) == 1:
-        return slices, [1.0]
+        return slices
     order = sorted(stacks, key=lambda s: -self_consistency(slices.take(slices.stack_id == s)))
-    agreement = {int(order[0]): 1.0}
     done = [order[0]]
     for stack in order[1:]:
         moving = slices.stack_id == stack
         fixed_slices = slices.take(np.isin(slices.stack_id, done))
         pose, ncc = _register_one(slices.take(moving), fixed_slices)
-        agreement[int(stack)] = ncc
         slices = slices.with_pose(slices.planes.pose.with_rows(moving, pose))
         done.append(stack)
         logger.debug("stack %d registered, correlation %.3f", stack, ncc)
-    return slices, [agreement[int(s)] for s in stacks]
+    return slices
 
 
 def self_consistency(stack: Slices) -> float:
@@ -91,7 +85,7 @@ def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
     volume = solve_volume(operator, fixed.value[index], np.ones(len(index), np.float32), smoothness=0.1)
     volume = gaussian_filter(volume, 0.8)
     stride = max(1, len(moving.pixel_index) // 15_000)
-    coarse = SliceModel(moving, volume, grid, stride=stride, psf_points=3)
+    coarse = SampledSlices(moving, volume, grid, stride=stride, psf_points=3)
     moving_center, fixed_center = _centroid(moving), _centroid(fixed)
     starts = []
     for angles in itertools.product(SEARCH_ANGLES_DEG, repeat=3):
@@ -102,7 +96,7 @@ def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
             pose = motion @ moving.planes.pose
             starts.append((_agreement(coarse, moving, pose), pose))
     starts.sort(key=lambda item: -item[0])
-    fine = SliceModel(moving, volume, grid, stride=max(1, stride // 3), psf_points=3)
+    fine = SampledSlices(moving, volume, grid, stride=max(1, stride // 3), psf_points=3)
     refined = []
     for _, pose in starts[:N_REFINED]:
         pose = refine_stack(coarse, moving, pose, n_steps=8)
@@ -116,13 +110,13 @@ def _centroid(slices: Slices) -> NDArray[np.float64]:
     return slices.planes.pixel_world_mm(slices.pixel_index).mean(0)
 
 
-def _agreement(model: SliceModel, slices: Slices, pose: RigidPose) -> float:
+def _agreement(model: SampledSlices, slices: Slices, pose: RigidPose) -> float:
     """Correlation over all pixels of a stack."""
     equations = model.evaluate(slices.planes.with_pose(pose), np.ones(len(slices)), 1.0)
     return float(correlation(equations.moments.sum(0)))
 
 
-def refine_stack(model: SliceModel, slices: Slices, pose: RigidPose, n_steps: int) -> RigidPose:
+def refine_stack(model: SampledSlices, slices: Slices, pose: RigidPose, n_steps: int) -> RigidPose:
     """Levenberg-Marquardt on one rigid motion of a whole stack.
 
     A world twist (W, V) about the centre c moves slice k in its own frame by w = R^T W and

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from g3r.geometry import RigidPose, VolumeGrid
+from g3r.geometry.grid import on_grid
 
 FULL_COVERAGE = 0.3
 """Share of the typical coverage of a voxel by pixels from which on the template does not count."""
@@ -39,7 +40,7 @@ class TemplateFill:
     def grid_with(self, grid: VolumeGrid) -> VolumeGrid:
         """A grid that covers another one and the whole head, with its voxels."""
         head = self.grid.world(np.argwhere(self.volume > 0))
-        corners = grid.world(np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(grid.shape) - 1))
+        corners = grid.world(grid.corner_index)
         both = np.concatenate([head, corners])
         return VolumeGrid.isotropic(both.min(0), both.max(0), float(grid.spacing_mm[0]), 0.0)
 
@@ -53,7 +54,7 @@ class TemplateFill:
             grid: its grid.
             coverage: [I, J, K] pixels of those slices (outside the head, too), spread by the PSF.
         """
-        head = resampled(self.volume, self.grid, grid)
+        head = on_grid(self.volume, self.grid, grid, 0.0)
         share = coverage_share(coverage)
         known = (share >= 1) & (head > 0)
         scale = 1.0
@@ -67,11 +68,6 @@ def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:
     some = coverage > 0.1 * coverage.max(initial=0)
     typical = float(np.median(coverage[some])) if some.any() else 1.0
     return np.minimum(coverage / np.float32(FULL_COVERAGE * typical), 1.0).astype(np.float32)
-
-
-def resampled(volume: NDArray[np.float32], grid: VolumeGrid, onto: VolumeGrid) -> NDArray[np.float32]:
-    """A volume on another grid (trilinear), 0 outside its own."""
-    return sampled(volume, grid, onto.world(np.indices(onto.shape).reshape(3, -1).T)).reshape(onto.shape)
 
 
 def sampled(volume: NDArray[np.float32], grid: VolumeGrid, point_mm: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -133,6 +133,6 @@ def remaining_share(
 
 def _coarse(grid: VolumeGrid) -> VolumeGrid:
     """Coarse voxels over all of a grid, of at least its own size."""
-    corners = grid.world(np.array(np.meshgrid(*[(0, n - 1) for n in grid.shape])).reshape(3, -1).T)
+    corners = grid.world(grid.corner_index)
     voxel_mm = max(PROBE_VOXEL_MM, float(grid.spacing_mm.max()))
     return VolumeGrid.isotropic(corners.min(0), corners.max(0), voxel_mm, voxel_mm)

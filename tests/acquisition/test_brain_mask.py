@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g3r.acquisition.brain_mask import required_mask, whole_image, without_surroundings
+from g3r.acquisition.brain_mask import empty_background_mask, required_mask, whole_image
 from g3r.acquisition.images import Volume
 from g3r.errors import InputError
 
@@ -26,7 +26,7 @@ def stack(inside: np.ndarray, around: float = 0.0) -> Volume:
 
 
 def test_a_brain_before_nothing_is_its_own_mask() -> None:
-    found = without_surroundings(stack(ball(12)))
+    found = empty_background_mask(stack(ball(12)))
     assert found is not None
     np.testing.assert_array_equal(found.inside, ball(12))
     assert found.source == "empty background"
@@ -36,7 +36,7 @@ def test_a_brain_before_nothing_is_its_own_mask() -> None:
 def test_nan_around_a_brain_is_nothing_too() -> None:
     volume = stack(ball(12))
     volume.data[~ball(12)] = np.nan
-    found = without_surroundings(volume)
+    found = empty_background_mask(volume)
     assert found is not None
     np.testing.assert_array_equal(found.inside, ball(12))
 
@@ -53,7 +53,7 @@ def test_nan_around_a_brain_is_nothing_too() -> None:
     ids=["tissue around it", "no background", "too small", "too large", "nothing at all"],
 )
 def test_without_a_mask_anything_else_is_refused(volume: Volume) -> None:
-    assert without_surroundings(volume) is None
+    assert empty_background_mask(volume) is None
     with pytest.raises(InputError, match=r"a\.nii\.gz: no mask says .*--masks.*--mask-command.*--whole-image"):
         required_mask(volume)
 

@@ -23,4 +23,4 @@ def test_a_command_names_the_extra_that_it_needs(command: str, subject: Path) ->
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
-    assert f"pip install 'g3r[{extra}]'" in done.stderr
+    assert f"pip install '.[{extra}]' in a checkout" in done.stderr

@@ -196,5 +196,7 @@ def test_stacks_and_a_reference(examination: Examination, tmp_path: Path, monkey
     assert main([str(word) for word in (*inputs, *outputs)]) == 0
     one = pydicom.dcmread(tmp_path / "series" / "0001.dcm")
     assert str(one.PatientName).startswith("Xenobia")
-    assert one.ImageComments.endswith("not for diagnosis; registration unreliable: do not rely on this volume")
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["partial"] is False
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["verdict"] == "do not use"
+    assert one.ImageComments == f"For research only, not for diagnosis; verdict: do not use: {'; '.join(record['reasons'])}"
+    assert record["partial"] is False

@@ -67,7 +67,6 @@ def test_a_head_in_any_orientation_is_found_and_set_upright(
     error = pixel_errors_mm(slices.with_motion(motion), truth)
     assert np.median(error) < 2
     assert error.max() < 5
-    assert placed.correlation > 0.7
     assert max(angle_deg(m @ rotation, np.eye(3)) for m in motion.rotation) < 15
     # the atlas frame is that of the phantom, but for the turn
     upright = standard_orientation(slices, placed.templates, motion, rng)

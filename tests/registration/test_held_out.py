@@ -44,7 +44,7 @@ def test_a_score_has_a_prediction_for_every_stack_and_slice(
     scores = held_out_score(slices, samples, truth)
     assert len(scores.prediction) == 3
     for stack, one in enumerate(scores.prediction):
-        assert one.slice_correlation.shape == ((slices.stack_id == stack).sum(),)
+        assert one.moments.shape == ((slices.stack_id == stack).sum(), 6)
     assert scores.cost == pytest.approx(sum(p.cost for p in scores.prediction))
 
 

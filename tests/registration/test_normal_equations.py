@@ -11,7 +11,7 @@ from g3r.acquisition.psf import psf_variance_mm2
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import rotation_matrix
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.similarity import correlation
 
 AFFINE = np.eye(4)
@@ -87,7 +87,7 @@ def jacobian(slices: Slices, gain: np.ndarray, size: float = 1e-6) -> np.ndarray
 @pytest.mark.parametrize("width", [0.05, 1e6])
 def test_gradient_and_hessian_against_finite_differences(width: float) -> None:
     slices, gain = make_slices()
-    equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, width)
+    equations = SampledSlices(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, width)
     derivative = jacobian(slices, gain)
     residual = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
     factor = 1 / (1 + (residual / width) ** 2)
@@ -103,7 +103,7 @@ def test_gradient_and_hessian_against_finite_differences(width: float) -> None:
 def test_the_gradient_is_that_of_the_cauchy_loss() -> None:
     slices, gain = make_slices(1)
     width, size = 0.1, 1e-5
-    model = SliceModel(slices, smooth_volume(), GRID)
+    model = SampledSlices(slices, smooth_volume(), GRID)
 
     def energy(pose: RigidPose, gain: np.ndarray) -> np.ndarray:
         equations = model.evaluate(slices.planes.with_pose(pose), gain, width)
@@ -118,7 +118,7 @@ def test_the_gradient_is_that_of_the_cauchy_loss() -> None:
 
 def test_statistics_are_those_of_the_pixels() -> None:
     slices, gain = make_slices(2)
-    equations = SliceModel(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
+    equations = SampledSlices(slices, smooth_volume(), GRID).evaluate(slices.planes, gain, 0.1)
     model = model_pixels(slices, slices.planes.pose, np.ones(len(slices)))
     for k in range(len(slices)):
         y, m = slices.masked_value[slices.pixel_plane == k].astype(float), model[slices.pixel_plane == k]
@@ -129,7 +129,7 @@ def test_statistics_are_those_of_the_pixels() -> None:
 
 def test_stride_takes_every_nth_pixel_and_residuals_match() -> None:
     slices, gain = make_slices(3)
-    model = SliceModel(slices, smooth_volume(), GRID, stride=3)
+    model = SampledSlices(slices, smooth_volume(), GRID, stride=3)
     expected = slices.masked_value - model_pixels(slices, slices.planes.pose, gain)
     np.testing.assert_allclose(model.residuals(slices.planes, gain), expected[::3], atol=1e-5)
     assert model.evaluate(slices.planes, gain, 1.0).moments[:, 0].sum() == len(expected[::3])
@@ -137,7 +137,7 @@ def test_stride_takes_every_nth_pixel_and_residuals_match() -> None:
 
 def test_losses_are_those_of_the_equations() -> None:
     slices, gain = make_slices(4)
-    model = SliceModel(slices, smooth_volume(), GRID)
+    model = SampledSlices(slices, smooth_volume(), GRID)
     expected = model.evaluate(slices.planes, gain, 0.1).loss
     np.testing.assert_allclose(model.losses(slices.planes, gain, 0.1), expected, rtol=1e-4)
 
@@ -153,7 +153,7 @@ def test_equations_of_many_pixels_are_sums_of_those_of_some() -> None:
     parts = []
     for mask in (np.ones(planes.n_pixels, bool), chosen, ~chosen):
         slices = replace(small, planes=planes, value=value, mask=mask)
-        parts.append(SliceModel(slices, smooth_volume(), GRID).evaluate(planes, gain, 0.1))
+        parts.append(SampledSlices(slices, smooth_volume(), GRID).evaluate(planes, gain, 0.1))
     whole, first, second = parts
     assert (whole.moments[:, 0] == 1600).all()
     for name in ("hessian", "gradient", "moments"):
@@ -165,7 +165,7 @@ def test_equations_of_many_pixels_are_sums_of_those_of_some() -> None:
 def test_slices_outside_the_volume_have_no_derivative_and_correlation_zero() -> None:
     slices, gain = make_slices(5)
     away = slices.with_pose(RigidPose(slices.planes.rotation, slices.planes.center_mm + 500))
-    equations = SliceModel(away, smooth_volume(), GRID).evaluate(away.planes, gain, 0.1)
+    equations = SampledSlices(away, smooth_volume(), GRID).evaluate(away.planes, gain, 0.1)
     assert (equations.hessian == 0).all()
     assert (equations.ncc == 0).all()
     assert np.isfinite(equations.loss).all()

@@ -10,7 +10,7 @@ from g3r.acquisition.least_squares import solve_volume
 from g3r.acquisition.planes import Slices
 from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import RigidPose, VolumeGrid
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.slice_registration import register_slices, try_neighbours
 from tests.registration.moving_heads import as_slices, pixel_errors_mm, slices_disturbed
 
@@ -28,7 +28,7 @@ def test_slices_find_back_to_a_volume(still: list[SimulatedStack]) -> None:
     start = slices_disturbed(slices, 2.0, 1.2)
     gain = np.exp(np.random.default_rng(1).normal(0, 0.1, len(slices)))
     dark = replace(start, value=(start.value * np.repeat(gain, np.diff(start.planes.offset))).astype(np.float32))
-    model = SliceModel(dark, volume, grid)
+    model = SampledSlices(dark, volume, grid)
     found, found_gain, fit = register_slices(model, dark, np.ones(len(slices)), n_steps=15, width=0.08)
     before, after = pixel_errors_mm(start, truth), pixel_errors_mm(found, truth)
     assert np.median(after) < 0.3 * np.median(before)
@@ -43,7 +43,7 @@ def test_registration_never_makes_the_fit_worse(still: list[SimulatedStack]) -> 
     slices, _ = as_slices(still)
     volume, grid = true_volume(slices)
     start = slices_disturbed(slices, 6.0, 4.0)
-    model = SliceModel(start, volume, grid)
+    model = SampledSlices(start, volume, grid)
     ones = np.ones(len(slices))
     before = model.evaluate(start.planes, ones, 0.1).loss
     _, _, fit = register_slices(model, start, ones, n_steps=6, width=0.1)
@@ -58,7 +58,7 @@ def test_a_slice_that_lost_its_way_takes_its_neighbours_place(still: list[Simula
     center = slices.planes.center_mm.copy()
     center[lost] += [9.0, -7, 6]
     astray = slices.with_pose(RigidPose(slices.planes.rotation, center))
-    model = SliceModel(astray, volume, grid)
+    model = SampledSlices(astray, volume, grid)
     found, n_moved = try_neighbours(model, astray, np.ones(len(slices)), width=0.1)
     assert n_moved >= 1
     np.testing.assert_allclose(found.planes.center_mm[lost], slices.planes.center_mm[lost], atol=1e-6)

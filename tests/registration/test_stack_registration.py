@@ -28,20 +28,15 @@ def test_stacks_come_together_from_15_degrees_and_5_mm(still: list[SimulatedStac
         )
     )
     before = pixel_errors_mm(slices, truth).mean()
-    registered, agreement = register_stacks(slices)
+    registered = register_stacks(slices)
     after = pixel_errors_mm(registered, truth).mean()
     assert before > 1.5
     assert after < 1.0
-    assert len(agreement) == 3
-    assert max(agreement) == 1.0
-    assert min(agreement) > 0.4  # volumes of the search are blurred
 
 
 def test_one_stack_is_left_where_it_is(still: list[SimulatedStack]) -> None:
     slices, _ = as_slices(still[:1])
-    registered, agreement = register_stacks(slices)
-    assert registered is slices
-    assert agreement == [1.0]
+    assert register_stacks(slices) is slices
 
 
 def test_self_consistency_is_lower_with_motion(head: Phantom, still: list[SimulatedStack]) -> None:

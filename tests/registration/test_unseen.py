@@ -8,7 +8,7 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.rigid import rotation_matrix
 from g3r.registration.held_out import held_out_score, volume_without
-from g3r.registration.normal_equations import SliceModel
+from g3r.registration.normal_equations import SampledSlices
 from g3r.registration.overlap import overlap_of
 from g3r.registration.similarity import StackSamples
 from g3r.registration.slice_registration import NeighbourTie
@@ -109,7 +109,7 @@ def test_whole_stacks_keep_their_motion(still_slices: tuple[Slices, RigidPose]) 
 
 def test_the_tie_of_unseen_slices_is_along_the_normal(holed: Slices) -> None:
     volume, grid = volume_without(holed, -1, 3.2)
-    equations = SliceModel(holed, volume, grid).evaluate(holed.planes, np.ones(len(holed)), 0.1)
+    equations = SampledSlices(holed, volume, grid).evaluate(holed.planes, np.ones(len(holed)), 0.1)
     usual = NeighbourTie.of(holed, equations).precision
     held = NeighbourTie.of(holed, equations, np.linspace(0, 1, len(holed))).precision
     assert (held[:, :5] == usual[:, :5]).all()

@@ -36,7 +36,8 @@ GOOD = {"stack mirrored": MIRRORED_BELOW, "perhaps mirrored": MIRRORED_BELOW, "s
 """Limits; of the others that of the agreement."""
 
 LINES = {
-    "unseen too much": f"N % of the brain was not seen by any slice (N ml) ..., above {100 * DO_NOT_USE_ABOVE:.0f} %",
+    "unseen too much": f"N % of the brain was not seen by any slice (N ml) ..., above {100 * DO_NOT_USE_ABOVE:.0f} %; "
+    "or: the field of view cuts the head: about N % of the brain lies beyond ...",
     "unseen": f"N % of the brain was not seen by any slice (N ml): it is shown as an estimate from other brains; from "
     f"{100 * MENTIONED_ABOVE:g} % on",
     "volume check": "the fit made the volume worse ..., or: the mean of the slices explains them better ...",
