@@ -133,20 +133,21 @@ def test_training_takes_a_template_of_another_age_and_validation_the_nearest() -
 
 
 FIGURES = {
-    "coarse": [0.173874, 0.312403],
-    "density": [1.20192, 0.887753],
-    "share": [0.156622, 0.342952],
-    "sharp": [0.176852, 0.286983],
-    "template": [0.116449, 0.262596],
-    "outline": [0.154735, 0.348627],
-    "truth": [0.123929, 0.295408],
-    "mask": [0.158331, 0.365051],
+    "coarse": [0.228616, 0.338295],
+    "density": [1.56158, 0.76188],
+    "share": [0.224108, 0.396208],
+    "sharp": [0.226325, 0.316122],
+    "template": [0.161803, 0.292276],
+    "outline": [0.223163, 0.400344],
+    "truth": [0.169934, 0.328681],
+    "mask": [0.225803, 0.41811],
 }
 """Mean and standard deviation of the images of one subject."""
 
 
 def test_the_synthesis_is_the_one_that_its_version_stands_for() -> None:
-    one = make_dataset(in_order=True, artefact_share=0.0).sample(0, 2)
+    # voxels fine enough that trilinear reading does not hide the profile of a pixel in plane
+    one = make_dataset(spacing_mm=1.2, in_order=True, artefact_share=0.0).sample(0, 2)
     found = {key: [float(f(getattr(one, key))) for f in (np.mean, np.std)] for key in IMAGE_KEYS}
     for key, figures in FIGURES.items():
         # far above what rounding differs by between machines; the template's place is searched for, less exactly
