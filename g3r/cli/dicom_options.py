@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-
 AUTO = ["auto"]
 """Masks of all series are to be found."""
 
@@ -224,8 +223,7 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
         logger.warning("--dicom-out: not written, because the run was interrupted")
         return
     from g3r.dicom.volume_series import write_volume_series
-
-        from g3r.report.verdict import verdict_of
+    from g3r.report.verdict import verdict_of
 
     registration = result.record.registration
 
