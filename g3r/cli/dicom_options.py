@@ -226,7 +226,6 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
     from g3r.report.verdict import verdict_of
 
     registration = result.record.registration
-
     write_volume_series(
         options.dicom_out,
         result.volume,
