@@ -224,11 +224,9 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
         logger.warning("--dicom-out: not written, because the run was interrupted")
         return
     from g3r.dicom.volume_series import write_volume_series
-
-        from g3r.report.verdict import verdict_of
+    from g3r.report.verdict import verdict_of
 
     registration = result.record.registration
-
     write_volume_series(
         options.dicom_out,
         result.volume,
