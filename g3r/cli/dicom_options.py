@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-
 AUTO = ["auto"]
 """Masks of all series are to be found."""
 

@@ -99,8 +99,7 @@ def write_volume_series(
     study: SourceStudy,
     *,
     in_scanner_space: bool,
-        remark: str,
-
+    remark: str,
 ) -> None:
     """Write a volume as a series of its examination; the folder appears whole or not at all.
 

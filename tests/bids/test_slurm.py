@@ -95,7 +95,9 @@ def test_without_slurm_or_the_extra(
         patch.delitem(sys.modules, "g3r.bids.slurm", raising=False)
         assert main(line) == 3
     said = capsys.readouterr().err
-    assert said == "g3r-bids: submitit is not installed; install the slurm extra: pip install '.[slurm]' in a checkout\n"
+    assert (
+        said == "g3r-bids: submitit is not installed; install the slurm extra: pip install '.[slurm]' in a checkout\n"
+    )
     pytest.importorskip("submitit", reason="the slurm extra is not installed")
     assert main(line) == 3
     said = capsys.readouterr().err
