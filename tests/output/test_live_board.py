@@ -59,7 +59,7 @@ def test_every_step_of_both_fits_is_written_when_it_is_done(
             during.append((moment.step, handed[n_before:], float(moment.cloud().amplitude.double().sum())))
 
     def counted(self: FileWriter, summary: Any, *arguments: Any, **options: Any) -> None:
-        step = options.get("global_step", arguments[0] if arguments else None)
+        step: Any = options.get("global_step", arguments[0] if arguments else None)
         handed.extend((value.tag, step) for value in summary.value)
         add(self, summary, *arguments, **options)
 
