@@ -6,13 +6,15 @@ makes it ring. It is not the motion from slice to slice, which `data_synth.motio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 import torchio as tio
 from numpy.typing import NDArray
+from torch import Tensor
 
 from data_synth.augment import applied
 from data_synth.simulator import SimulatedStack
@@ -45,16 +47,32 @@ def with_artefacts(stacks: Sequence[SimulatedStack], share: float, rng: np.rando
     for one in stacks:
         image = one.stack.image.copy()
         for k in np.flatnonzero(rng.random(image.shape[2]) < share):
-            image[:, :, k] = _with_artefact(image[:, :, k], one.stack.spacing_mm, transform, rng)
+            subject = _as_subject(torch.from_numpy(image[:, :, k]), one.stack.spacing_mm)
+            image[:, :, k] = _magnitude(applied(transform, subject, rng)).numpy()
         result.append(replace(one, stack=replace(one.stack, image=image)))
     return result
 
 
-def _with_artefact(
-    image: NDArray[np.float32], spacing_mm: NDArray[np.float64], transform: tio.Transform, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def slice_by_slice(transform: tio.Transform) -> Callable[[Tensor], Tensor]:
+    """A transform as a function of a stack [1, I, J, K] whose slices are taken one after another, in pixels.
+
+    Each slice draws anew from torch's generator, as a part of a transform that is `applied`.
+
+    Args:
+        transform: see `slice_artefacts`.
+    """
+    pixel = np.ones(2)
+    return lambda stack: torch.stack(
+        [_magnitude(transform(_as_subject(one, pixel))) for one in stack[0].unbind(-1)], dim=-1
+    )[None]
+
+
+def _as_subject(image: Tensor, spacing_mm: NDArray[np.float64]) -> tio.Subject:
+    """A slice [I, J] as torchio is to see it."""
     # the last axis counts torchio's k-space lines: it must be one of the plane
-    tensor = torch.from_numpy(np.ascontiguousarray(image))[None, None]
     affine = np.diag([SLICE_WIDTH_MM, spacing_mm[0], spacing_mm[1], 1.0])
-    result = applied(transform, tio.Subject(image=tio.ScalarImage(tensor=tensor, affine=affine)), rng)
-    return np.abs(result["image"].data[0, 0].numpy())  # scanners write magnitudes
+    return tio.Subject(image=tio.ScalarImage(tensor=image.contiguous()[None, None], affine=affine))
+
+
+def _magnitude(subject: Any) -> Tensor:
+    return subject["image"].data[0, 0].abs()  # scanners write magnitudes

@@ -7,17 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from g3r._version import __version__
-from g3r.errors import G3RError
+from g3r.cli.failures import EXPECTED, line_and_code
 
 BRIGHT = 1000.0
 """The 99.5th percentile of the truth in the mask; stacks are int16."""
 PHANTOM_SPACING_MM = 0.8
 MARGIN_VOXELS = 4
 """Background around the truth that is written."""
+LESS_MEMORY = "choose a coarser --resolution, or crop the volume"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code (0 done, 2 usage, 3 bad input)."""
+    """Run the command; return its exit code (0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted)."""
     parser = _parser()
     arguments = parser.parse_args(argv)
     if arguments.volume is not None and arguments.mask is None:
@@ -30,11 +31,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--seed {arguments.seed}; expected 0 or above")
     try:
         line = _simulate(arguments)
-    except G3RError as error:
-        print(f"g3r-simulate: {error}", file=sys.stderr)
-        return error.exit_code
+    except KeyboardInterrupt:
+        return _failed("interrupted; no simulation was written", 130)
+    except EXPECTED as error:
+        return _failed(*line_and_code(error, LESS_MEMORY))
     print(line)
     return 0
+
+
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-simulate: {line}", file=sys.stderr)
+    return exit_code
 
 
 def _parser() -> argparse.ArgumentParser:

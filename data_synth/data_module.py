@@ -30,7 +30,7 @@ class SyntheticDataModule(LightningDataModule):
     Args:
         source: `phantom`, or a folder of NIfTI volumes with masks (see `data_synth.atlas`).
         include: glob patterns of subject names for training; none takes all.
-        exclude: glob patterns of subject names not to train on.
+        exclude: glob patterns of subject names neither to train nor to validate on.
         val_include: glob patterns of subject names to validate on; they are not trained on. None validates on
             other simulations of the training subjects, which flatters the network, and says so.
         num_workers: worker processes that make training data.

@@ -21,7 +21,14 @@ N_PHANTOMS = 24
 """Phantoms made for training; each varies further by augmentation."""
 
 WEEKS_RANGE = (15.0, 45.0)
-"""Gestational ages that a number in a subject's name may mean."""
+"""Gestational ages that a name may state."""
+
+WEEKS_IN_NAME = re.compile(
+    r"(?<![a-z])(?:sta|sb|ga|weeks?)[-_]?(\d+(?:\.\d+)?)"  # sta27, sb23-notoperated, ga-31.5, week27, weeks-27
+    r"|(?<![\d.])(\d+(?:\.\d+)?)[-_]?w(?:eeks?)?(?![a-z])",  # 27w, 27-weeks
+    re.IGNORECASE,
+)
+"""An age in a name is marked as one: a bare number is more often that of a subject (`sub-020`, `case31`)."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +70,7 @@ def training_and_validation(
     Args:
         source: `phantom`, or an atlas folder.
         include: glob patterns of names for training; none takes all.
-        exclude: glob patterns of names not to train on.
+        exclude: glob patterns of names neither to train nor to validate on.
         val_include: glob patterns of names to validate on, which are not trained on; without any, the
             training subjects are taken, and a warning says so.
         n_val_phantoms: phantoms to validate on.
@@ -79,7 +86,7 @@ def training_and_validation(
         )
     train: list[Subject] = [*find_subjects(source, include or (), [*(exclude or ()), *(val_include or ())])]
     if val_include:
-        return train, [*find_subjects(source, val_include)]
+        return train, [*find_subjects(source, val_include, exclude or ())]
     logger.warning("no val_include given: validating on other simulations of the training subjects")
     return train, [*train]
 
@@ -89,27 +96,28 @@ USUAL_WEEKS = 30.0
 
 
 def weeks_of(subject: Subject, otherwise: float | None = None) -> float:
-    """Gestational age in weeks: a phantom's own, or the first number in the last part of an atlas name.
+    """Gestational age in weeks: a phantom's own, or the first that the last part of an atlas name states.
 
     Args:
         subject: with a name.
-        otherwise: the age of a subject whose name has none.
+        otherwise: the age of a subject whose name states none.
 
     Raises:
-        InputError: no number that can be an age, as in `sta27` or `sb23-notoperated`, and no `otherwise`.
+        InputError: no age as in `sta27`, `sb23-notoperated`, `ga-31.5`, `week27` or `27w`, and no `otherwise`.
     """
     if isinstance(subject, PhantomSubject):
         return subject.weeks
-    found = re.search(r"\d+(\.\d+)?", subject.name.rsplit("/", 1)[-1])
     low, high = WEEKS_RANGE
-    if found is None or not low <= float(found[0]) <= high:
-        if otherwise is not None:
-            return otherwise
-        raise InputError(
-            f"{subject.image}: no gestational age in the name {subject.name!r}; expected a number of weeks "
-            f"between {low:g} and {high:g}, as in sta27; rename the folder"
-        )
-    return float(found[0])
+    for found in WEEKS_IN_NAME.finditer(subject.name.rsplit("/", 1)[-1]):
+        weeks = float(found[1] or found[2])
+        if low <= weeks <= high:
+            return weeks
+    if otherwise is not None:
+        return otherwise
+    raise InputError(
+        f"{subject.image}: no gestational age in the name {subject.name!r}; expected weeks between {low:g} and "
+        f"{high:g} as in sta27, sb23, ga-31.5, week27 or 27w; rename the folder, or the file where it has the name"
+    )
 
 
 def load_volume_of(subject: Subject, spacing_mm: float | None) -> TruthVolume:

@@ -10,6 +10,7 @@ import torchio as tio
 from monai.transforms import RandRicianNoise
 from numpy.typing import NDArray
 
+from data_synth.artefacts import slice_by_slice
 from data_synth.augment import applied
 from data_synth.mask_scans import Scan
 from g3r.acquisition.axis_resampling import along_axes, axis_weights
@@ -32,6 +33,8 @@ WIDE_NOISE = 0.05
 """Largest standard deviations of the noise; a wide pixel is the mean of several."""
 IN_PLANE_BLUR = (0, 0.9, 0, 0.9, 0, 0)
 """Standard deviations in pixels: from, to, along each axis."""
+MOTION_SHARE = 0.05
+"""Stacks whose slices were blurred by motion, each by its own, while they were taken."""
 WRAP_SHARE = 0.08
 
 
@@ -139,7 +142,7 @@ def _transform() -> tio.Compose:
         [
             tio.RandomBiasField(coefficients=0.3, order=2, p=0.7),
             tio.RandomGhosting(num_ghosts=(2, 6), axes=(0, 1), intensity=(0.1, 0.6), p=0.1),
-            tio.RandomMotion(degrees=4, translation=3, num_transforms=2, p=0.05),
+            tio.Lambda(slice_by_slice(tio.RandomMotion(degrees=4, translation=3, num_transforms=2)), p=MOTION_SHARE),
             tio.RandomBlur(std=IN_PLANE_BLUR, p=0.4),  # type: ignore[arg-type]  # six numbers are ranges per axis
         ]
     )

@@ -145,14 +145,26 @@ def _random_intensities(
     """
     n, size = len(image), image.shape[1]
     image = image ** np.float32(np.exp(rng.uniform(-0.4, 0.4)))
-    slope = (rng.normal(0, 0.1, 3) / 50.0) @ pose.rotation  # [K, 3] per mm along each slice's axes
-    at = (np.arange(size) - (size - 1) / 2) * pixel_mm
+    log_field = log_bias(rng.normal(0, 0.1, 3) / 50.0, pose, pixel_mm, size)
     log_gain = rng.normal(0, rng.uniform(0, 0.1), n)
     dropout = rng.random(n) < DROPOUT_SHARE
     log_gain = np.where(dropout, np.log(rng.uniform(0.1, 0.7, n)), log_gain)
-    field = np.exp(
-        log_gain[:, None, None] + slope[:, 0, None, None] * at[:, None] + slope[:, 1, None, None] * at
-    ).astype(np.float32)
+    field = np.exp(log_gain[:, None, None] + log_field).astype(np.float32)
     noise = RandRicianNoise(prob=1.0, std=MAX_NOISE)
     noise.set_random_state(int(rng.integers(2**32)))
     return np.asarray(noise(image * field)) * inside
+
+
+def log_bias(slope_per_mm: Array, pose: RigidPose, pixel_mm: float, size: int) -> Array:
+    """Logarithm [K, N, N] of a bias field that rises along one direction of the atlas frame.
+
+    Args:
+        slope_per_mm: [3] of the logarithm, along the atlas's axes; it is 0 at their origin.
+        pose: [K] atlas frame from the slices.
+        pixel_mm: edge of the square pixels.
+        size: N, pixels per edge.
+    """
+    at = (np.arange(size) - (size - 1) / 2) * pixel_mm
+    along = slope_per_mm @ pose.rotation  # [K, 3] per mm along each slice's axes
+    in_middle = pose.translation_mm @ slope_per_mm
+    return in_middle[:, None, None] + along[:, 0, None, None] * at[:, None] + along[:, 1, None, None] * at

@@ -227,11 +227,8 @@ def synthesise(
         outline=fitted.inside,
         truth=inside.astype(np.float32),
         mask=truth.mask,
-        affine=truth.affine,
-        name=truth.name,
         n_stacks=slices.n_stacks,
         thickness_mm=float(slices.thickness_mm.mean()),
-        residual=residual,
     )
 
 

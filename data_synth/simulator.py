@@ -37,8 +37,16 @@ FRAMES = {
 FIELD_OF_VIEW_MARGIN_MM = 5.0
 """Around the head at rest; motion may carry a part of it out of view, as it does in a scanner."""
 
-SIGNAL_REACH_VOXELS = 4
-"""Pixels further than this from the mask show nothing but noise and are not computed."""
+SIMULATOR_VERSION = 2
+"""Of the slices that are kept in files; to be raised when the same settings give other slices. Since 2 a pixel of the
+`box` and `sinc` profiles averages over its own area in plane."""
+
+SIGNAL_REACH_MM = 3.2
+"""Pixels further than this from the mask, along the axes of its grid and to the nearest voxel, show nothing but noise
+and are not computed."""
+
+PROFILE_REACH = 0.6
+"""Where the edge of the `box` profile ends, in thicknesses from the centre of the slice: thick slices reach further."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +134,7 @@ def simulate_stacks(
     """Take stacks of a volume.
 
     Args:
-        volume: [I, J, K] intensities; anything further than 4 voxels from the mask is not seen.
+        volume: [I, J, K] intensities; anything further than `reach_voxels` from the mask is not seen.
         mask: [I, J, K] the head.
         affine: [4, 4] RAS+ mm from index.
         settings: one entry per stack.
@@ -139,17 +147,25 @@ def simulate_stacks(
     """
     if not mask.any():
         raise InputError("simulation: the mask is empty; expected the head to be marked")
-    inside = np.argwhere(mask)
-    low = np.maximum(inside.min(0) - SIGNAL_REACH_VOXELS - 1, 0)
-    high = np.minimum(inside.max(0) + SIGNAL_REACH_VOXELS + 2, mask.shape)
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    local = affine.copy()
-    local[:3, 3] = affine[:3, :3] @ low + affine[:3, 3]
-    head = _Head.of(np.asarray(volume[box], np.float32), mask[box], local, fine)
+    # a head for each reach: what a stack sees does not depend on how thick the slices of others are
+    reaches = [reach_voxels(affine, one.thickness_mm) for one in settings]
+    heads = {n: _Head.within(volume, mask, affine, n, fine) for n in set(reaches)}
     return [
-        _simulate_stack(head, one, child, f"stack-{number}")
-        for number, (one, child) in enumerate(zip(settings, rng.spawn(len(settings)), strict=True))
+        _simulate_stack(heads[n], one, child, f"stack-{number}")
+        for number, (n, one, child) in enumerate(zip(reaches, settings, rng.spawn(len(settings)), strict=True))
     ]
+
+
+def reach_voxels(affine: NDArray[np.float64], thickness_mm: float) -> int:
+    """How far beyond the mask slices may show signal, in voxels along the axes of the grid.
+
+    Args:
+        affine: [4, 4] of the grid; the smallest edge of its voxels counts.
+        thickness_mm: of the slices.
+    """
+    voxel_mm = float(np.linalg.norm(affine[:3, :3], axis=0).min())
+    of_profile = int(np.ceil(PROFILE_REACH * thickness_mm / voxel_mm - 1e-6))  # less what an affine's rounding adds
+    return max(round(SIGNAL_REACH_MM / voxel_mm), of_profile, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,9 +182,18 @@ class _Head:
     bright: float
 
     @classmethod
-    def of(cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], fine: bool) -> _Head:
+    def within(
+        cls, volume: NDArray[np.float32], mask: NDArray[np.bool_], affine: NDArray[np.float64], n_reach: int, fine: bool
+    ) -> _Head:
+        """The head cut from its volume, with `n_reach` voxels around it where signal may be."""
+        inside = np.argwhere(mask)
+        low = np.maximum(inside.min(0) - n_reach - 1, 0)
+        high = np.minimum(inside.max(0) + n_reach + 2, mask.shape)
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        volume, mask, affine = np.asarray(volume[box], np.float32), mask[box], affine.copy()
+        affine[:3, 3] += affine[:3, :3] @ low
         grid = VolumeGrid(mask.shape, affine)
-        reach = binary_dilation(mask, iterations=SIGNAL_REACH_VOXELS)
+        reach = binary_dilation(mask, iterations=n_reach)
         shell = np.argwhere(mask & ~np.roll(mask, 1, 0) | mask & ~np.roll(mask, -1, 0))
         points = grid.world(shell[:: max(1, len(shell) // 4000)])
         extent = grid.world(np.argwhere(mask)[::7])

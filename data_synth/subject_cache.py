@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.registration_errors import ResidualKind
+from data_synth.simulator import SIMULATOR_VERSION
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
-SYNTHESIS_VERSION = 4
-"""Raised whenever the synthesis changes, so that subjects of an earlier one are not taken."""
+SYNTHESIS_VERSION = 5
+"""Raised whenever the synthesis changes, so that subjects of an earlier one are not taken. Slices have a version of
+their own (`SIMULATOR_VERSION`), which counts as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +32,8 @@ class SyntheticSubject:
         outline: [I, J, K] share of brain in it.
         truth: [I, J, K], zero outside the mask.
         mask: [I, J, K] the head.
-        affine: [4, 4] RAS+ mm from index.
-        name: of the subject that it was made from.
         n_stacks: stacks that it was made from.
         thickness_mm: of the slices, which is that of all stacks.
-        residual: kind of its pose errors.
     """
 
     coarse: NDArray[np.float32]
@@ -46,11 +44,8 @@ class SyntheticSubject:
     outline: NDArray[np.float32]
     truth: NDArray[np.float32]
     mask: NDArray[np.bool_]
-    affine: NDArray[np.float64]
-    name: str
     n_stacks: int
     thickness_mm: float
-    residual: ResidualKind
 
 
 class SubjectCache:
@@ -70,13 +65,13 @@ class SubjectCache:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another cache") from None
-        self.prefix = hashlib.sha256(f"{SYNTHESIS_VERSION} {spec}".encode()).hexdigest()[:12]
+        self.prefix = hashlib.sha256(f"{SIMULATOR_VERSION} {SYNTHESIS_VERSION} {spec}".encode()).hexdigest()[:12]
 
     def _path(self, epoch: int, index: int) -> Path:
         return self.folder / f"{self.prefix}-{epoch:05d}-{index:05d}.npz"
 
     def load(self, epoch: int, index: int) -> SyntheticSubject | None:
-        """The subject of that number, or None where it is not kept (or its file is damaged)."""
+        """The subject of that number, or None where it is not kept, or its file is damaged or lacks a field."""
         try:
             with self._path(epoch, index).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 found = {name: file[name] for name in file.files}
@@ -84,6 +79,8 @@ class SubjectCache:
             return None
         values = {}
         for field in fields(SyntheticSubject):
+            if field.name not in found:
+                return None  # of an earlier version
             value = found[field.name]
             if value.ndim == 0:
                 values[field.name] = value.item()

@@ -15,7 +15,7 @@ import numpy as np
 
 from data_synth.atlas import TruthVolume, cropped, find_subjects, load_subject
 from data_synth.export import save_simulation
-from data_synth.simulator import StackSettings, orthogonal_settings, simulate_stacks
+from data_synth.simulator import SIMULATOR_VERSION, StackSettings, orthogonal_settings, simulate_stacks
 from g3r.errors import InputError
 from g3r.evaluation.case import SimulatedCase, load_case
 
@@ -28,10 +28,6 @@ BRIGHT = 1000.0
 
 STRETCH = 0.05
 """Each axis of a subject is longer or shorter by at most this share."""
-
-SIMULATOR = 2
-"""Of the slices in the cache; to be raised when the same settings give other slices. Since 2 a pixel of the `box` and
-`sinc` profiles averages over its own area in plane."""
 
 RECORD_NAME = "simulation.json"
 
@@ -168,7 +164,8 @@ def simulated_subject(spec: SubjectSpec, atlas: Path | None, cache: Path) -> Pat
         InputError: the atlas lacks the volume, or the cache holds another subject of that name.
     """
     folder = cache / spec.name
-    record = json.loads(json.dumps(asdict(spec) | {"simulator": SIMULATOR}))  # as it is read again: tuples are lists
+    # as it is read again: tuples are lists
+    record = json.loads(json.dumps(asdict(spec) | {"simulator": SIMULATOR_VERSION}))
     if folder.is_dir():
         path = folder / RECORD_NAME
         found = json.loads(path.read_text(encoding="utf-8")).get("spec") if path.is_file() else None

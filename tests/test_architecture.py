@@ -75,7 +75,9 @@ def test_only_the_pretrain_command_knows_lightning() -> None:
 
 @pytest.mark.parametrize("path", in_package("data_synth"), ids=relative)
 def test_data_synth_uses_only_the_lower_rooms(path: Path) -> None:
-    assert rooms_imported(path) <= DATA_SYNTH_MAY_IMPORT, relative(path)
+    # g3r-simulate fails as the other commands do
+    own = {"cli"} if path.name == "cli.py" else set()
+    assert rooms_imported(path) <= DATA_SYNTH_MAY_IMPORT | own, relative(path)
 
 
 def test_g3r_does_not_know_data_synth() -> None:

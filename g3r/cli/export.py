@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 from g3r._version import __version__
 from g3r.cli.completion import parsed
+from g3r.cli.failures import EXPECTED, is_out_of_memory, line_and_code
 from g3r.errors import G3RError, InputError
 
 if TYPE_CHECKING:
     from g3r.checkpoints.trained_model import TrainedModel
 
+LESS_MEMORY = "end other programs, or use a machine with more"
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code (0 done, 2 usage, 3 bad input)."""
+    """Run the command; return its exit code (0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted)."""
     parser = argparse.ArgumentParser(prog="g3r-export", description=__doc__)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("run", metavar="RUN.ckpt", type=Path, help="checkpoint written by g3r-pretrain")
@@ -29,15 +32,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parsed(parser, argv)
     try:
         model = export(arguments.run, arguments.file, arguments.data_description, replace=arguments.force)
-    except G3RError as error:
-        print(f"g3r-export: {error}", file=sys.stderr)
-        return error.exit_code
+    except KeyboardInterrupt:
+        return _failed("interrupted; no file was written", 130)
+    except EXPECTED as error:
+        return _failed(*line_and_code(error, LESS_MEMORY))
     size_mb = arguments.file.stat().st_size / 1e6
     print(f"{arguments.file}: {size_mb:.1f} MB, {model.in_words()}")
     print(f"trained on: {model.training_data}")
     for name, value in sorted(model.validation.items()):
         print(f"  {name:20s} {value:.4f}")
     return 0
+
+
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-export: {line}", file=sys.stderr)
+    return exit_code
 
 
 def export(run: Path, file: Path, data_description: str | None = None, *, replace: bool = False) -> TrainedModel:
@@ -73,9 +82,11 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
         kind = _model_types()[entry["kind"]]
         kind.from_training(entry, _weights(content), words).save(file)
         return kind.load(file)
-    except (G3RError, MemoryError):
+    except G3RError:
         raise
     except Exception as error:  # a network given other numbers than it expects may raise anything
+        if is_out_of_memory(error):
+            raise
         found = " ".join(str(error).split())[:120]
         raise InputError(f"{run}: cannot be exported ({found}); export another checkpoint") from error
 
@@ -107,6 +118,8 @@ def _read_run(run: Path, entry: str) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise InputError(f"{run}: no such file; {expected}") from error
     except Exception as error:  # torch.load says "damaged" in many types
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{run}: cannot be read as a checkpoint ({type(error).__name__}); {expected}") from error
     if not isinstance(content, dict) or "state_dict" not in content or entry not in content:
         raise InputError(f"{run}: was not written by this version of g3r-pretrain; {expected}")

@@ -20,12 +20,16 @@ EXTRAS = {
 }
 """Packages, as they are imported, that only some commands need."""
 
-OUT_OF_MEMORY = "out of memory; choose a coarser --resolution or --preset preview, or crop the stacks"
+LESS_MEMORY = "choose a coarser --resolution or --preset preview, or crop the stacks"
 KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
 
 
-def line_and_code(error: BaseException) -> tuple[str, int]:
+def line_and_code(error: BaseException, less_memory: str = LESS_MEMORY) -> tuple[str, int]:
     """The line for the user and the exit code.
+
+    Args:
+        error: one of `EXPECTED`.
+        less_memory: what to do where memory could not be had.
 
     Raises:
         BaseException: the error itself where it is a defect of the program.
@@ -33,7 +37,7 @@ def line_and_code(error: BaseException) -> tuple[str, int]:
     if isinstance(error, G3RError):
         return str(error), error.exit_code
     if is_out_of_memory(error):
-        return OUT_OF_MEMORY, NumericalError.exit_code
+        return f"out of memory; {less_memory}", NumericalError.exit_code
     if isinstance(error, OSError):
         if error.filename is not None:
             return str(cannot_be_written(error.filename, error)), InputError.exit_code

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from g3r._version import __version__
-from g3r.errors import G3RError
+from g3r.cli.failures import EXPECTED, is_out_of_memory, line_and_code, missing_extra
+from g3r.errors import G3RError, InputError
 
 _HELP = """\
 usage: g3r-pretrain fit --config lightning_configs/prior.yaml [--data.source DIR] [options]
@@ -28,9 +29,12 @@ All options: g3r-pretrain fit --help      Watch: tensorboard --logdir runs
 Afterwards:  g3r-export runs/prior/version_0/checkpoints/last.ckpt prior.safetensors
 """
 
+INTERRUPTED = "interrupted; --ckpt_path FILE goes on from a checkpoint of the run"
+LESS_MEMORY = "lower data.batch_size, or data.patch_size of the prior network"
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code (0 done, 2 usage, 3 bad input)."""
+    """Run the command; return its exit code (0 done, 2 usage, 3 bad input, 4 out of memory, 130 interrupted)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_HELP, end="")
@@ -40,16 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"g3r-pretrain {__version__}")
         return 0
 
-    from g3r.cli.failures import missing_extra
-
     try:
         from lightning.pytorch import LightningDataModule, Trainer
         from lightning.pytorch.cli import LightningCLI
 
         from g3r.training.annealed_module import AnnealedModule, WholeCheckpoints
+    except KeyboardInterrupt:
+        return _failed(INTERRUPTED, 130)
     except ModuleNotFoundError as error:
-        print(f"g3r-pretrain: {missing_extra(error)}", file=sys.stderr)
-        return 3
+        return _failed(missing_extra(error), InputError.exit_code)
 
     class PretrainCLI(LightningCLI):
         def instantiate_trainer(self, **options: Any) -> Trainer:
@@ -65,20 +68,27 @@ def main(argv: Sequence[str] | None = None) -> int:
             save_config_kwargs={"overwrite": True},  # a resumed run writes its settings again
             args=arguments,
         )
-    except (G3RError, ValueError, SystemExit) as error:
-        own = _own_error(error)  # jsonargparse wraps what the model raises in an error of its own
-        if own is None:
+    except (KeyboardInterrupt, ValueError, SystemExit, *EXPECTED) as error:
+        # jsonargparse wraps what the model raises in an error of its own, Lightning leaves an interrupted fit by exit
+        found = error if isinstance(error, OSError) else _first_known(error)
+        if found is None:
             raise
-        print(f"g3r-pretrain: {own}", file=sys.stderr)
-        return own.exit_code
+        if isinstance(found, KeyboardInterrupt):
+            return _failed(INTERRUPTED, 130)
+        return _failed(*line_and_code(found, LESS_MEMORY))
     return 0
 
 
-def _own_error(error: BaseException | None) -> G3RError | None:
-    """The first error of g3r's own among an error and those that led to it."""
-    while error is not None and not isinstance(error, G3RError):
+def _first_known(error: BaseException | None) -> BaseException | None:
+    """The first among an error and those that led to it that the user can act on."""
+    while error is not None and not isinstance(error, (KeyboardInterrupt, G3RError)) and not is_out_of_memory(error):
         error = error.__cause__ or error.__context__
     return error
+
+
+def _failed(line: str, exit_code: int) -> int:
+    print(f"g3r-pretrain: {line}", file=sys.stderr)
+    return exit_code
 
 
 if __name__ == "__main__":

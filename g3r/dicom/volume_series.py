@@ -99,7 +99,7 @@ def write_volume_series(
     study: SourceStudy,
     *,
     in_scanner_space: bool,
-    remark: str,
+    remark: str = "",
 ) -> None:
     """Write a volume as a series of its examination; the folder appears whole or not at all.
 
@@ -170,7 +170,7 @@ def _series(study: SourceStudy, *, in_scanner_space: bool, remark: str) -> Datas
     one.Manufacturer, one.ManufacturerModelName, one.SoftwareVersions = "g3r", "g3r", f"g3r {__version__}"
     one.ImageType = ["DERIVED", "SECONDARY", "OTHER"]
     one.DerivationDescription = DERIVATION.format(version=__version__, space=SPACES[in_scanner_space])
-    one.ImageComments = f"For research only, not for diagnosis; {remark}"
+    one.ImageComments = "; ".join(filter(None, ("For research only, not for diagnosis", remark)))
     one.BurnedInAnnotation = "NO"
     # research mode: no pulse sequence made these images
     one.ScanningSequence, one.SequenceVariant, one.ScanOptions = "RM", "NONE", ""

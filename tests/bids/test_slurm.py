@@ -95,9 +95,8 @@ def test_without_slurm_or_the_extra(
         patch.delitem(sys.modules, "g3r.bids.slurm", raising=False)
         assert main(line) == 3
     said = capsys.readouterr().err
-    assert (
-        said == "g3r-bids: submitit is not installed; install the slurm extra: pip install '.[slurm]' in a checkout\n"
-    )
+    way_on = "install the slurm extra: pip install '.[slurm]' in a checkout"
+    assert said == f"g3r-bids: submitit is not installed; {way_on}\n"
     pytest.importorskip("submitit", reason="the slurm extra is not installed")
     assert main(line) == 3
     said = capsys.readouterr().err

@@ -31,6 +31,6 @@ def atlas(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("atlas")
     write_subject(root / "a" / "week24", 24)
     write_subject(root / "a" / "week30", 30, affine_flip=True)
-    write_subject(root / "b", 27, names=("sub-27", "sub-27_mask"))
+    write_subject(root / "b", 27, names=("ga-27", "ga-27_mask"))
     (root / "b" / "notes.txt").write_text("not an image")
     return root

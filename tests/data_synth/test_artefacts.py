@@ -9,7 +9,7 @@ pytest.importorskip("torchio")
 import torchio as tio
 
 from data_synth import artefacts
-from data_synth.artefacts import with_artefacts
+from data_synth.artefacts import slice_by_slice, with_artefacts
 from data_synth.atlas import TruthVolume
 from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 
@@ -51,6 +51,19 @@ def test_the_generator_decides(stacks: list[SimulatedStack]) -> None:
     again = with_artefacts(stacks, 0.3, np.random.default_rng(2))
     assert not changed_slices(first, again).any()
     assert changed_slices(first, with_artefacts(stacks, 0.3, np.random.default_rng(3))).any()
+
+
+def test_each_slice_of_a_stack_moves_by_itself() -> None:
+    one = torch.zeros(24, 20)
+    one[6:18, 5:15] = torch.rand(12, 10, generator=torch.Generator().manual_seed(1))
+    stack = one[..., None].repeat(1, 1, 4)[None]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(2)
+        moved = slice_by_slice(tio.RandomMotion(degrees=4, translation=3))(stack)
+    assert moved.shape == stack.shape
+    assert float(moved.min()) >= 0
+    assert bool(((moved - stack).abs().amax((0, 1, 2)) > 0.05).all())
+    assert all(float((moved[..., k] - moved[..., k - 1]).abs().max()) > 0.05 for k in range(1, 4))
 
 
 def test_motion_rings_within_the_slice(stacks: list[SimulatedStack], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,9 +19,9 @@ SPACING_MM = 2.0
 
 
 def test_atlas_conventions_and_patterns(atlas: Path) -> None:
-    assert [s.name for s in find_subjects(atlas)] == ["a/week24", "a/week30", "b/sub-27"]
+    assert [s.name for s in find_subjects(atlas)] == ["a/week24", "a/week30", "b/ga-27"]
     assert [s.name for s in find_subjects(atlas, include=["a/*"])] == ["a/week24", "a/week30"]
-    assert [s.name for s in find_subjects(atlas, exclude=["week*"])] == ["b/sub-27"]
+    assert [s.name for s in find_subjects(atlas, exclude=["week*"])] == ["b/ga-27"]
     with pytest.raises(InputError, match=r"none of 3 subjects.*change the patterns"):
         find_subjects(atlas, include=["c/*"])
     with pytest.raises(InputError, match="no such folder"):

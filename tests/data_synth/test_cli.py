@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.cli import main
 from data_synth.export import check_output
 from data_synth.phantom import fetal_brain_phantom
 from g3r._version import __version__
@@ -134,6 +135,29 @@ def test_bad_input_is_one_line_and_exit_3(case: str, volume: tuple[Path, Path], 
 )
 def test_usage_errors_are_exit_2(arguments: str) -> None:
     assert run(*arguments.split()).returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "says"), [(KeyboardInterrupt(), 130, "interrupted"), (MemoryError(), 4, "out of memory")]
+)
+def test_ctrl_c_and_little_memory_end_in_one_line(
+    failure: BaseException,
+    code: int,
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def failing(*arguments: object, **options: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("data_synth.simulator.simulate_stacks", failing)
+    output = tmp_path / "out"
+    assert main(["--phantom", "20", "--output", str(output)]) == code
+    said = capsys.readouterr().err
+    assert said.startswith(f"g3r-simulate: {says}")
+    assert said.count("\n") == 1
+    assert not output.exists()
 
 
 def test_version() -> None:

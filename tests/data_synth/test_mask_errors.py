@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_cdt
 
 from data_synth.atlas import TruthVolume
-from data_synth.mask_errors import with_mask_errors, with_skull_rim
+from data_synth.mask_errors import MISSED_MM, RIM_MM, with_mask_errors, with_skull_rim
 from data_synth.simulator import StackSettings, simulate_stacks
 
 
@@ -24,3 +25,22 @@ def test_masks_grow_into_the_rim_or_shrink(head: TruthVolume, grow: bool) -> Non
     assert (after.sum() > before.sum()) == grow
     larger, smaller = (after, before) if grow else (before, after)
     assert larger[smaller].all()
+
+
+@pytest.mark.parametrize("grow", [True, False])
+@pytest.mark.parametrize("pixel_mm", [0.5, 1.5])
+def test_the_rim_is_as_wide_as_drawn_whatever_the_pixels(head: TruthVolume, grow: bool, pixel_mm: float) -> None:
+    settings = StackSettings(resolution_mm=pixel_mm, thickness_mm=6.0)
+    stacks = simulate_stacks(head.data, head.mask, head.affine, [settings], np.random.default_rng(2))
+    before = stacks[0].stack.mask
+    k = int(before.sum((0, 1)).argmax())
+    for seed in range(5):
+        (changed,) = with_mask_errors(stacks, np.random.default_rng(seed), grow)
+        differs = (changed.stack.mask != before)[:, :, k]
+        # steps of the rim are those of a taxicab
+        away = distance_transform_cdt(~before[:, :, k] if grow else before[:, :, k], metric="taxicab")
+        width_mm = away[differs].max() * pixel_mm
+        drawn_mm = np.random.default_rng(seed).uniform(0.2, 1.0) * (RIM_MM if grow else MISSED_MM)
+        # to the nearest pixel, and at least one
+        assert abs(width_mm - drawn_mm) <= max(pixel_mm / 2, pixel_mm - drawn_mm) + 1e-9
+        assert differs[away == 1].all()

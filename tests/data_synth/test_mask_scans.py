@@ -10,6 +10,7 @@ from data_synth.mask_head import filled_head
 
 pytest.importorskip("torchio")
 
+from data_synth import mask_samples, mask_scans
 from data_synth.mask_data import new_scene
 from data_synth.mask_samples import draw_sample, full_stack, with_artefacts
 from data_synth.mask_scans import Scan, Scene, draw_scan
@@ -39,6 +40,19 @@ def test_the_mask_holds_the_head(scene: Scene, seed: int) -> None:
     true_ml = head.inside.sum() * abs(np.linalg.det(head.affine[:3, :3])) / 1000
     seen_ml = inside.sum() * 9 * scan.spacing_mm / 1000
     assert 0.1 * true_ml < seen_ml < 1.2 * true_ml
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_mask_has_the_head_s_volume_where_nothing_cuts_it(
+    scene: Scene, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mask_scans, "CUT_SHARE", 0.0)
+    still = {"none": 1.0}
+    rng = np.random.default_rng(seed)
+    scan = draw_scan(scene, rng, negative=False, view_cut_share=0.0, level_share=still)
+    _, inside = whole(scan)
+    true_ml = scene.head.inside.sum() * abs(np.linalg.det(scene.head.affine[:3, :3])) / 1000
+    assert inside.sum() * 9 * scan.spacing_mm / 1000 == pytest.approx(true_ml, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -91,3 +105,18 @@ def test_artefacts_keep_shape_and_are_reproducible(rng: np.random.Generator) -> 
     assert first.shape == image.shape
     assert (first >= 0).all()
     np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_artefacts_stay_within_their_slice(
+    seed: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slices are taken one by one: what one shows reaches no other, motion while it is taken included."""
+    monkeypatch.setattr(mask_samples, "MOTION_SHARE", 1.0)
+    image = rng.random((24, 20, 5)).astype(np.float32)
+    other = image.copy()
+    other[:, :, 2] = rng.random((24, 20))
+    made = [with_artefacts(one, np.random.default_rng(seed), 1.0) for one in (image, other)]
+    change = np.abs(made[0] - made[1]).max((0, 1))
+    assert change[2] > 0.1
+    assert np.delete(change, 2).max() < 1e-5

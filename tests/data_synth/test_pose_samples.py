@@ -7,7 +7,7 @@ from scipy.ndimage import map_coordinates
 from data_synth import stack_planning
 from data_synth.atlas import TruthVolume
 from data_synth.motion import LEVELS
-from data_synth.pose_samples import draw_slice_set
+from data_synth.pose_samples import draw_slice_set, log_bias
 from data_synth.simulator import StackSettings, simulate_stacks
 from data_synth.slice_sampling import Head, sample_slices
 from g3r.acquisition.slice_images import slice_images
@@ -71,6 +71,17 @@ def test_the_same_images_as_at_inference(centred_head: TruthVolume, sampled: Hea
     for image, other in zip(images.image, fast, strict=True):
         if (other > 0).sum() > 60:
             assert np.corrcoef(image.ravel(), other.ravel())[0, 1] > 0.95
+
+
+def test_slices_through_one_point_have_one_bias_factor_there(rng: np.random.Generator) -> None:
+    slope_per_mm, point_mm = np.array([0.004, -0.003, 0.006]), np.array([12.0, -30.0, 21.0])
+    pixel_mm, size, pixels = 3.0, 40, np.array([[4, 31], [22, 9], [35, 35]])
+    turned = RigidPose.from_rotvec(rng.normal(0, 1, (3, 3)), np.zeros((3, 3)))
+    in_slice = np.column_stack([(pixels - (size - 1) / 2) * pixel_mm, np.zeros(3)])
+    pose = RigidPose(turned.rotation, point_mm - turned.apply(in_slice))
+    found = log_bias(slope_per_mm, pose, pixel_mm, size)
+    assert found.shape == (3, size, size)
+    np.testing.assert_allclose(found[np.arange(3), pixels[:, 0], pixels[:, 1]], slope_per_mm @ point_mm)
 
 
 def test_a_set_varies_and_is_finite(sampled: Head) -> None:

@@ -11,7 +11,7 @@ pytest.importorskip("lightning")
 pytest.importorskip("torchio")
 
 from data_synth.prior_data import StackSynthesisDataModule
-from data_synth.prior_samples import IMAGE_KEYS
+from data_synth.prior_samples import IMAGE_KEYS, SyntheticSubjects
 from g3r.errors import InputError
 
 TINY: dict[str, Any] = {
@@ -72,12 +72,31 @@ def test_training_on_a_folder(atlas: Path) -> None:
     assert data.train_set is not None
     assert data.val_set is not None
     assert [s.name for s in data.train_set.subjects] == ["a/week24", "a/week30"]
-    assert [s.name for s in data.val_set.subjects] == ["b/sub-27"]
+    assert [s.name for s in data.val_set.subjects] == ["b/ga-27"]
     assert len(next(iter(data.val_dataloader()))) == len(IMAGE_KEYS) + 2
     mixed = StackSynthesisDataModule(source=str(atlas), val_include=["week24"], phantom_share=0.5, **TINY)
     mixed.setup()
     assert mixed.train_set is not None
     assert len(mixed.train_set.subjects) == 4
+
+
+def seeds_of(subjects: SyntheticSubjects, epoch: int, index: int) -> tuple[int, ...]:
+    """What all draws of an item follow from."""
+    seeds = subjects.draw(epoch, index)[1].bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
+    return tuple(seeds)
+
+
+@pytest.mark.parametrize("source", ["phantom", "atlas"])
+def test_training_and_validation_share_neither_subjects_nor_draws(source: str, atlas: Path) -> None:
+    of_source: dict[str, Any] = (
+        {} if source == "phantom" else {"source": str(atlas), "val_include": ["b/*"], "phantom_share": 0.5}
+    )
+    data = StackSynthesisDataModule(**TINY, **of_source, seed=3)
+    train, val = data.make_sets()
+    assert not {one.name for one in train.subjects} & {one.name for one in val.subjects}
+    seeds = [{seeds_of(one, epoch, index) for epoch in range(3) for index in range(2)} for one in (train, val)]
+    assert [len(one) for one in seeds] == [6, 6]
+    assert not seeds[0] & seeds[1]
 
 
 def test_the_template_is_made_of_the_training_subjects_once(atlas: Path) -> None:

@@ -1,6 +1,7 @@
 """Pose errors that registration leaves."""
 
 import numpy as np
+import pytest
 
 from data_synth.motion import LEVELS, slice_trajectory
 from data_synth.registration_errors import draw_residual_kind, mean_motion, residual_errors
@@ -22,6 +23,22 @@ def test_residual_errors_have_the_stated_size() -> None:
     assert np.abs(residual_errors("none", stack_id, center, np.random.default_rng(0)).rotvec_rad()).max() == 0
     gross = residual_errors("gross", stack_id, center, np.random.default_rng(0))
     assert 2.0 < np.linalg.norm(gross.apply(center) - center, axis=1).max() < 20
+
+
+def test_half_of_the_variance_is_shared_with_neighbours_of_the_same_stack() -> None:
+    n_slices, edge = 40, 6  # the filter repeats the outermost values
+    stack_id, center = np.repeat([0, 1, 2], n_slices), np.zeros((3 * n_slices, 3))
+    within, across = [], []
+    for seed in range(400):
+        moved = residual_errors("small", stack_id, center, np.random.default_rng(seed)).translation_mm
+        moved = (moved / np.sqrt((moved**2).mean())).reshape(3, n_slices, 3)
+        inner = moved[:, edge:-edge]
+        within.append((inner[:, :-1] * inner[:, 1:]).mean() / (inner**2).mean())
+        across.append((moved[:-1, -1] * moved[1:, 0]).mean())
+    # half of exp(-1 / (4 sigma^2)) with sigma 2, times E[f]^2 / E[f^2] of the factor f: 3 for a tenth, else 1
+    expected = 0.5 * np.exp(-1 / 16) * 1.2**2 / 1.8
+    assert np.mean(within) == pytest.approx(expected, abs=0.03)
+    assert np.mean(across) == pytest.approx(0, abs=0.08)
 
 
 def test_shares_of_residual_kinds() -> None:

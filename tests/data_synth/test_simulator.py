@@ -5,10 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.stats import rayleigh
 
 from data_synth.atlas import TruthVolume
 from data_synth.motion import LEVELS, MotionLevel
-from data_synth.simulator import SimulatedStack, StackSettings, orthogonal_settings, simulate_stacks
+from data_synth.simulator import (
+    SIGNAL_REACH_MM,
+    SimulatedStack,
+    StackSettings,
+    orthogonal_settings,
+    reach_voxels,
+    simulate_stacks,
+)
 from data_synth.slice_profile import Profile
 from g3r.acquisition.coarse_volume import coarse_and_density
 from g3r.acquisition.psf import psf_variance_mm2
@@ -140,7 +148,10 @@ def test_noise_gain_and_dropout() -> None:
     volume = np.full((N, N, N), 500, np.float32)
     level = MotionLevel(dropout_share=0.3)
     noisy = StackSettings(motion=level, snr=20.0, bias=0.0, gain_deviation=0.1, gap_mm=0.0, thickness_mm=2.0)
-    (one,) = simulate_stacks(volume, BALL, AFFINE, [noisy], np.random.default_rng(7))
+    one, clean = (
+        simulate_stacks(volume, BALL, AFFINE, [settings], np.random.default_rng(7))[0]
+        for settings in (noisy, replace(noisy, snr=np.inf))
+    )
     assert 1 <= one.dropout.sum() < len(one.dropout)
     assert (one.gain[one.dropout] < 0.7).all()
     inside = deep(one)
@@ -148,8 +159,72 @@ def test_noise_gain_and_dropout() -> None:
         values = one.stack.image[:, :, k][inside[:, :, k]]
         assert abs(values.mean() - 500 * one.gain[k]) < 4
         assert abs(values.std() - 500 / 40) < 2
-    background = one.stack.image[:, :, 0][:5, :5]
-    assert 5 < background.mean() < 30  # Rayleigh
+    background = one.stack.image[clean.stack.image == 0]  # out of reach
+    assert len(background) > 10_000
+    expected = rayleigh(scale=500 / 40)
+    assert background.mean() == pytest.approx(expected.mean(), rel=0.05)
+    assert background.std() == pytest.approx(expected.std(), rel=0.05)
+
+
+def log_bias_field(bias: float, resolution_mm: float) -> np.ndarray:
+    """Coefficients of 1, x, y, xy, x^2 and y^2 (mm from the middle of the image) in the log of a constant's image."""
+    settings = replace(CLEAN, bias=bias, resolution_mm=resolution_mm)
+    volume = np.full((N, N, N), 500, np.float32)
+    (one,) = simulate_stacks(volume, BALL, AFFINE, [settings], np.random.default_rng(9))
+    shape = one.stack.image.shape
+    x, y, _ = np.meshgrid(*[(np.arange(n) - (n - 1) / 2) * resolution_mm for n in shape], indexing="ij")
+    inside = deep(one)
+    log = np.log(one.stack.image / 500, where=inside, out=np.zeros(shape))
+    by_slice = np.ma.masked_array(log, ~inside)
+    assert by_slice.count(2).max() > 8
+    assert np.ma.ptp(by_slice, axis=2).max() < 1e-5  # fixed to the scanner: the same in every slice
+    x, y, log = x[inside], y[inside], log[inside]
+    terms = np.stack([np.ones_like(x), x, y, x * y, x**2, y**2], 1)
+    coefficients = np.linalg.lstsq(terms, log, rcond=None)[0]
+    np.testing.assert_allclose(terms @ coefficients, log, atol=1e-5)
+    return coefficients
+
+
+def test_the_bias_field_is_a_quadratic_in_mm() -> None:
+    field = log_bias_field(0.3, 0.8)
+    assert abs(field[0]) < 1e-5
+    assert (np.abs(field[1:]) * [10, 10, 100, 100, 100] > 1e-3).all()
+    np.testing.assert_allclose(log_bias_field(0.6, 0.8), 2 * field, rtol=1e-3, atol=1e-6)
+    # the field is scaled by n / (n - 1) of n pixels, up to 3 % here
+    np.testing.assert_allclose(log_bias_field(0.3, 1.6), field, rtol=0.06, atol=1e-6)
+
+
+@pytest.mark.parametrize("thickness_mm", [2.2, 4.5])
+def test_the_reach_is_a_length(thickness_mm: float) -> None:
+    for stretch in (0.95, 1.0, 1.05):  # as of the studies' subjects, whose slices are kept
+        assert reach_voxels(np.diag([0.8 * stretch, 0.8, 0.8, 1]), thickness_mm) == 4
+    for voxel_mm in (0.3, 0.5, 1.0, 1.6, 2.5):
+        reach_mm = reach_voxels(np.diag([voxel_mm] * 3 + [1.0]), thickness_mm) * voxel_mm
+        profile_mm = 0.6 * thickness_mm
+        assert max(SIGNAL_REACH_MM - voxel_mm / 2, profile_mm) <= reach_mm
+        assert reach_mm < max(SIGNAL_REACH_MM + voxel_mm / 2, profile_mm + voxel_mm) + 1e-9
+    assert reach_voxels(np.diag([0.5, 0.5, 0.5, 1]), 8.0) == 10  # 0.6 thicknesses, rounded up
+    assert reach_voxels(np.diag([9.0, 9.0, 9.0, 1]), thickness_mm) == 1
+
+
+@pytest.mark.parametrize("voxel_mm", [0.5, 1.0])
+def test_thick_slices_show_the_head_as_far_as_their_profile_reaches(voxel_mm: float) -> None:
+    n, thickness_mm = round(24 / voxel_mm), 8.0
+    mask = np.zeros((n, n, n), bool)
+    mask[(slice(n // 4, 3 * n // 4),) * 3] = True
+    affine = np.diag([voxel_mm] * 3 + [1.0])
+    settings = replace(CLEAN, thickness_mm=thickness_mm, gap_mm=-7.0, resolution_mm=1.0)
+    volume = np.where(mask, 500, 0).astype(np.float32)
+    (one,) = simulate_stacks(volume, mask, affine, [settings], np.random.default_rng(0))
+    n_i, n_j, n_k = one.stack.image.shape
+    depth_mm = one.stack.affine[2, 3] + np.arange(n_k) * 1.0
+    # the soft-edged box through the slice, seen through a slab that ends half a voxel beyond its outer voxels
+    low_mm, high_mm = (n // 4 - 0.5) * voxel_mm, (3 * n // 4 - 0.5) * voxel_mm
+    at = np.linspace(-0.6, 0.6, 2401) * thickness_mm
+    profile = np.clip((0.6 - np.abs(at) / thickness_mm) / 0.2, 0, 1)
+    share = [profile[(at + z > low_mm) & (at + z < high_mm)].sum() / profile.sum() for z in depth_mm]
+    assert ((np.array(share) > 0.02) & ((depth_mm < low_mm - 3) | (depth_mm > high_mm + 3))).any()
+    np.testing.assert_allclose(one.stack.image[n_i // 2, n_j // 2], 500 * np.array(share), atol=10)  # quadrature
 
 
 def test_bright_rim_outside_the_mask_is_not_needed() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import affine_transform, center_of_mass
 
-from data_synth.atlas import AtlasSubject, find_subjects
-from data_synth.heads import PhantomSubject, load_head, weeks_of
+from data_synth.atlas import find_subjects
+from data_synth.heads import PhantomSubject, load_head
 from data_synth.template import atlas_templates
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.errors import InputError
@@ -43,16 +43,6 @@ def test_a_head_stands_on_its_centroid() -> None:
     grid = VolumeGrid(head.data.shape, head.affine)
     np.testing.assert_allclose(grid.world(center_of_mass(head.mask)), 0, atol=1e-6)
     assert (head.data[~head.mask] == 0).all()
-
-
-@pytest.mark.parametrize(("name", "weeks"), [("crl/sta27", 27), ("sb/sb23-notoperated", 23), ("x/ga-31.5_v2", 31.5)])
-def test_age_from_the_name(tmp_path: Path, name: str, weeks: float) -> None:
-    assert weeks_of(AtlasSubject(name, tmp_path, tmp_path)) == weeks
-
-
-def test_no_age_in_the_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no gestational age"):
-        weeks_of(AtlasSubject("atlas/subject-7", tmp_path / "t2.nii.gz", tmp_path))
 
 
 def test_no_subject_near_the_ages() -> None:

@@ -118,6 +118,5 @@ def test_a_missing_package_is_named_with_what_to_install(
     monkeypatch.setenv("PATH", "")
     assert main(["--dicom", str(examination.dicom), "--output", "out"]) == 3
     (line,) = capsys.readouterr().err.splitlines()
-    assert (
-        line == f"g3r-infer: {package} is not installed; install the dicom extra: pip install '.[dicom]' in a checkout"
-    )
+    way_on = "install the dicom extra: pip install '.[dicom]' in a checkout"
+    assert line == f"g3r-infer: {package} is not installed; {way_on}"

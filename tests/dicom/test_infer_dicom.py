@@ -198,8 +198,6 @@ def test_stacks_and_a_reference(examination: Examination, tmp_path: Path, monkey
     assert str(one.PatientName).startswith("Xenobia")
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["verdict"] == "do not use"
-    assert (
-        one.ImageComments
-        == f"For research only, not for diagnosis; verdict: do not use: {'; '.join(record['reasons'])}"
-    )
+    verdict = f"do not use: {'; '.join(record['reasons'])}"
+    assert one.ImageComments == f"For research only, not for diagnosis; verdict: {verdict}"
     assert record["partial"] is False

@@ -1,0 +1,41 @@
+"""`g3r-export` that is interrupted or has no memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from g3r.cli.export import main
+
+FAILURES = [
+    (KeyboardInterrupt(), 130, "interrupted"),
+    (MemoryError(), 4, "out of memory"),
+    (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 4, "out of memory"),
+]
+
+
+@pytest.mark.parametrize(("failure", "code", "says"), FAILURES)
+@pytest.mark.parametrize("where", ["torch.load", "g3r.cli.export._weights"])
+def test_ctrl_c_and_little_memory_end_in_one_line(
+    where: str,
+    failure: BaseException,
+    code: int,
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def failing(*arguments: object, **options: object) -> None:
+        raise failure
+
+    entry = {"kind": "prior", "training_data": "", "optimiser_steps": 1}
+    monkeypatch.setattr("g3r.cli.export._read_run", lambda run, name: {"state_dict": {}, name: entry})
+    if where == "torch.load":
+        monkeypatch.undo()
+    monkeypatch.setattr(where, failing)
+    assert main([str(tmp_path / "last.ckpt"), str(tmp_path / "prior.safetensors")]) == code
+    said = capsys.readouterr().err
+    assert said.startswith(f"g3r-export: {says}")
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
