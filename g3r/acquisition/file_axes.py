@@ -114,7 +114,10 @@ def settled(grid: VolumeGrid) -> VolumeGrid:
     affine = np.eye(4)
     affine[:3, :3] = rounded @ stretch
     affine[:3, 3] = np.rint(grid.center_mm / CENTER_STEP_MM) * CENTER_STEP_MM - affine[:3, :3] @ middle
-    return VolumeGrid(grid.shape, affine)
+    try:
+        return VolumeGrid(grid.shape, affine)
+    except ValueError:  # rounding flattens axes that lie nearly in a plane; `Stack` refuses them with a line
+        return grid
 
 
 def between(start: VolumeGrid, end: VolumeGrid) -> RigidPose:

@@ -123,7 +123,7 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
     volume = load_volume(path)
     found = empty_background_mask(volume) or masker(path, volume)
     if isinstance(found, str):
-        raise InputError(f"{volume.name}: {found}")
+        raise InputError(f"{volume.name}: {found}; draw the mask by hand, or try --mask-command")
     stack = load_stack(path, found, float(volume.grid.spacing_mm.max()))
     save_mask_picture(target.with_name(f"{target.name}.png"), [stack])
     volume_ml = found.volume_ml(volume)

@@ -143,4 +143,4 @@ class GaussianCloud:
                 names = ("mean_mm", "log_scale", "quaternion_wxyz", "amplitude")
                 return cls.of([torch.from_numpy(data[name]) for name in names], data["origin_mm"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: not a cloud written by g3r ({error})") from None
+            raise InputError(f"{path}: not a cloud written by g3r ({error}); expected the file of g3r-infer") from None

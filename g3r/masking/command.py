@@ -96,7 +96,9 @@ class MaskCommand:
             )
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
-            raise InputError(f"{name}: --mask-command cannot be started ({found}): {words[0]}") from None
+            raise InputError(
+                f"{name}: --mask-command cannot be started ({found}): {words[0]}; check its path"
+            ) from None
         try:
             said, complained = process.communicate(timeout=self.timeout_s)
         except BaseException as error:  # Ctrl-C, too
@@ -109,7 +111,8 @@ class MaskCommand:
             ) from None
         if process.returncode:
             raise InputError(
-                f"{name}: --mask-command failed with exit code {process.returncode}{_last_words(complained, said)}"
+                f"{name}: --mask-command failed with exit code {process.returncode}{_last_words(complained, said)}; "
+                "try it alone"
             )
 
 

@@ -75,7 +75,7 @@ def test_a_masker_that_fails_ends_the_run_in_one_line(surrounded: Path, tmp_path
                "--output", tmp_path / "out")  # fmt: skip
     assert done.returncode == 3
     assert done.stderr.splitlines() == [
-        "g3r-infer: stack-0.nii.gz: --mask-command failed with exit code 1 and said nothing"
+        "g3r-infer: stack-0.nii.gz: --mask-command failed with exit code 1 and said nothing; try it alone"
     ]
     assert list(tmp_path.iterdir()) == []
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from g3r.errors import InputError
-from tests.faults.commands import TooSlowError, within
+from tests.faults.commands import TooSlowError, has_remedy, within
 
 MAX_SECONDS = 5.0
 MAX_GAINED_BYTES = 1_500_000_000
@@ -75,7 +75,7 @@ def run_cases(kind: str, n_cases: int, seed: int, folder: Path, first: int = 0) 
 
 def is_one_line(message: str) -> bool:
     """A refusal: a name, what was found, what to do; not too long to read."""
-    return ": " in message and ("; " in message or ", " in message) and "\n" not in message and len(message) < 600
+    return ": " in message and has_remedy(message) and "\n" not in message and len(message) < 600
 
 
 def main() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from g3r.cli import evaluate
@@ -21,6 +23,13 @@ def judged(outcome: Outcome, command: str, bad: Path, says: str, *, must: bool) 
     return False
 
 
+VALID_MASKS = {"constant", "a mask", "all infinite", "slope beyond float32"}
+"""Of the files that are no stack: all or a part of their voxels have one value above a half."""
+
+NO_MASK = "mask is empty; expected|as an image does; expected|; resample the mask"
+"""What is said of images that can be read; of the others it is what is said of a stack."""
+
+
 @pytest.mark.parametrize("name", BAD_STACKS)
 @pytest.mark.parametrize("role", ["volume", "reference", "mask"])
 def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally) -> None:
@@ -33,8 +42,15 @@ def test_evaluate(role: str, name: str, tmp_path: Path, tally: Tally) -> None:
         line = [f"--{key}={path}" for key, path in files.items()]
         outcome = run(evaluate.main, [*line, "--json", tmp_path / "s.json"], tmp_path)
         must = name not in USABLE_AS_A_VOLUME and says != "no positive value"
-        if judged(outcome, "g3r-evaluate", files[role], says, must=must and role != "mask"):
+        if role == "mask":
+            must, says = name not in VALID_MASKS, f"{says}|{NO_MASK}"
+        if judged(outcome, "g3r-evaluate", files[role], says, must=must):
             case.refused()
+        else:
+            assert outcome.changed == {str(tmp_path / "s.json")}
+            scores = json.loads((tmp_path / "s.json").read_text())
+            assert np.isfinite(list(scores.values())).all(), scores
+            assert scores["n_voxels"] > 0
 
 
 @pytest.mark.parametrize("name", BAD_MASKS)

@@ -27,6 +27,7 @@ from data_synth.prior_data import StackSynthesisDataModule
 from g3r.prior.config import PriorNetworkConfig
 from g3r.training.annealed_module import WholeCheckpoints
 from g3r.training.prior_module import PriorModule
+from tests.training.small_runs import Losses
 
 NETWORK = PriorNetworkConfig(channels=(4, 4), units=(1, 1), tail_channels=2, template_spacing_mm=3.0)
 # ten patches an epoch in batches of three: one is left over each time
@@ -42,21 +43,6 @@ DATA: dict[str, Any] = {
     "seed": 3,
 }
 N_EPOCHS = 4
-
-
-class Losses(lightning.Callback):
-    """Keeps the loss of every step, and ends the run at one of them as a kill would."""
-
-    def __init__(self, end_at: int | None = None) -> None:
-        self.found: dict[int, float] = {}
-        self.end_at = end_at
-
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: object, batch_idx: int
-    ) -> None:
-        self.found[trainer.global_step] = float(outputs["loss"])
-        if trainer.global_step == self.end_at:
-            raise ZeroDivisionError
 
 
 def trained(folder: Path, end_at: int | None = None, resume: Path | None = None) -> dict[int, float]:

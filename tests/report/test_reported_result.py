@@ -15,6 +15,7 @@ from g3r.output.record import RunRecord
 from g3r.report.reported_result import ReportedResult
 from g3r.report.verdict import verdict_of
 from tests.faults.small_case import quick_settings
+from tests.report.planted_head import SIDES, blob, brain, bright_corner, section_of
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,15 @@ def test_a_notebook_shows_it_with_pictures(result: ReportedResult) -> None:
     assert text.count("data:image/png;base64,") == 3
     assert "&lt;script&gt;" in text
     assert "<script" not in text
+
+
+def test_its_pictures_are_as_radiologists_read_them(result: ReportedResult) -> None:
+    """The patient's right, and the front, are on the left, whatever the volume's axes."""
+    planted = replace(result, volume=blob(result.grid), mask=brain(result.grid))
+    assert isinstance(planted, ReportedResult)
+    sections = planted.report().sections
+    assert [name for name, _ in sections] == list(SIDES)
+    assert {name: bright_corner(section_of(picture)) for name, picture in sections} == dict.fromkeys(SIDES, "top left")
 
 
 def test_the_page_is_written_where_it_is_asked_for(result: ReportedResult, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader, Dataset
 
 from g3r.cli import export
+from g3r.training.annealed_module import AnnealedModule
 
 
 def trainer(folder: Path, **options: Any) -> lightning.Trainer:
@@ -26,6 +27,48 @@ def trainer(folder: Path, **options: Any) -> lightning.Trainer:
         "log_every_n_steps": 1,
     }
     return lightning.Trainer(default_root_dir=folder, **{**defaults, **options})
+
+
+class Losses(lightning.Callback):
+    """Keeps the loss of every step, and ends the run at one of them as a kill would."""
+
+    def __init__(self, end_at: int | None = None) -> None:
+        self.found: dict[int, float] = {}
+        self.end_at = end_at
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: object, batch_idx: int
+    ) -> None:
+        self.found[trainer.global_step] = float(outputs["loss"])
+        if trainer.global_step == self.end_at:
+            raise ZeroDivisionError
+
+
+def assert_resuming_changes_nothing(
+    make_module: Callable[[], AnnealedModule],
+    make_data: Callable[[], lightning.LightningDataModule],
+    folder: Path,
+    n_epochs: int = 3,
+) -> None:
+    """What goes on from the first epoch's checkpoint has the losses, step by step, and the weights of the whole run."""
+
+    def run(seed: int, resume: Path | None = None) -> tuple[dict[int, float], AnnealedModule]:
+        torch.manual_seed(seed)
+        module, losses = make_module(), Losses()
+        keeper = lightning.callbacks.ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
+        one = trainer(folder, max_epochs=n_epochs, logger=False, callbacks=[losses, keeper])
+        one.fit(module, make_data(), ckpt_path=resume, weights_only=True if resume else None)
+        return losses.found, module
+
+    whole, module = run(0)
+    n_steps = len(whole)
+    assert n_steps % n_epochs == 0
+    assert len(set(whole.values())) == n_steps
+    resumed, other = run(1, folder / "epoch=0.ckpt")
+    assert resumed == {step: loss for step, loss in whole.items() if step > n_steps // n_epochs}
+    found = other.state_dict()
+    for name, value in module.state_dict().items():
+        assert torch.equal(found[name], value), name
 
 
 def in_memory(samples: list[dict[str, torch.Tensor]], batch_size: int | None = None) -> DataLoader:

@@ -20,7 +20,7 @@ import lightning.pytorch as lightning
 from torch.utils.data import DataLoader
 
 from g3r.training.mask_module import MaskModule, dice, scores_of, summary
-from tests.training.small_runs import in_memory, logged, trainer
+from tests.training.small_runs import assert_resuming_changes_nothing, in_memory, logged, trainer
 
 NETWORK = MaskNetworkConfig(channels=(4, 8))
 
@@ -72,6 +72,11 @@ def test_the_loss_falls(trained: tuple[Path, Path, MaskModule]) -> None:
     names = set(board.Tags()["scalars"])
     assert {"val/outline_dice", "val/find_dice", "val/false_find_cm2", "train/samples_per_second"} <= names
     assert board.Tags()["images"]
+
+
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+def test_resuming_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    assert_resuming_changes_nothing(lambda: MaskModule(network=NETWORK, warmup_steps=1), TinyData, tmp_path)
 
 
 def test_export_and_load(trained: tuple[Path, Path, MaskModule], tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from g3r.pose_network.inference import as_pose
 from g3r.pose_network.network import PoseStep
 from g3r.training.pose_module import PoseModule, disturbed, point_loss, vote_loss
 from g3r.training.pose_scores import scores_of, summary
-from tests.training.small_runs import assert_export_refuses, in_memory, logged, trainer
+from tests.training.small_runs import assert_export_refuses, assert_resuming_changes_nothing, in_memory, logged, trainer
 
 NETWORK = PoseNetworkConfig(channels=(4, 8, 8), width=32, n_blocks=2, n_heads=2)
 SMALL: dict[str, Any] = {"network": NETWORK, "warmup_steps": 1}
@@ -105,11 +105,10 @@ def test_the_template_is_the_data_module_s(trained: Trained) -> None:
     assert trained[2].weeks == [25.0, 26.0]
 
 
-def test_resuming_goes_on(trained: Trained, tmp_path: Path) -> None:
-    module = PoseModule(**SMALL)
-    run = trainer(tmp_path, max_epochs=2)
-    run.fit(module, TinyData(), ckpt_path=trained[1], weights_only=True)
-    assert run.global_step == 6
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")  # the resumed run writes into the same folder
+def test_resuming_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    """With the same disturbances of the poses, too."""
+    assert_resuming_changes_nothing(lambda: PoseModule(**SMALL), TinyData, tmp_path)
 
 
 def test_export_gives_the_same_network(trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
