@@ -138,7 +138,8 @@ class MaskSamples(SubjectDataset[MaskSample]):
         which, rng = self.draw(epoch, index)
         if self.in_order:
             scene = self._new_scene(which, rng)
-            return draw_sample(draw_scan(scene, rng, index % NEGATIVE_EVERY == NEGATIVE_EVERY - 1), rng, **self.shapes)
+            headless = self.turn(index, NEGATIVE_EVERY) == NEGATIVE_EVERY - 1
+            return draw_sample(draw_scan(scene, rng, headless), rng, **self.shapes)
         number = index % self.n_scenes
         scene = self._scene(epoch, number)
         if not self._is_hard(number):

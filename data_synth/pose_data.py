@@ -137,7 +137,7 @@ class SliceSets(SubjectDataset[SliceSet]):
             self.pixel_mm,
             self.size,
             max_slices,
-            n_stacks=1 + index % MAX_VALIDATION_STACKS if self.in_order else None,
+            n_stacks=1 + self.turn(index, MAX_VALIDATION_STACKS) if self.in_order else None,
             recorded=self.recorded,
         )
 

@@ -98,7 +98,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
         template = self.template()
         n_phantoms = round(len(train) * h.phantom_share / (1 - h.phantom_share)) if h.source != "phantom" else 0
         # spread over the names, which mostly sort by age
-        step = max(1, len(val) // h.val_subjects)
+        validated = [val[int(k)] for k in np.linspace(0, len(val) - 1, min(h.val_subjects, len(val))).round()]
         common = {"spacing_mm": h.spacing_mm, "artefact_share": h.artefact_share, "cache": h.cache}
         return SyntheticSubjects(
             [*train, *phantom_subjects(n_phantoms, h.seed, "training")],
@@ -110,7 +110,7 @@ class StackSynthesisDataModule(SyntheticDataModule):
             distinct=h.distinct_epochs,
             **common,
         ), SyntheticSubjects(
-            val[step // 2 :: step][: h.val_subjects],
+            validated,
             template,
             length=h.val_subjects,
             seed=h.seed + VALIDATION_SEED,

@@ -22,6 +22,7 @@ from data_synth.registration_errors import ResidualKind, draw_residual_kind, mea
 from data_synth.simulator import SimulatedStack, StackSettings, simulate_stacks
 from data_synth.subject_cache import SubjectCache, SyntheticSubject
 from data_synth.subject_dataset import SubjectDataset
+from data_synth.template import HALF_WINDOW_WEEKS
 from data_synth.uneven_coverage import with_uneven_coverage
 from g3r.acquisition.atlas_template import AtlasTemplate
 from g3r.acquisition.coarse_volume import coarse_and_density, normalisation_scale
@@ -48,11 +49,12 @@ DISTRUSTED_SHARE = 0.15
 """How often registration gave a run of up to `DISTRUSTED_SLICES` slices of a subject no weight."""
 DISTRUSTED_SLICES = 4
 
-OTHER_AGE_WEEKS = (2.0, 4.5)
-"""Templates are drawn among those whose age differs by so much: a nearer one was made of the subject itself, or of one
-that is nearly the same image, and no subject in use will find one as alike."""
+OTHER_AGE_WEEKS = (HALF_WINDOW_WEEKS + 0.5, HALF_WINDOW_WEEKS + 3.5)
+"""Templates are drawn among those whose age differs by so much: a nearer one is a mean of heads with the subject itself
+among them, and no subject in use will find a template as alike."""
 START_DEG, START_MM, START_SCALE = 2.0, 1.5, 0.03
-"""Standard deviations of the place of the template before it is fitted, per axis, and of the log of its size."""
+"""Standard deviations of the place of the template before it is fitted, per axis, and of the log of its size. A head
+that augmentation has turned (`augment.py`) is off by that turn as well."""
 
 
 class SyntheticSubjects(SubjectDataset[Patches]):
@@ -134,7 +136,7 @@ class SyntheticSubjects(SubjectDataset[Patches]):
         if self.augmentation is not None:
             truth = augmented(truth, self.augmentation, rng)
         truth = _padded(cropped(truth, MARGIN_VOXELS), self.patch_size)
-        n_stacks = 1 + index % MAX_VALIDATION_STACKS if self.in_order else None
+        n_stacks = 1 + self.turn(index, MAX_VALIDATION_STACKS) if self.in_order else None
         head = self._template_head(weeks_of(self.subjects[which], USUAL_WEEKS), rng)
         return synthesise(truth, head, rng, n_stacks, self.artefact_share)
 
@@ -236,7 +238,8 @@ def _placed(template: TemplateHead, truth: TruthVolume, rng: np.random.Generator
     """The template's grid at the head, about as registration places it."""
     head_grid = VolumeGrid(truth.data.shape, truth.affine)
     here, there = head_grid.world(np.argwhere(truth.mask)), template.grid.world(np.argwhere(template.volume > 0))
-    scale = here.std() / there.std() * np.exp(rng.normal(0, START_SCALE))
+    size_mm, template_size_mm = ((points - points.mean(0)).std() for points in (here, there))
+    scale = size_mm / template_size_mm * np.exp(rng.normal(0, START_SCALE))
     turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0, START_DEG, 3))).as_matrix()
     affine = np.eye(4)
     affine[:3, :3] = scale * turn @ template.grid.affine[:3, :3]

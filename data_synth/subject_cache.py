@@ -14,7 +14,7 @@ from data_synth.simulator import SIMULATOR_VERSION
 from g3r.errors import InputError
 from g3r.run.atomic_file import atomic_path
 
-SYNTHESIS_VERSION = 5
+SYNTHESIS_VERSION = 6
 """Raised whenever the synthesis changes, so that subjects of an earlier one are not taken. Slices have a version of
 their own (`SIMULATOR_VERSION`), which counts as well."""
 

@@ -68,6 +68,11 @@ class SubjectDataset(Dataset[Item], Generic[Item]):
         rng = np.random.default_rng([self.seed, epoch, index])
         return index % len(self.subjects) if self.in_order else int(rng.integers(len(self.subjects))), rng
 
+    def turn(self, index: int, n: int) -> int:
+        """0 to n - 1 in turn, shifted with each pass through the subjects, so that each of these meets all of them."""
+        n_passes, which = divmod(index, len(self.subjects))
+        return (which + n_passes) % n
+
 
 class EpochSampler(Sampler[int]):
     """Numbers epoch * length + index, one epoch further each time it is iterated.

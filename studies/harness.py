@@ -175,7 +175,7 @@ class Study:
         print("\n\n".join(texts.values()))
         for marker, text in texts.items():
             if options.docs:
-                put_between_markers(options.docs, marker, stated(text, record["machine"]))
+                put_between_markers(options.docs, marker, stated(text, record))
         if self.figure and options.figure:
             self.figure(record, options)
         return 0 if self.verdict is None or self.verdict(record) else 1
@@ -197,14 +197,19 @@ class Study:
         return found | (self.settings(options) if self.settings else {})
 
 
-def stated(text: str, found: Record) -> str:
-    """Published tables with the machine and the commit of their record, unless they say them already.
+def stated(text: str, record: Record) -> str:
+    """Published tables with machine, commit and weights of their record, unless they say them already.
 
     Args:
         text: in Markdown.
-        found: by `g3r.bench.record.machine`.
+        record: with what `g3r.bench.record.machine` found.
     """
-    return text if "commit " in text or "|" not in text else f"{text}\n\n{machine_line(found)}"
+    if "commit " in text or "|" not in text:
+        return text
+    line = machine_line(record["machine"])
+    if "weights" in record and record["weights"] not in text:
+        line += f" Prior of weights {record['weights']}."
+    return f"{text}\n\n{line}"
 
 
 def left_text(n_done: int, n_all: int, seconds: float) -> str:

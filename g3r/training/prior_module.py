@@ -122,7 +122,9 @@ class PriorModule(AnnealedModule):
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last epoch's scores and images."""
-        assert self.voxel_mm is not None  # set with the data
+        if self.voxel_mm is None:  # `validate` alone fits nothing
+            self.take_voxel_size()
+        assert self.voxel_mm is not None
         self._scores, self._panels = ValidationScores(self.voxel_mm), {}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -176,6 +178,10 @@ class PriorModule(AnnealedModule):
             self.weeks = [float(week) for week in template.weeks]
 
     def on_fit_start(self) -> None:
+        """Take the voxel size from the data module, once a checkpoint to go on with is loaded."""
+        self.take_voxel_size()
+
+    def take_voxel_size(self) -> None:
         """Take the voxel size from the data module.
 
         Raises:
@@ -200,7 +206,7 @@ class PriorModule(AnnealedModule):
                 )
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Note the voxel size of a run that is resumed; `on_fit_start` compares it with the data's."""
+        """Note the voxel size of a run that is resumed; `take_voxel_size` compares it with the data's."""
         voxel_mm = checkpoint.get(TRAINING_ENTRY, {}).get("voxel_mm")
         if voxel_mm is not None:
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)

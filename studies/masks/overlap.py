@@ -36,7 +36,7 @@ def settings(options: argparse.Namespace) -> Record:
     path = weights_path(options.masks, "mask")
     if not path.is_file():
         raise InputError(f"--masks {path}: no such file; export a checkpoint of the mask networks and name it")
-    return {"weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16]}
+    return {"mask_weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16]}
 
 
 @cache

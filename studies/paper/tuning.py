@@ -25,7 +25,7 @@ from studies.paper.least_squares import TIKHONOV, TOTAL_VARIATION, least_squares
 from studies.paper.subjects import TUNING_SEED, VOXEL_MM, PaperSubject, atlas_heads, paper_case, phantom_heads
 from studies.tables import Cell, table
 
-STRENGTHS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
+STRENGTHS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
 
 KINDS = {"Tikhonov": TIKHONOV, "total variation": TOTAL_VARIATION}
 

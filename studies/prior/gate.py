@@ -82,7 +82,8 @@ def measure(
     run = options.output / variant.name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
     n_epochs = epochs_of(options.steps, configuration(), options.train_args)
     own = [f"--model.density={kind}", f"--seed_everything={seed}"]
-    checkpoint, seconds = train(variant, run, n_epochs, [*data_arguments(*data), *options.train_args, *own])
+    arguments = [*data_arguments(*data), *options.train_args, *own]
+    checkpoint, seconds = train(variant, run, n_epochs, arguments, fresh=options.fresh)
     if checkpoint is None:
         print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
         return None

@@ -88,7 +88,9 @@ def measure(variant: Variant, n_epochs: int, data: tuple[Path, Path, int], optio
         The row of the record, or None when training failed.
     """
     run = options.output / variant.name
-    checkpoint, seconds = train(variant, run, n_epochs, [*data_arguments(*data), *options.train_args])
+    checkpoint, seconds = train(
+        variant, run, n_epochs, [*data_arguments(*data), *options.train_args], fresh=options.fresh
+    )
     if checkpoint is None:
         print(f"{variant.name}: training failed; see {run / 'train.log'}", file=sys.stderr)
         return None

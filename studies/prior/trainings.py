@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -69,12 +70,16 @@ def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
     ]
 
 
-def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
-    """Train a variant in a process of its own, going on where an earlier one stopped.
+def train(
+    variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str], *, fresh: bool
+) -> tuple[Path | None, float]:
+    """Train a variant in a process of its own, going on where an earlier one stopped unless `fresh`.
 
     Returns:
         Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
     """
+    if fresh:  # an earlier training may be finished, and of other code
+        shutil.rmtree(run, ignore_errors=True)
     run.mkdir(parents=True, exist_ok=True)
     last = newest_checkpoint(run)
     command = [

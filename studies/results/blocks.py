@@ -24,6 +24,23 @@ RECORD_OF = {
 }
 """Blocks of the same record as another one, which is the one that its page says the command of."""
 
+OLDER_WEIGHTS = frozenset(
+    {
+        *(
+            "sets",
+            "unseen-sweep",
+            "masks-written",
+            "paper-variants-atlas",
+            "paper-stages-atlas",
+            "lattices",
+            "in-plane",
+        ),
+        *("time-budgets", "bias", "convergence", "layers", "intensities", "slice-profile"),
+    }
+)
+"""Blocks of runs with a prior that do not say its weights, from commits before that of the present ones (bc1df76). What
+is published anew says them."""
+
 BLOCK = re.compile(r"<!-- ([\w.-]+):begin -->\n(.*?)\n?<!-- \1:end -->", flags=re.DOTALL)
 COMMAND = re.compile(
     r"^    ((?:make|g3r-bench|python3? -m) .*)$|`((?:make study-|g3r-bench )[^`]+)`", flags=re.MULTILINE
@@ -105,8 +122,8 @@ class Block:
         return found[1] if found else ""
 
     def is_older(self, shipped: str) -> bool:
-        """Whether it says that it was measured with other weights than those."""
-        return self.weights not in ("", shipped)
+        """Whether it was measured with other weights than those."""
+        return self.weights != shipped if self.weights else self.name in OLDER_WEIGHTS
 
     @property
     def is_measured(self) -> bool:

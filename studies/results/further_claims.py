@@ -21,8 +21,8 @@ EVERY = {"stress-sweep": "Every run", "stress-drawn": "Every subject", "stress-d
 """Title of the table of all runs, by the block of the study."""
 
 AT_ONCE = {
-    "stress-sweep": "",
-    "stress-drawn": ", all drawn at once",
+    "stress-sweep": ", one thing wrong at a time on heads that limits were set on",
+    "stress-drawn": ", all drawn at once on heads that limits were set on",
     "stress-drawn-later": ", all drawn at once again with one limit raised on two of these",
 }
 """What claims about a study say of it."""

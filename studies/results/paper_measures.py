@@ -74,7 +74,7 @@ def ahead(
         needed: subjects.
         of: the others; all but V_prior when none are named.
         first: the method.
-        at_least: what the difference is to reach; with 0 it is to be above.
+        at_least: what the difference is to reach; with 0 it is to be above, by two units of the third digit.
         place: "mask" or "grid".
         motion: its level.
     """
@@ -99,7 +99,8 @@ def ahead(
         text = {PSNR: f"{gain:+.2f} dB {word}", LPIPS: f"{abs(gain):.3f} {'lower' if gain > 0 else 'higher'} than"}.get(
             head, f"{gain:+.3f} {word}"
         )
-        holds = gain >= at_least if at_least else gain > 0
+        # means have three digits at most: a difference of one in the last is none
+        holds = gain >= at_least if at_least else round(gain, 3) >= (0.01 if head == PSNR else 0.002)
         figure = "; without ".join([f"{text} {least}", *(name for name in known if name not in same)])
         return Finding(figure=figure, n=int(n), of="subjects", holds=holds, enough=n >= needed)
 

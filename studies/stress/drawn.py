@@ -158,7 +158,7 @@ class Draw:
 def drawn(n: int) -> Draw:
     """Subject `n`."""
     seed = FIRST_SEED + n
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, 1])  # the seed alone draws the head and its motion
     thickness_mm = round(float(rng.uniform(2.0, 4.5)), 2)
     subject = DrawnSubject(
         name=f"drawn-{seed}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import time
 from dataclasses import dataclass, replace
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from data_synth.simulator import SIMULATOR_VERSION
 from g3r.acquisition.images import Volume
+from g3r.bench.record import machine
 from g3r.evaluation.align import resample
 from g3r.evaluation.case import SimulatedCase
 from g3r.evaluation.metrics import score
@@ -215,9 +218,11 @@ def predictors_of(result: ReconstructionResult) -> dict[str, NDArray[np.float64]
 def _cached_registration(
     case: SimulatedCase, subject: Subject, reconstructor: GaussianReconstructor, cache: Path
 ) -> Registration:
-    """Registration of the stacks; it does not depend on the prior, so it is made once and kept."""
+    """Registration of the stacks; it does not depend on the prior, so it is made once for a commit and kept."""
     missing = "".join(f"-{h.stack}_{h.first:g}_{h.n_slices or h.last:g}" for h in subject.holes)
-    path = cache / f"{case.name}-{subject.n_stacks}{missing}.whole-slices.motion.pkl"
+    made_with = f"{machine()['commit']} {SIMULATOR_VERSION} {reconstructor.settings.registration}"
+    key = hashlib.sha256(made_with.encode()).hexdigest()[:12]
+    path = cache / f"{case.name}-{subject.n_stacks}{missing}.{key}.motion.pkl"
     if path.is_file():
         with path.open("rb") as stream:
             return pickle.load(stream)

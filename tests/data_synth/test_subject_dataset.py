@@ -1,6 +1,9 @@
 """Epochs: the numbers of their items."""
 
-from data_synth.subject_dataset import EpochSampler
+import pytest
+
+from data_synth.heads import phantom_subjects
+from data_synth.subject_dataset import EpochSampler, SubjectDataset
 
 
 def test_epoch_sampler_goes_on() -> None:
@@ -21,3 +24,12 @@ def test_an_iterator_that_is_not_used_costs_no_epoch() -> None:
     sampler = EpochSampler(2)
     iter(sampler)
     assert list(sampler) == [0, 1]
+
+
+@pytest.mark.parametrize("n_subjects", [5, 6, 9, 10])
+@pytest.mark.parametrize("n", [3, 5, 6])
+def test_every_subject_meets_every_number_of_stacks(n_subjects: int, n: int) -> None:
+    """Else errors by number of stacks would be those of other heads."""
+    dataset = SubjectDataset[int](phantom_subjects(n_subjects, 0, "x"), length=n_subjects * n, seed=0, in_order=True)
+    met = {(dataset.draw(0, index)[0], dataset.turn(index, n)) for index in range(len(dataset))}
+    assert len(met) == n_subjects * n

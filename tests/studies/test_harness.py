@@ -64,6 +64,7 @@ def test_an_interrupted_study_goes_on_and_writes_its_table(tmp_path: Path, capsy
     assert (tmp_path / "page.md").read_text() == PAGE.replace("old", f"{lines}\n\n{machine_line(machine)}")
     assert stated("| of commit 1 |", machine) == "| of commit 1 |"
     assert stated("Not measured yet.", machine) == "Not measured yet."
+    assert stated("| a |", {"machine": machine, "weights": "ab"}).endswith(". Prior of weights ab.")
     assert (tmp_path / "out" / "squares.md").read_text() == lines + "\n"
     assert study.main(["9", *output]) == 1  # the verdict
 

@@ -187,6 +187,17 @@ def test_export_refuses_what_is_no_checkpoint(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_checkpoint_can_be_validated_by_itself(trained: Trained, tmp_path: Path) -> None:
+    """As the model card does; nothing is fitted, and the weights are those of the file."""
+    _, checkpoint, module = trained
+    torch.manual_seed(1)
+    fresh = training.PriorModule(replace(NETWORK, alpha=0.1))
+    (scores,) = trainer(tmp_path, logger=False).validate(fresh, TinyData(), ckpt_path=checkpoint, verbose=False)
+    (of_trained,) = trainer(tmp_path, logger=False).validate(module, TinyData(), verbose=False)
+    assert scores["val/psnr_prior"] == pytest.approx(of_trained["val/psnr_prior"])
+    assert fresh.voxel_mm == 0.8
+
+
 def test_voxel_size_must_agree_with_the_data(tmp_path: Path) -> None:
     module = training.PriorModule(**SMALL, voxel_mm=1.0)
     with pytest.raises(InputError, match=r"1.0 mm, but the data are made at 0.8 mm"):
