@@ -111,7 +111,7 @@ class GaussianReconstructor:
             cloud=cloud,
             held_out=held_out,
             fit=self._fit_to_slices(cloud, prior, poses, held_out, plan, run),
-            prior_record=prior_record,
+            prior_record=prior_record if plan.settings.use_prior else None,
             pose_record=pose_record,
         )
         return ReportedResult.of(assemble(found, plan, run))

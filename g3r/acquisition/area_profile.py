@@ -23,6 +23,10 @@ MIN_CUT_AREA = 0.3
 """A stack whose first or last slice is larger than this share of its largest one was cut there. Whole heads end at
 0 to 0.19 of it, with 4 mm between slices at the most; a field of view that lacks a tenth of the head at 0.36."""
 
+MIN_CUT_SHARE = 0.05
+"""Share of a head beyond its field of view that counts. In slices of 5 mm the outermost one of a whole head may have
+`MIN_CUT_AREA`, too; then next to nothing lies beyond it."""
+
 MIN_SLICES = 6
 """Stacks of fewer slices are too coarse to say where they were cut."""
 
@@ -100,6 +104,12 @@ class AreaProfile:
     def missing_share(self) -> float:
         """Share of the head in missing slices; too large by up to a half where a stack ends in its largest slice."""
         return float(self.area_mm2[~self.seen].sum() / self.area_mm2.sum())
+
+    @property
+    def cut_share(self) -> float | None:
+        """Share of the head beyond the field of view, from `MIN_CUT_SHARE` on; else None."""
+        share = self.missing_share
+        return share if self.is_cut and share >= MIN_CUT_SHARE else None
 
     @property
     def has_missing(self) -> bool:

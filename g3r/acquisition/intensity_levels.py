@@ -7,6 +7,7 @@ stack at a third of the others' level would be taken for one that does not fit t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from g3r.acquisition.stacks import Stack
 
 LEVEL_RANGE = 1.25
-"""A level within this factor of the usual one is left as it is: gains of slices make up for it."""
+"""A level within this factor of that of the others is left as it is: gains of slices make up for it."""
 
 
 def same_level(stacks: Sequence[Stack]) -> tuple[Stack, ...]:
@@ -30,8 +31,10 @@ def same_level(stacks: Sequence[Stack]) -> tuple[Stack, ...]:
     """
     typical = [_typical(stack) for stack in stacks]
     usual = float(np.exp(np.median(np.log(typical))))
+    # the usual level of two stacks is halfway between them
+    reach = math.sqrt(LEVEL_RANGE) if len(stacks) == 2 else LEVEL_RANGE
     return tuple(
-        stack if 1 / LEVEL_RANGE <= usual / own <= LEVEL_RANGE else _multiplied(stack, usual / own)
+        stack if 1 / reach <= usual / own <= reach else _multiplied(stack, usual / own)
         for stack, own in zip(stacks, typical, strict=True)
     )
 

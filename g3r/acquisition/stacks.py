@@ -214,8 +214,9 @@ def load_stack(
     remarks = list(volume.remarks)
     if found.source != "whole image" and found.inside.all():
         remarks.append("its mask marks every voxel; expected the brain alone")
-    if profile.thickness_mm < spacing[:2].min():
-        pixels = spaced(spacing[:2])
+    pixel_mm = grid.spacing_mm[:2]  # of the slices, whichever axis of the file they are along
+    if profile.thickness_mm < pixel_mm.min():
+        pixels = spaced(pixel_mm)
         remarks.append(f"thickness {profile.thickness_mm:g} mm is less than the pixels' {pixels} mm; check --thickness")
     for remark in remarks:
         logger.warning("%s: %s", volume.name, remark)

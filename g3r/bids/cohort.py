@@ -17,6 +17,7 @@ from g3r.bids.executor import Ended, Executor, Job
 from g3r.bids.outcome import failure_path, log_path, write_failure
 from g3r.bids.sidecars import inherited, with_sidecar
 from g3r.errors import InputError
+from g3r.run.hidden_folders import HiddenFolders
 
 INFER = (sys.executable, "-m", "g3r.cli.infer")
 
@@ -25,6 +26,9 @@ AUTO = "auto"
 
 SPEAKER = "g3r-infer: "
 """How the lines of the command begin."""
+
+DEFECT = 1
+"""Exit code of Python after a traceback; g3r-infer has others for what it knows."""
 
 MAX_REASON = 500
 
@@ -107,8 +111,8 @@ class Cohort:
         """
         works = []
         for session in sessions:
-            if record_path(session, self.out_dir).exists() and not self.force:
-                failure_path(session, self.out_dir).unlink(missing_ok=True)  # of a try to replace it
+            has_failed = failure_path(session, self.out_dir).exists()  # perhaps where it was to be replaced
+            if record_path(session, self.out_dir).exists() and not has_failed and not self.force:
                 self.say(f"{session.stem}: was done before")
                 continue
             try:
@@ -191,7 +195,8 @@ class Cohort:
             reason: why.
             seconds: that its process took; None where it had none, or nobody could tell.
         """
-        line = " ".join(reason.split())[:MAX_REASON]
+        hidden = HiddenFolders([str(self.bids_dir), str(self.out_dir)])  # the data set is passed on
+        line = " ".join(hidden.left_out_of(reason).split())[:MAX_REASON]
         with suppress(OSError):  # the disk is full: then it is said, at least
             write_failure(session, self.out_dir, line, seconds)
         self.say(f"{session.stem}: failed: {line}")
@@ -203,5 +208,6 @@ def _reason(log: Path, code: int) -> str:
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError:
         lines = []
-    said = [line for line in lines if line.startswith(SPEAKER)] or lines[-1:]
+    # a defect ends with a traceback; lines of the command before it are warnings about other things
+    said = [line for line in lines if line.startswith(SPEAKER) and code != DEFECT] or lines[-1:]
     return said[-1].removeprefix(SPEAKER) if said else f"g3r-infer ended with exit code {code} and said nothing"

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from g3r.run.hidden_folders import name_alone
+
 GRACE_S = 30.0
 """For a run that is asked to stop to end its step and write what it has."""
 
@@ -66,13 +68,13 @@ class Executor(Protocol):
 
 
 def start(job: Job) -> subprocess.Popen[bytes]:
-    """Start the process of a job; its command line and what it says go to its log.
+    """Start the process of a job; its command line, with names of files alone, and its output go to its log.
 
     Raises:
         OSError: the log cannot be written, or there is no such command.
     """
     with job.log.open("wb") as log:
-        log.write(f"{shlex.join(job.words)}\n".encode(errors="surrogateescape"))
+        log.write(f"{shlex.join(map(name_alone, job.words))}\n".encode(errors="surrogateescape"))
         log.flush()
         return subprocess.Popen(
             job.words,

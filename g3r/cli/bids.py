@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from g3r.cli.completion import parsed
 from g3r.cli.failures import EXPECTED, line_and_code, missing_extra
 from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
+from g3r.run.hidden_folders import name_alone
 
 if TYPE_CHECKING:
     from g3r.bids.dataset import Session
@@ -121,16 +122,7 @@ def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> arg
 
 def _command(words: Sequence[str]) -> str:
     """The command line with names of files and folders alone: it stays in a data set that is passed on."""
-    return shlex.join(["g3r-bids", *map(_without_folders, words)])
-
-
-def _without_folders(word: str) -> str:
-    """A word, or the value in --option=value, without the folders that a path names."""
-    option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-    separators = [one for one in (os.sep, os.altsep) if one]
-    if value in (os.curdir, os.pardir) or any(one in value for one in separators):
-        value = os.path.basename(os.path.abspath(value)) or os.sep  # abspath: of data/ and of . the name, too
-    return option + equals + value
+    return shlex.join(["g3r-bids", *map(name_alone, words)])
 
 
 def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tuple[str, ...], command: str) -> int:
@@ -152,7 +144,7 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
         out_dir=options.out_dir,
         options=infer_words,
         whole_image=infer.whole_image,
-        resumes=infer.time_budget is None,
+        resumes=_keeps_stages(infer),
         force=options.force,
         mask_derivative=options.mask_derivative,
         n_threads=None if infer.threads else n_threads,
@@ -164,6 +156,16 @@ def _run(options: argparse.Namespace, infer: argparse.Namespace, infer_words: tu
     finally:
         exit_code = _table(options, sessions)
     return exit_code
+
+
+def _keeps_stages(infer: argparse.Namespace) -> bool:
+    """Whether a run that was cut short can be resumed: none with a time budget, nor the repetition of such a run."""
+    from g3r.bids.description import read_object
+
+    if infer.config:
+        with suppress(InputError):  # g3r-infer says what is wrong with the file
+            return not read_object(Path(infer.config)).get("time_budget")
+    return infer.time_budget is None
 
 
 def _executor(options: argparse.Namespace, infer: argparse.Namespace) -> tuple[Executor, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -43,7 +44,12 @@ def _columns() -> int:
 
 
 def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argparse.Namespace:
-    """The parsed command line; where the shell asks for completion, it is answered and the program ends."""
+    """The parsed command line; where the shell asks for completion, it is answered and the program ends.
+
+    From here on the command can print every file name, also one that the terminal cannot show.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     if "_ARGCOMPLETE" in os.environ:
         complete(parser)
     return parser.parse_args(argv)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
-import io
 import logging
 import os
 import platform
@@ -52,8 +51,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     import_lean()
     let_threads_sleep()
     atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     stop_request = StopRequest()
     try:
         with stop_request, _terminal(options, stop_request) as terminal:
@@ -225,7 +222,8 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
     record = replace(
         result.record,
         command=command,
-        inputs=task.inputs,
+        # a short time budget leaves the network out that was loaded
+        inputs=task.inputs if result.record.prior else replace(task.inputs, prior=None),
         memory=task.memory.record(),
         notes=task.notes + result.record.notes + task.memory.changes,
         warnings=result.record.warnings + task.warnings,

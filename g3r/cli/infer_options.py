@@ -214,7 +214,15 @@ def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
             setattr(options, name, value)
     if options.ckpt and options.no_prior:
         parser.error("--ckpt and --no-prior exclude each other")
+    if options.preset == "preview" and options.ckpt and not _names_a_set(options.ckpt):
+        parser.error("--ckpt and --preset preview exclude each other: a preview uses no prior network")
     return options
+
+
+def _names_a_set(weights: str) -> bool:
+    from g3r.checkpoints.shipped import set_of
+
+    return set_of(weights) is not None
 
 
 def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

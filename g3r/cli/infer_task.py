@@ -99,11 +99,17 @@ def earlier_run(options: argparse.Namespace) -> RunRecord | None:
     earlier = RunRecord.read(options.config)
     if earlier.partial:
         raise InputError(f"{options.config}: is of an interrupted run; pass the run.json of a complete result")
-    n_then, n_now = len(earlier.stacks), len(options.stacks)
-    if n_then != n_now and not options.thickness and not options.slices:
-        raise InputError(f"{options.config}: is of {n_then} stacks, {n_now} are given; pass --thickness to use it")
+    if len(options.stacks) < len(earlier.stacks):
+        _check_number(options, earlier, len(options.stacks))
     options.anatomy = earlier.settings.anatomy
     return earlier
+
+
+def _check_number(options: argparse.Namespace, earlier: RunRecord, n_stacks: int) -> None:
+    """Refuse to take the slice profiles of another number of stacks than that of the stacks with a head."""
+    n_then = len(earlier.stacks)
+    if n_then != n_stacks and not options.thickness and not options.slices:
+        raise InputError(f"{options.config}: is of {n_then} stacks, {n_stacks} are given; pass --thickness to use it")
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
@@ -160,6 +166,8 @@ def prepared(
     else:
         reporter.begun(FINDING_MASKS)
         masked = masked_stacks(options, networks.get("mask"))
+        if earlier:
+            _check_number(options, earlier, len(masked.kept))
         reporter.begun(LOADING)
         stacks = _load(options, masked, earlier)
     reporter.begun(PREPARING)

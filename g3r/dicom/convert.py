@@ -50,9 +50,17 @@ def converter() -> str:
 
 
 def converter_version() -> str:
-    """What dcm2niix says of itself, such as v1.0.20260724; "unknown" where it does not."""
-    done = subprocess.run([converter(), "--version"], capture_output=True, text=True, errors="replace", check=False)
-    found = re.search(r"v\d[\d.]+", done.stdout)
+    """The version that dcm2niix prints, such as v1.0.20260724; "unknown" where it prints none.
+
+    Raises:
+        InputError: dcm2niix cannot be started.
+        ModuleNotFoundError: dcm2niix is not installed.
+    """
+    try:
+        printed = _run([converter(), "--version"]).stdout.decode(errors="replace")
+    except subprocess.TimeoutExpired:
+        return "unknown"
+    found = re.search(r"v\d[\d.]+", printed)
     return found[0] if found else "unknown"
 
 
@@ -73,14 +81,12 @@ def convert(series: Series, folder: Path) -> Path:
         _link(image.path.resolve(), images / f"{n:05d}.dcm")
     words = [converter(), *OPTIONS, "-f", series.name, "-o", str(folder), str(images)]
     try:
-        done = subprocess.run(words, capture_output=True, timeout=TIMEOUT_S, check=False)
+        done = _run(words)
     except subprocess.TimeoutExpired:
         raise InputError(
             f"{series.name}: dcm2niix did not end within {TIMEOUT_S:g} s and was stopped; copy the folder to a local "
             "disk, or leave the series out (--series)"
         ) from None
-    except OSError as error:
-        raise InputError(f"dcm2niix cannot be started ({error.strerror}); reinstall it: pip install dcm2niix") from None
     shutil.rmtree(images)
     # what dcm2niix printed is not passed on: it quotes headers
     made = sorted(path.name for path in folder.glob(f"{series.name}*.nii") if _is_of(path.name, series.name))
@@ -93,6 +99,19 @@ def convert(series: Series, folder: Path) -> Path:
     _check_geometry(target, series)
     _reduce_sidecar(target.with_suffix(".json"))
     return target
+
+
+def _run(words: list[str]) -> subprocess.CompletedProcess[bytes]:
+    """A command of dcm2niix, ended.
+
+    Raises:
+        InputError: it cannot be started.
+        subprocess.TimeoutExpired: it does not end within `TIMEOUT_S`.
+    """
+    try:
+        return subprocess.run(words, capture_output=True, timeout=TIMEOUT_S, check=False)
+    except OSError as error:
+        raise InputError(f"dcm2niix cannot be started ({error.strerror}); reinstall it: pip install dcm2niix") from None
 
 
 def _is_of(name: str, series_name: str) -> bool:

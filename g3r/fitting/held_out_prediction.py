@@ -34,11 +34,13 @@ class HeldOutFit:
         cloud: that was fitted.
         slices: that were held out, with the profile of the fit.
         share: [P'] of brain in their masked pixels.
+        field: [P'] bias field of their stacks there, as the fit found it.
     """
 
     cloud: GaussianCloud
     slices: Slices
     share: NDArray[np.float32]
+    field: NDArray[np.float32]
 
     def errors(self, stretch: float = 1.0) -> NDArray[np.float64]:
         """[P'] absolute errors of masked pixels after one gain a slice, in the units of what was measured.
@@ -50,7 +52,7 @@ class HeldOutFit:
         planes = self.slices.planes
         number = planes.plane_id()[index]
         planes = replace(planes, psf_var_mm2=planes.psf_var_mm2 * np.array([1, 1, stretch**2]))
-        predicted, measured = render(self.cloud, planes).numpy()[index], self.slices.value[index]
+        predicted, measured = render(self.cloud, planes).numpy()[index] * self.field, self.slices.value[index]
         across = np.bincount(number, self.share * predicted * measured)
         own = np.bincount(number, self.share * predicted * predicted)
         gain = np.divide(across, own, out=np.ones_like(own), where=own > 0)

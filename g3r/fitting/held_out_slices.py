@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g3r.acquisition.planes import Slices
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.held_out_prediction import MIN_HELD_OUT, HeldOutFit, lowest
 from g3r.fitting.initial_volumes import PriorVolume
 from g3r.fitting.prior_stage import NO_PROGRESS, VolumeTarget
@@ -229,4 +230,7 @@ def _short_fit(
         pixel_weight=sliced.pixel_weight * ~held[plane],
     )
     held_pixels = np.flatnonzero(slices.mask & np.isin(plane, rows))
-    return HeldOutFit(fit.cloud, slices.take(rows), sliced.pixel_weight[held_pixels])
+    field = np.ones(len(held_pixels), np.float32)
+    if fit.bias_field:
+        field = np.exp(StackBiasField(slices).log_field(np.array(fit.bias_field))[held_pixels])
+    return HeldOutFit(fit.cloud, slices.take(rows), sliced.pixel_weight[held_pixels], field)

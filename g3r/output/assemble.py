@@ -135,9 +135,9 @@ def _share_by_areas(found: StageResults, settings: ReconstructionSettings) -> fl
     Of another object the part in the masks is meant, wherever it ends.
     """
     profiles = found.registration.profiles
-    if settings.anatomy != FETAL_BRAIN or len(profiles) != 1 or not profiles[0].is_cut:
+    if settings.anatomy != FETAL_BRAIN or len(profiles) != 1:
         return None
-    return profiles[0].missing_share
+    return profiles[0].cut_share
 
 
 def _record(

@@ -36,6 +36,9 @@ PRIOR_FROM_S = 13.0
 """Seconds left at the start from which on the prior network is used. The import of its libraries takes two of them, and
 with fewer seconds in all there is often no time left for the network itself, on two cores and a 30-week head."""
 
+SWITCHES = ("template", "network", "segments", "check_handedness", "leave_out_misfits")
+"""Fields of `RegistrationSettings` that options and anatomy switch off; a budget never switches them on again."""
+
 REGISTRATION_SHARE = 0.5
 """Largest share of the remaining time that registration may take."""
 
@@ -131,7 +134,10 @@ class TimeBudget:
         allowed = [name for name, min_s in REGISTRATION_FROM_S.items() if self.given_s >= min_s]
         name = max(allowed, key=lambda name: REGISTRATION_FROM_S[name])
         asked = self.settings.registration
-        chosen = replace(PRESETS[name].registration, standard_orientation=asked.standard_orientation, seed=asked.seed)
+        preset = PRESETS[name].registration
+        # what was switched off stays off, whatever the budget allows
+        switches = {one: getattr(preset, one) and getattr(asked, one) for one in SWITCHES}
+        chosen = replace(preset, standard_orientation=asked.standard_orientation, seed=asked.seed, **switches)
         self.settings = replace(self.settings, registration=chosen)
         self.choices["registration"] = name
         logger.info("time budget: %.0f s left, registration as in %s", left, name)
@@ -148,7 +154,8 @@ class TimeBudget:
         views = min(max(1, views), PRESETS["accurate"].prior_views)
         round_s = ROUND_OVER_COARSE * coarse_s + view_s * views + compiling_s()
         rounds = int(ROUNDS_SHARE * max(0.0, self.deadline.remaining_s) / round_s) if round_s > 0 else 0
-        careful = PRESETS["accurate"].pose_rounds
+        # without motion segments poses are kept as they were given
+        careful = PRESETS["accurate"].pose_rounds if self.settings.registration.segments else self.settings.pose_rounds
         pose_rounds = replace(careful.at_most(rounds), moves_to_prior=min(max(1, rounds), careful.moves_to_prior))
         self.settings = replace(self.settings, prior_views=views, pose_rounds=pose_rounds)
         if not self.settings.use_prior:
@@ -217,7 +224,7 @@ class TimeBudget:
             held_out=None,  # three fits whose seconds nobody has timed
             n_lattices=PRESETS["accurate"].n_lattices,  # as many as time is left for
             share_probes=probes,
-            voxel_correction=settings.voxel_correction if preset.voxel_correction else None,
+            voxel_correction=preset.voxel_correction if settings.voxel_correction else None,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
             slice_stage=replace(settings.slice_stage, n_steps=PRESETS["accurate"].slice_stage.n_steps),
         )

@@ -26,7 +26,7 @@ from g3r.registration.overlap import Overlap, overlap_of
 from g3r.registration.segment_search import aligned_to
 from g3r.registration.settings import RegistrationSettings
 from g3r.registration.similarity import StackSamples
-from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, refine_slices
+from g3r.registration.slice_rounds import FittedSlices, correlation_with_all, fitted_in_place, refine_slices
 from g3r.registration.stack_quality import StackQuality
 from g3r.registration.thresholds import MAX_HELD_OUT_LOSS, MIN_NCC_GAIN
 from g3r.registration.unseen import TemplateFill
@@ -221,8 +221,13 @@ def _with_rigid_stacks(
     for sample in reverted:
         logger.info("stack %d: is rigid, slices keep its motion", sample.stack)
         refined = refined.with_rows(sample.rows, motion.take(sample.rows))
-        gain[sample.rows], weight[sample.rows] = 1.0, 1.0  # those of the refined poses do not apply
     moved = slices.with_motion(refined)
+    # gains and weights of the refined poses do not apply to a stack that reverts, but a dark slice stays dark
+    if settings.n_rounds:
+        placed = fitted_in_place(moved, settings)
+        for sample in reverted:
+            gain[sample.rows], weight[sample.rows] = placed.gain[sample.rows], placed.weight[sample.rows]
+        gain /= np.exp(np.log(gain).mean())
     ncc = correlation_with_all(moved, gain, weight, settings.finest_voxel_mm, settings.max_pixels)
     kept = replace(fitted, slices=moved, gain=gain, weight=weight, ncc=ncc)
     return kept, held_out_score(slices, samples, refined, fill).agreements(samples, weight)

@@ -95,6 +95,11 @@ def _of_others(
     return operator, value, grid
 
 
+LEAST_ENERGY = 0.01
+"""Least mean square of a slice over that of its stack. Thinned pixels of a small slice may all lie outside its mask;
+the faint values that other stacks show there would then be compared with zero, and that slice would decide for all."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """How well a volume predicts the slices of a stack that it was made without.
@@ -140,7 +145,8 @@ def predict(
     """
     moments = own_moments(sample.pixels, volume, grid, motion)
     energy = moments[:, 3] / moments[:, 0]
-    relative = mean_square_residual(moments) / np.maximum(energy, 1e-30)
+    least = LEAST_ENERGY * moments[:, 3].sum() / moments[:, 0].sum() + 1e-30
+    relative = mean_square_residual(moments) / np.maximum(energy, least)
     fit = (sample.pixels.area_mm2 / CORRELATION_AREA_MM2) @ np.log(relative + 1e-4)
     moves = changes_in_time(motion, sample.slice_index, sample.pixels.center_mm, interleave)
     return Prediction(float(fit) + transition_penalty(moves), moments)

@@ -111,6 +111,11 @@ def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
     elif not record.settings.n_lattices:
         kind = "the prior volume" if record.settings.use_prior else "a least-squares volume of the slices"
         yield "not fitted" if record.time_budget else "preview", {"what": kind}
+    elif record.prior_weight == 1 and not (record.volume_check and record.volume_check.falls_back):
+        yield "fit ended early", {}
+    search = record.settings.registration
+    if record.settings.n_lattices and search.template and not search.check_handedness and len(record.stacks) > 1:
+        yield "sides not compared", {}
     said = {unseen, checked}
     for line in record.warnings:
         if line not in said and not _is_said_otherwise(line, record):

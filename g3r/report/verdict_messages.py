@@ -133,6 +133,16 @@ MESSAGES = {
         "there was no time for a fit: this is {what}, without uncertainty",
         "Run again with a longer --time-budget, or without one, before reading it.",
     ),
+    "fit ended early": Message(
+        CHECK,
+        "the fit had too little time to be shown: this is the prior volume alone",
+        "Run again with a longer --time-budget, or without one, before reading it.",
+    ),
+    "sides not compared": Message(
+        CHECK,
+        "there was no time to ask whether a stack is a mirror image of the others, or does not belong to them",
+        "Run again with a longer --time-budget, or without one, before trusting left and right.",
+    ),
     "preview": Message(
         CHECK, "this is a preview: {what}, without uncertainty", "Run again with another --preset before reading it."
     ),

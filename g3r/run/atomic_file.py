@@ -38,13 +38,15 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file (UTF-8), whole or not at all.
+    r"""Write a text file (UTF-8), whole or not at all.
+
+    Bytes of file names that are no text are written as escapes, such as `\udce4`.
 
     Raises:
         OSError: it cannot be written.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def remove_leftovers(folder: Path, suffix: str) -> None:

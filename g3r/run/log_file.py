@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+
+from g3r.run.hidden_folders import HiddenFolders
 
 LOG_NAME = "log.txt"
 
@@ -16,9 +17,6 @@ MAX_CHARACTERS = 20_000_000
 """More than any run says; what comes after it is dropped."""
 
 OURS = "g3r"
-
-ABSOLUTE = re.compile(r"(?<![\w./])(?:/[^\s/:;,'\"]+)+/(?=[^\s/])")
-"""Folders of any path from the root, such as those of a traceback."""
 
 
 class LogFile(logging.Handler):
@@ -39,16 +37,7 @@ class LogFile(logging.Handler):
         self.n_characters = 0
         self.path: Path | None = None
         self.addFilter(logging.Filter(OURS))
-        self.hidden: set[str] = set()
-        self.hide([*(os.path.dirname(path) for path in paths), *folders])
-
-    def hide(self, folders: Iterable[str]) -> None:
-        """Leave some more folders out, however they are written."""
-        for folder in folders:
-            if not folder or "\0" in folder:  # that no file can have: it is refused later
-                continue
-            spelled = (folder, os.path.abspath(folder), os.path.realpath(folder))
-            self.hidden |= {one.rstrip(os.sep) + os.sep for one in spelled if one.strip("./\\")}
+        self.hidden = HiddenFolders([*(os.path.dirname(path) for path in paths), *folders])
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record, and write it where there is a file."""
@@ -64,20 +53,12 @@ class LogFile(logging.Handler):
     def say(self, text: str) -> None:
         """Add a line with its time."""
         passed = time.monotonic() - self.begun_s
-        line = f"{time.strftime('%H:%M:%S')} {passed:8.2f} s  {self.without_folders(text)}\n"
+        line = f"{time.strftime('%H:%M:%S')} {passed:8.2f} s  {self.hidden.left_out_of(text)}\n"
         if self.n_characters > MAX_CHARACTERS:
             return
         self.n_characters += len(line)
         self.lines.append(line)
         self._write(line, "a")
-
-    def without_folders(self, text: str) -> str:
-        """A text in which paths are names of files."""
-        for folder in sorted(self.hidden, key=len, reverse=True):
-            whole = re.escape(folder.rstrip(os.sep))
-            text = re.sub(rf"(?<![\w./-]){whole}[/\\]+(?=[^\s/])", "", text)  # a name may be a part of a word
-            text = re.sub(rf"(?<![\w./-]){whole}(?![\w.-])", "DIR", text)
-        return ABSOLUTE.sub("", text)
 
     def keep_in(self, folder: Path) -> None:
         """Write to the log.txt of a folder from now on, beginning with all that was said."""

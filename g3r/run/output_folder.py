@@ -4,7 +4,8 @@
 lock ends with the process, however that ends. So an unlocked folder belongs to a dead run, and the next run to the
 same output may take what it finds there or remove it. Nothing of a living run is ever touched.
 
-Where DIR is a file system of its own (a mount point), nothing can be renamed onto it: there the staging folder is
+Two kinds of DIR stay where they are: a file system of its own (a mount point), onto which nothing can be renamed, and
+the folder that the process works in, whose shell would be left in a removed one. There the staging folder is
 `DIR/.unfinished`, and the files move one by one, the record last.
 """
 
@@ -50,8 +51,8 @@ class OutputFolder:
     def __init__(self, output: str | os.PathLike[str], names: Collection[str] | None = None) -> None:
         self.named = Path(output)
         self.output = Path(os.path.realpath(output))  # a link is followed, not replaced
-        self.is_mount = self.output.is_dir() and is_mount(self.output)
-        self.staging = self.output / SUFFIX if self.is_mount else self.output.with_name(self.output.name + SUFFIX)
+        self.stays = self.output.is_dir() and stays(self.output)
+        self.staging = self.output / SUFFIX if self.stays else self.output.with_name(self.output.name + SUFFIX)
         self.stages = self.staging / "stages"
         self.names = names
         self.is_written = False
@@ -110,7 +111,7 @@ class OutputFolder:
             for path in self._new.rglob("*"):  # a full disk may be reported only now
                 if path.is_file():
                     sync(path)
-            if self.is_mount:
+            if self.stays:
                 self._half_backup.mkdir()
                 _move_files(self.output, self._half_backup, self.names)
                 os.rename(self._half_backup, self._backup)
@@ -126,7 +127,7 @@ class OutputFolder:
 
     def _clean(self) -> None:
         """Remove a result that was not finished; finish or undo the exchange of an earlier one."""
-        if self.is_mount:
+        if self.stays:
             self._clean_mount()
             return
         shutil.rmtree(self._new, ignore_errors=True)
@@ -190,6 +191,13 @@ def is_mount(folder: Path) -> bool:
     return folder.stat().st_dev != folder.parent.stat().st_dev
 
 
+def stays(folder: Path) -> bool:
+    """Whether a folder must not be renamed: a mount point, or the folder that the process works in."""
+    with suppress(OSError):  # the working folder is gone
+        return is_mount(folder) or folder.samefile(os.curdir)
+    return False
+
+
 def check_output_folder(
     folder: Path, names: Collection[str], *, replace: bool, inputs: Sequence[str | os.PathLike[str]] = ()
 ) -> None:
@@ -216,7 +224,7 @@ def check_output_folder(
         if not parent.is_dir():
             raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
         written = [target] if target.exists() else [parent]
-        if target.exists() and not is_mount(target):
+        if target.exists() and not stays(target):
             written.append(parent)  # in which the folder is renamed
         if not all(os.access(path, os.W_OK | os.X_OK) for path in written):
             raise InputError(f"{folder}: cannot be written; choose another --output")
@@ -231,6 +239,10 @@ def check_output_folder(
             continue
         if is_output:
             raise InputError(f"{path}: would be replaced by a result of its name; choose another --output")
+    found = sorted(path.name for path in outputs if path.exists())
+    is_cut_short = (folder / SUFFIX).exists()  # a mount point, where the record moves last
+    if replace and found and LAST_NAME in names and LAST_NAME not in found and not is_cut_short:
+        raise InputError(f"{folder}: holds {found[0]}, but no {LAST_NAME} of a result of g3r; choose another --output")
 
 
 def _move_files(source: Path, target: Path, names: Collection[str] | None = None) -> None:

@@ -6,6 +6,8 @@ import pytest
 from data_synth.phantom import fetal_brain_phantom
 from g3r.acquisition.area_profile import area_profiles, head_volume_mm3
 from g3r.acquisition.planes import Slices
+from g3r.acquisition.slicing import slices_from_stacks
+from tests.acquisition.ellipsoids import ellipsoid_stack
 from tests.registration.moving_heads import as_slices, simulated
 
 
@@ -54,6 +56,16 @@ def test_a_cut_head_is_continued(whole: Slices, span: tuple[float, float], cut: 
     assert seen_mm3 < 0.7 * given.volume_mm3
     assert found.missing_share == pytest.approx(1 - seen_mm3 / given.volume_mm3, abs=0.07)
     assert np.linalg.norm(found.head_center_mm - given.head_center_mm) < 3
+
+
+def test_a_whole_head_in_thick_slices_is_not_called_cut_for_its_first_slice(whole: Slices) -> None:
+    """The outermost slice lies up to its own thickness inside the head, where it is large."""
+    slices = slices_from_stacks([ellipsoid_stack(thickness_mm=6.0, low_mm=-43.0)])
+    (found,) = area_profiles(slices)
+    assert found.cut == (True, False)
+    assert found.cut_share is None
+    (half,) = area_profiles(without(one_stack(whole, 2), 2, 0.0, 0.4))
+    assert half.cut_share == half.missing_share > 0.3
 
 
 def test_whole_stacks_say_the_volume(whole: Slices) -> None:

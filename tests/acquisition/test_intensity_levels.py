@@ -48,3 +48,11 @@ def test_black_in_a_mask_does_not_change_its_level() -> None:
 def test_a_single_stack_has_nothing_to_match() -> None:
     only = stack(7.0, "a")
     assert same_level([only]) == (only,)
+
+
+def test_two_stacks_are_compared_with_each_other() -> None:
+    """Each is within the range of their common level, but not of the other's."""
+    found = same_level([stack(100.0, "a"), stack(100.0 * 1.4, "b")])
+    np.testing.assert_allclose(found[0].image, found[1].image, rtol=1e-5)
+    alike = [stack(100.0, "a"), stack(100.0 * 0.95 * LEVEL_RANGE, "b")]
+    assert same_level(alike) == tuple(alike)

@@ -37,6 +37,14 @@ def test_thickness_is_not_the_distance_of_slices(tmp_path: Path, caplog: pytest.
     assert normal_sigma == pytest.approx(2.2 / 2.3548, rel=1e-4)
 
 
+def test_a_thickness_below_the_pixels_is_doubtful_whatever_axis_the_slices_are_on(tmp_path: Path) -> None:
+    image, mask = arrays(shape=(6, 14, 11))
+    path = write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"], spacing=(3.0, 0.8, 0.9)))
+    assert load_stack(path, whole_image, 1.0).remarks == ()
+    (remark,) = load_stack(path, whole_image, 0.7).remarks
+    assert remark == "thickness 0.7 mm is less than the pixels' 0.8 x 0.9 mm; check --thickness"
+
+
 def test_a_mask_may_be_found_by_any_function(tmp_path: Path) -> None:
     image, mask = arrays()
     stack = load_stack(write(tmp_path / "a.nii.gz", image * mask, affine_of(AXES["RAS"])), whole_image)

@@ -183,3 +183,61 @@ def test_what_each_process_is_told(raw: Path, use: Use, tmp_path: Path) -> None:
     assert main([*line, "--force", "--", "--time-budget", "30", "--whole-image"]) == 0
     words = events(tmp_path)[-1]["words"]
     assert not {"--masks", "--resume"} & set(words)
+
+
+@pytest.mark.parametrize("budget", [None, {"seconds": 30.0}])
+def test_the_repetition_of_a_budget_is_not_resumed(
+    raw: Path, use: Use, tmp_path: Path, budget: dict[str, float] | None
+) -> None:
+    """Such a run keeps no stages, and g3r-infer would refuse --resume."""
+    use()
+    config = tmp_path / "run.json"
+    config.write_text(json.dumps({"time_budget": budget}))
+    line = [str(raw), str(tmp_path / "out"), "participant", "--participant-label", "03", "--", "--config", str(config)]
+    assert main(line) == 0
+    assert ("--resume" in events(tmp_path)[0]["words"]) is (budget is None)
+
+
+def test_a_failed_try_to_replace_a_result_is_tried_again(raw: Path, use: Use, tmp_path: Path) -> None:
+    """The old volume is not passed off as the new one."""
+    use()
+    line = [str(raw), str(tmp_path / "out"), "participant", "--participant-label", "03"]
+    assert main(line) == 0
+    first = next((raw / "sub-03").rglob("*run-1_T2w.nii.gz"))
+    first.write_bytes(BROKEN)
+    assert main([*line, "--force"]) == 1
+    assert rows(tmp_path / "out")["sub-03"]["verdict"] == "failed"
+    first.write_bytes(b"mended")
+    assert main(line) == 0
+    assert len(events(tmp_path)) == 3
+    assert rows(tmp_path / "out")["sub-03"]["verdict"] == "use"
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [(1, "ValueError: x"), (3, "a.nii.gz: thickness is taken as the distance of slices"), (None, "ValueError: x")],
+)
+def test_the_reason_of_a_defect_is_its_last_line(tmp_path: Path, code: int | None, reason: str) -> None:
+    log = tmp_path / "log"
+    lines = ["g3r-infer --stacks a.nii.gz", "g3r-infer: a.nii.gz: thickness is taken as the distance of slices"]
+    if code != 3:
+        lines += ["Traceback (most recent call last):", "ValueError: x"]
+    log.write_text("\n".join(lines) + "\n")
+    assert cohort._reason(log, code or 1) == reason
+
+
+def test_neither_command_lines_nor_reasons_name_folders(raw: Path, use: Use, tmp_path: Path) -> None:
+    """A data set is passed on. What a process prints in its log is its own affair."""
+    use()
+    out, link = tmp_path / "out", next((raw / "sub-03").rglob("*run-1_T2w.nii.gz"))
+    link.unlink()
+    link.symlink_to(tmp_path / "not-fetched" / "image")
+    (tmp_path / "JANE").mkdir()
+    assert main([str(raw.rename(tmp_path / "JANE" / "raw")), str(out), "participant"]) == 1
+    assert "T2w.nii.gz" in rows(out)["sub-03"]["reasons"]
+    logs = list((out / "logs").glob("*.log"))
+    assert len(logs) == N
+    told = [path.read_text() for path in (*out.glob("*.tsv"), *out.glob("*.html"), *out.rglob("*.failure.json"))]
+    told += [path.read_text().splitlines()[0] for path in logs]
+    assert len(told) == N + 4
+    assert not any("JANE" in text or str(tmp_path) in text for text in told)

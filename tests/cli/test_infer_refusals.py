@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from g3r import GaussianReconstructor
+from g3r.cli.infer_options import parsed_options
 from g3r.errors import InputError
 from g3r.planning.presets import PRESETS, ReconstructionSettings
 from tests.cli.test_infer import files, inputs, run
@@ -138,3 +139,18 @@ def test_a_usage_error_as_a_process() -> None:
     done = run("infer", "--stacks")
     assert done.returncode == 2
     assert done.stderr.startswith("usage: g3r-infer")
+
+
+@pytest.mark.parametrize(("weights", "code"), [("mine.safetensors", 2), ("cc0", None)])
+def test_a_preview_takes_no_prior_of_the_user(
+    weights: str, code: int | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The name of a set chooses the atlas template as well, which a preview uses."""
+    words = ["--stacks", "a.nii", "--output", "out", "--preset", "preview", "--ckpt", weights]
+    if code is None:
+        assert parsed_options(words).ckpt == weights
+        return
+    with pytest.raises(SystemExit) as ended:
+        parsed_options(words)
+    assert ended.value.code == code
+    assert "--ckpt and --preset preview exclude each other" in capsys.readouterr().err

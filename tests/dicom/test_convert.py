@@ -139,3 +139,11 @@ def test_the_folder_is_private_and_goes(tmp_path: Path, monkeypatch: pytest.Monk
         interrupted_in_the_folder()
     # a process of another machine may be running, whatever its number is here
     assert set(tmp_path.iterdir()) == {alive, elsewhere}
+
+
+def test_a_converter_that_cannot_be_started_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = tmp_path / "dcm2niix"
+    broken.write_text("of another machine")
+    monkeypatch.setattr(convert_module, "converter", lambda: str(broken))
+    with pytest.raises(InputError, match=r"dcm2niix cannot be started .*reinstall it"):
+        converter_version()

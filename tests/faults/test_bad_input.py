@@ -149,6 +149,19 @@ def test_an_output_that(name: str, stack: Path, tmp_path: Path, tally: Tally, mo
         case.refused()
 
 
+def test_force_takes_no_folder_for_a_result_that_holds_none(stack: Path, tmp_path: Path, tally: Tally) -> None:
+    """Another program's mask.nii.gz is not ours to replace."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mask.nii.gz").write_text("mine")
+    with tally.case() as case:
+        outcome = run(main, ["--stacks", stack, "--whole-image", "--output", tmp_path / "out", "--force"], tmp_path)
+        assert_refused(
+            outcome, REFUSES, "out", "holds mask.nii.gz, but no run.json of a result of g3r; choose another --output"
+        )
+        assert (tmp_path / "out" / "mask.nii.gz").read_text() == "mine"
+        case.refused()
+
+
 @pytest.mark.parametrize("role", ["stack", "mask", "link"])
 def test_an_input_is_never_in_the_way_of_an_output(role: str, tmp_path: Path, tally: Tally) -> None:
     """With --force a folder may be replaced, but not what is read from it."""

@@ -94,7 +94,8 @@ def test_a_write_that_fails_leaves_the_earlier_result(
     """As on a disk that is full when the last file is written."""
     out = tmp_path / "out"
     out.mkdir()
-    (out / "volume.nii.gz").write_text("old")
+    for name in ("volume.nii.gz", "run.json"):
+        (out / name).write_text("old")
 
     def full(*arguments: object, **options: object) -> None:
         raise cannot_be_written("sections.png", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
@@ -207,6 +208,22 @@ def test_an_empty_mount_point_is_written_and_an_earlier_result_in_it_replaced(
         assert case.run(small_disk, "--force") == 0
         assert names(small_disk) == WHOLE | {"notes"}
         assert (small_disk / "volume.nii.gz").read_bytes() == case.volume
+
+
+def test_the_working_folder_takes_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tally: Tally) -> None:
+    """Renamed and replaced, it would leave the user's shell in a removed folder."""
+    from g3r.run.output_folder import OutputFolder, check_output_folder
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes").write_text("mine")
+    for text in ("first", "second"):
+        with tally.case():
+            check_output_folder(Path("."), {"run.json"}, replace=True)
+            with OutputFolder(".", {"run.json"}) as run, run.result() as staged:
+                (staged / "run.json").write_text(text)
+            assert Path.cwd() == tmp_path
+            assert Path("run.json").read_text() == text
+            assert names(Path(".")) == {"run.json", "notes"}
 
 
 @pytest.mark.parametrize("moved", range(9))

@@ -231,7 +231,8 @@ def test_an_output(kind: str, tmp_path: Path, tally: Tally) -> None:
     if kind in ("empty", "earlier result"):
         folder.mkdir()
     if kind == "earlier result":
-        (folder / "volume.nii.gz").write_text("earlier")
+        for name in ("volume.nii.gz", "run.json"):
+            (folder / name).write_text("earlier")
         options = ["--force"]
     with tally.case():
         line = ["--stacks", write(tmp_path / "s.nii"), "--whole-image", "--output", folder, "--dry-run", *options]

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from g3r.acquisition.planes import Slices
+from g3r.fitting.bias_field import StackBiasField
 from g3r.fitting.held_out_prediction import HeldOutFit, lowest
 from g3r.fitting.held_out_slices import HeldOutChoice, HeldOutSettings, ask_held_out_slices, held_out_rows
 from g3r.fitting.initial_volumes import InitialVolumes, PriorVolume
@@ -52,6 +54,12 @@ def ask(prior: PriorVolume, cloud: GaussianCloud) -> HeldOutChoice:
     )
 
 
+def held_out_fit(cloud: GaussianCloud, slices: Slices) -> HeldOutFit:
+    """Of slices that show brain alone, without a bias field."""
+    ones = np.ones(len(slices.pixel_index), np.float32)
+    return HeldOutFit(cloud, slices, ones, ones)
+
+
 @pytest.mark.parametrize("width", [0.7, 1.3])
 def test_the_width_of_the_profile_is_found(width: float) -> None:
     found = ask(*start(width))
@@ -70,15 +78,15 @@ def test_each_stack_has_a_width_of_its_own() -> None:
     factor = np.stack([np.ones(24), np.ones(24), widths[said.stack_id]], axis=1)
     planes = replace(said.planes, psf_var_mm2=said.planes.psf_var_mm2 * factor**2)
     slices = replace(said, value=render(cloud, planes, cutoff_sigma=6.0).numpy())
-    fit = HeldOutFit(cloud, slices, np.ones(int(slices.mask.sum()), np.float32))
+    fit = held_out_fit(cloud, slices)
     expected = widths / math.prod(widths) ** (1 / 3)
     np.testing.assert_allclose(fit.relative_widths(np.arange(3)), expected, rtol=0.03)
     few = slices.take(np.r_[0:2, 8:24])  # two slices of a stack say nothing
-    of_few = HeldOutFit(cloud, few, np.ones(int(few.mask.sum()), np.float32))
+    of_few = held_out_fit(cloud, few)
     np.testing.assert_array_equal(of_few.relative_widths(np.arange(3)), 1)
     # a stack of which no slice was held out has a width, too: the fit takes one for each stack of the run
     without = slices.take(slices.stack_id != 1)
-    of_two = HeldOutFit(cloud, without, np.ones(int(without.mask.sum()), np.float32))
+    of_two = held_out_fit(cloud, without)
     np.testing.assert_array_equal(of_two.relative_widths(np.arange(3)), np.ones(3))
 
 
@@ -108,9 +116,34 @@ def test_distrusted_slices_are_not_asked() -> None:
 
 def test_the_error_is_after_one_gain_a_slice() -> None:
     cloud, slices = true_cloud(), make_slices(np.linspace(0.5, 2, 24))
-    fit = HeldOutFit(cloud, slices, np.ones(len(slices.pixel_index), np.float32))
+    fit = held_out_fit(cloud, slices)
     assert fit.errors().mean() < 2e-3 * slices.value.max()  # the cut-off of the renderer
     assert fit.errors(1.3).mean() > 2 * fit.errors().mean()
+
+
+def test_the_field_of_a_stack_is_no_error() -> None:
+    cloud, slices = true_cloud(), make_slices()
+    fields = StackBiasField(slices)
+    field = np.exp(fields.log_field(np.full((len(fields.stacks), 5), 0.3)))
+    shaded = replace(slices, value=slices.value * field)
+    known = HeldOutFit(cloud, shaded, np.ones(len(slices.pixel_index), np.float32), field[slices.pixel_index])
+    unknown = held_out_fit(cloud, shaded)
+    assert known.errors().mean() < 2e-3 * shaded.value.max()
+    assert unknown.errors().mean() > 3 * known.errors().mean()
+
+
+def test_a_short_fit_hands_on_the_fields_it_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior, cloud = start(1.0)
+    seen: list[float] = []
+    errors = HeldOutFit.errors
+
+    def noted(fit: HeldOutFit, stretch: float = 1.0) -> np.ndarray:
+        seen.append(float(np.abs(np.log(fit.field)).max()))
+        return errors(fit, stretch)
+
+    monkeypatch.setattr(HeldOutFit, "errors", noted)
+    ask(prior, cloud)
+    assert max(seen) > 0
 
 
 def test_the_slice_model_scales_the_profile_and_leaves_the_rest() -> None:

@@ -14,7 +14,8 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.stacks import Stack, load_stack
 from g3r.geometry.grid import on_grid
 from g3r.planning import time_budget
-from g3r.planning.presets import PRESETS, ReconstructionSettings
+from g3r.planning.anatomy import GENERIC
+from g3r.planning.presets import PRESETS, ReconstructionSettings, for_anatomy, keeping_poses
 from g3r.planning.time_budget import REGISTRATION_FROM_S, TimeBudget, fit_seconds
 from g3r.reconstruct import GaussianReconstructor
 from g3r.registration import Registration, RegistrationSettings
@@ -82,6 +83,36 @@ def test_registration_keeps_the_space_and_the_seed_that_were_asked_for() -> None
     assert 0 < deadline.remaining_s < 60
 
 
+def test_what_was_switched_off_stays_off() -> None:
+    asked = replace(PRESETS["accurate"].registration, leave_out_misfits=False)
+    one = budget(1000.0, replace(PRESETS["accurate"], registration=asked))
+    one.for_registration()
+    assert not one.settings.registration.leave_out_misfits
+    assert one.settings.registration.check_handedness
+    knee = budget(1000.0, for_anatomy(PRESETS["accurate"], GENERIC))
+    knee.for_registration()
+    assert not knee.settings.registration.template
+    assert not knee.settings.registration.network
+
+
+def test_poses_that_were_given_are_kept_whatever_time_there_is() -> None:
+    one = budget(1000.0, keeping_poses(PRESETS["accurate"]))
+    one.for_registration()
+    one.for_prior(1.0)
+    assert [one.settings.pose_rounds.n_rounds(n) for n in (1, 2, 3)] == [0, 0, 0]
+    free = budget(1000.0, PRESETS["accurate"])
+    free.for_registration()
+    free.for_prior(1.0)
+    assert free.settings.pose_rounds.n_rounds(2) > 0
+
+
+def test_the_correction_on_voxels_is_that_of_the_fit_that_is_made() -> None:
+    for name in ("fast", "balanced", "accurate"):
+        one = budget(1000.0, PRESETS["accurate"])
+        one._take(name, 1, 0.0)
+        assert one.settings.voxel_correction == PRESETS[name].voxel_correction
+
+
 def test_slices_are_searched_for_as_the_budget_chose(stacks: list[Stack], monkeypatch: pytest.MonkeyPatch) -> None:
     class Searched(Exception):
         """Ends the run where the search would begin."""
@@ -126,6 +157,13 @@ def test_no_time_at_all_still_gives_a_volume_and_says_what_was_done(stacks: list
     assert result.record.loss["fit to slices"] == []
     assert result.uncertainty is None
     assert "no time for a fit" in verdict_of(result.record).line()
+
+
+def test_a_network_that_had_no_time_is_not_said_to_be_used(stacks: list[Stack]) -> None:
+    settings = replace(SETTINGS, use_prior=True)
+    result = GaussianReconstructor(settings=settings).reconstruct(stacks, plan=TimeBudget.of(settings, 0.01))
+    assert not result.record.settings.use_prior
+    assert result.record.prior is None
 
 
 @pytest.mark.parametrize("use_prior", [False, True])

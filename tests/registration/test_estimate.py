@@ -139,3 +139,17 @@ def test_poses_of_two_stacks_do_not_keep_a_shear_that_motion_is_not_likely_to_ha
     of_truth, of_proposal, of_estimate = amounts
     assert of_truth < 0.2 * of_proposal
     assert of_estimate < 0.6 * of_proposal
+
+
+def test_a_dark_slice_of_a_stack_that_did_not_move_counts_for_little(still: list[SimulatedStack]) -> None:
+    """Its stack keeps the poses of its header, but not a weight of 1 for each of its slices."""
+    slices, _ = as_slices(still)
+    of_stack = np.flatnonzero(slices.stack_id == 1)
+    dark = int(of_stack[len(of_stack) // 2])
+    factor = np.where(slices.planes.plane_id() == dark, 0.05, 1.0).astype(np.float32)
+    estimate = register(replace(slices, value=slices.value * factor), replace(OFF, n_rounds=4))
+    np.testing.assert_allclose(estimate.slices.world_from_header().rotvec_rad()[of_stack], 0, atol=1e-9)  # it is rigid
+    assert estimate.weight[dark] < 0.2
+    assert estimate.gain[dark] < 0.3
+    assert np.median(np.delete(estimate.weight, dark)) == 1.0
+    assert np.log(estimate.gain).mean() == pytest.approx(0, abs=1e-6)

@@ -15,6 +15,7 @@ from g3r.registration.held_out import (
     estimate_interleave,
     fine_held_out_correlations,
     held_out_score,
+    predict,
     volume_without,
 )
 from g3r.registration.similarity import StackSamples
@@ -65,6 +66,21 @@ def test_a_few_slices_that_went_astray_do_not_count_in_the_agreement(
     # where many do not count, all of them tell
     weight[rows[::2]] = 0.1
     assert score.agreements(samples, weight)[1] == without[1]
+
+
+def test_a_slice_whose_thinned_pixels_are_all_black_does_not_decide(
+    still_slices: tuple[Slices, RigidPose], samples: list[StackSamples]
+) -> None:
+    """What the others show there is faint, and differs between placements by next to nothing."""
+    slices, truth = still_slices
+    sample = samples[1]
+    value = sample.pixels.value.copy()
+    value[sample.pixels.start[0] : sample.pixels.start[1]] = 0
+    blank = replace(sample, pixels=replace(sample.pixels, value=value))
+    volume, grid = volume_without(slices, 1, 3.2)
+    own = truth.take(sample.rows)
+    costs = [predict(blank, own, np.maximum(volume, faint), grid, 2).cost for faint in (1e-3, 1e-2)]
+    assert abs(costs[1] - costs[0]) < 10
 
 
 def test_poses_pay_a_penalty_for_their_movements(

@@ -131,6 +131,16 @@ def test_names_from_files_are_text_and_no_markup(finished: Path, tmp_path: Path)
     assert "&lt;/script&gt;" in report_html(folder)
 
 
+def test_a_name_that_is_no_text_is_escaped(finished: Path, tmp_path: Path) -> None:
+    """Files of other systems have such names; json holds them, a page in UTF-8 cannot."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    record = json.loads((folder / "run.json").read_text())
+    record["stacks"][0]["name"] = "kopf-\udce4.nii"
+    (folder / "run.json").write_text(json.dumps(record))
+    (folder / "report.html").unlink()
+    assert "kopf-\\udce4.nii" in page.write_report(folder).read_text(encoding="utf-8")
+
+
 def test_a_report_that_fails_costs_no_volume(
     planted_stacks: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 from g3r.fitting.volume_check import VolumeCheck
 from g3r.output.record import RunRecord
 from g3r.planning.plan import BudgetRecord
+from g3r.planning.presets import PRESETS
 from g3r.registration.quality import PARALLEL
 from g3r.registration.stack_quality import StackQuality
 from g3r.report.verdict import verdict_of
@@ -52,6 +53,12 @@ def crossing(angle_deg: float) -> RunRecord:
     assert found.registration is not None
     registration = replace(found.registration, crossing_deg=angle_deg)
     return replace(found, registration=registration, warnings=[f"{PARALLEL} (...)"])
+
+
+def hurried(n_stacks: int) -> RunRecord:
+    """A run whose registration was that of `preview`, with a fit after it."""
+    found = record(*(stack(f"{n}.nii") for n in range(n_stacks)))
+    return replace(found, settings=replace(found.settings, registration=PRESETS["preview"].registration))
 
 
 CASES: dict[str, tuple[RunRecord, str, str]] = {
@@ -138,6 +145,12 @@ CASES: dict[str, tuple[RunRecord, str, str]] = {
         CHECK,
         "the run was interrupted in fit to slices, step 3 of 40",
     ),
+    "ended early": (record(prior_weight=1.0), CHECK, "the fit had too little time to be shown"),
+    "sides": (
+        hurried(n_stacks=3),
+        CHECK,
+        "there was no time to ask whether a stack is a mirror image of the others, or does not belong",
+    ),
     "left out": (record(warnings=["d.nii: left out, no head was found"]), CHECK, "d.nii: left out"),
 }
 
@@ -213,3 +226,15 @@ def test_the_table_says_things_in_the_same_form() -> None:
         assert message.word in MILDEST_FIRST, name
         assert not message.text.endswith("."), name
         assert message.advice == "" or message.advice.endswith("."), name
+
+
+def test_nobody_asks_for_the_sides_of_one_stack_or_of_a_preview() -> None:
+    texts = [reason.text for reason in verdict_of(hurried(n_stacks=1)).reasons]
+    assert not any("mirror image" in text for text in texts)
+    preview = replace(hurried(n_stacks=3), settings=PRESETS["preview"])
+    assert [reason.text.split(":")[0] for reason in verdict_of(preview).reasons] == ["this is a preview"]
+
+
+def test_a_volume_that_fell_back_to_the_prior_is_not_called_hurried() -> None:
+    (reason,) = verdict_of(replace(CASES["fallback"][0], prior_weight=1.0)).reasons
+    assert "made the volume worse" in reason.text

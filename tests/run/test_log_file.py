@@ -23,7 +23,7 @@ from g3r.run.log_file import LOG_NAME, LogFile
 )
 def test_folders_are_left_out(text: str, told: str) -> None:
     log = LogFile(["data/JANE/stack.nii.gz"], ["out", "/mnt/some where"])
-    assert log.without_folders(text) == told
+    assert log.hidden.left_out_of(text) == told
 
 
 def test_what_others_log_stays_out_and_all_is_copied(tmp_path: Path) -> None:
