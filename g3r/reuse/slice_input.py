@@ -29,7 +29,8 @@ from g3r.reuse.slice_files import read_index, read_slices, slice_folder_of
 from g3r.reuse.slice_groups import SliceGroup, grouped_by_headers, grouped_by_index, slope
 
 REACH_MM = 60.0
-"""Largest in-plane distance of the middle of a slice from that of its stack in the nominal geometry."""
+"""Largest in-plane distance of the middle of a slice from that of its stack in the nominal geometry; the motions hold
+the rest."""
 
 MARGIN_MM = 10.0
 """In-plane margin around all slices of a stack. Slices are mostly cropped to the brain, so it holds none."""
