@@ -28,7 +28,7 @@ VOXEL_MM_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Prior(TrainedModel):
-    """A trained prior network with its voxel size and template ages. See `TrainedModel` for `load`, `save` and `record`.
+    """A trained prior network with its voxel size and template ages; see `TrainedModel` for `load`, `save`, `record`.
 
     Attributes:
         voxel_mm: isotropic voxel size that it was trained at, and is used at.
