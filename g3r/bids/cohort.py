@@ -71,7 +71,7 @@ class Cohort:
     Args:
         bids_dir: the data set.
         out_dir: the derivative data set.
-        options: of g3r-infer, for all sessions.
+        options: options of g3r-infer, for all sessions.
         whole_image: whether these options say that no mask is needed.
         resumes: whether interrupted runs are resumed.
         force: whether finished sessions are run again.

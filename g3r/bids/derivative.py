@@ -27,7 +27,7 @@ XFM = "from-scanner_to-standard_mode-image_xfm.txt"
 
 @dataclass(frozen=True)
 class Image:
-    """An image of the derivative: end of its name, what it shows, and further keys of its sidecar."""
+    """An image of the derivative: end of its name, its content in words, and further keys of its sidecar."""
 
     end: str
     shows: str
@@ -67,7 +67,7 @@ def figure_path(session: Session, out_dir: Path, end: str = SECTIONS) -> Path:
     """Path of a picture of a session.
 
     Args:
-        session: of the data set.
+        session: session of the data set.
         out_dir: the derivative data set.
         end: end of the file's name; by default that of the picture of sections.
     """
@@ -130,7 +130,7 @@ def _sidecar(path: Path, image: Image, where: str, volume: str) -> dict[str, Any
 
     Args:
         path: the image.
-        image: what it is.
+        image: its kind.
         where: the space of its grid, in words.
         volume: URI of the volume whose space it is in.
     """

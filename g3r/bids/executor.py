@@ -55,7 +55,7 @@ class Executor(Protocol):
         """Run jobs in order until all have ended.
 
         Args:
-            jobs: to run.
+            jobs: jobs to run.
             begin: called with the number of a job just before the executor takes it.
             ended: called with the number of a job and how it ended.
 

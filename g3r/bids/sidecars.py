@@ -18,7 +18,7 @@ def inherited(stack: Path, bids_dir: Path) -> dict[str, Any] | None:
     g3r-infer reads the file beside a stack itself. Other keys may name the patient and are not copied.
 
     Args:
-        stack: in the data set.
+        stack: a stack of the data set.
         bids_dir: the data set.
 
     Raises:

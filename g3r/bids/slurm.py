@@ -49,7 +49,7 @@ class SlurmArrays:
     """An executor on a cluster.
 
     Args:
-        folder: for scripts and results of the jobs, on a file system that all nodes share.
+        folder: folder for scripts and results of the jobs, on a file system that all nodes share.
         request: resources and options for sbatch.
         n_jobs: tasks at a time; None for as many as Slurm starts.
         n_cores: cores of each task.

@@ -104,7 +104,7 @@ def stacks_on_disk(options: argparse.Namespace, *, replaces: bool) -> Iterator[D
     """Set `options.stacks` to paths of NIfTI files; files converted from DICOM are removed when the block ends.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         replaces: whether earlier results in the output may be replaced.
 
     Raises:
@@ -210,7 +210,7 @@ def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom
     """Write the volume as a series of its examination, if asked for and if the result is not partial.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         result: result of the run.
         dicom: from `stacks_on_disk`.
 

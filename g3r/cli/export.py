@@ -55,7 +55,7 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
     Args:
         run: checkpoint written by `PriorModule`, `PoseModule` or `MaskModule` under a Lightning trainer.
         file: file to write; its name ends in .safetensors.
-        data_description: training data in words; None keeps what the run recorded.
+        data_description: training data in words; None keeps those that the run recorded.
         replace: overwrite an existing file.
 
     Returns:

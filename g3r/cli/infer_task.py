@@ -87,7 +87,7 @@ def earlier_run(options: argparse.Namespace) -> RunRecord | None:
     """The run of --config; its anatomy is copied to the options, because it decides how masks are found.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
 
     Raises:
         InputError: the file cannot be used, or is of an interrupted run or of another number of stacks.
@@ -110,8 +110,8 @@ def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) ->
     """Check all files that can be checked without reading an image; returns the files of networks, by kind.
 
     Args:
-        options: of g3r-infer.
-        folder: for the results.
+        options: options of g3r-infer.
+        folder: folder for the results.
         replaces: whether earlier results in the folder may be replaced.
 
     Raises:
@@ -144,7 +144,7 @@ def prepared(
     """Read and check everything that the run needs.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         networks: files of networks, by kind.
         earlier: the run of --config.
         reporter: is notified of each step.

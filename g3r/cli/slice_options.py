@@ -53,7 +53,7 @@ def load_slices(options: argparse.Namespace, earlier: RunRecord | None) -> Slice
     """The slice folder, with thickness and profile of the repeated run if that has the same number of stacks.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         earlier: the run of --config.
 
     Raises:

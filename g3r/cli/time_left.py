@@ -87,7 +87,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     """Seconds of each stage of a run, in their order.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         compiling: whether programs have to be compiled.
     """
     before = dict(BEFORE_S)

@@ -68,7 +68,7 @@ class ImageHeader:
     """The header of one DICOM image.
 
     Attributes:
-        path: of its file.
+        path: path of its file.
         position_mm: position of the centre of its first pixel, in the patient's frame (LPS); None if absent.
         axes: [2, 3] directions of a row and of a column; None if absent.
         is_cut: whether the file is too short for its pixels.

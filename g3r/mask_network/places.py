@@ -111,7 +111,7 @@ def is_agreed(places: Sequence[Place], seen: Sequence[Image], spacing_mm: Array)
     """Whether each flip has the same likeliest place as their mean.
 
     Args:
-        places: from the mean of the flips.
+        places: places from the mean of the flips.
         seen: probability [A, B, C] from each flip.
         spacing_mm: [3] voxel size.
     """

@@ -110,7 +110,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
 
 
 def _unseen_part(written: WrittenVolume, found: StageResults, settings: ReconstructionSettings) -> UnseenPart:
-    """How much of the brain is unseen, and what is shown there."""
+    """The unseen part of the brain, with the words for what is shown there."""
     return UnseenPart.of(
         written.unseen,
         written.mask,
@@ -123,7 +123,7 @@ def _unseen_part(written: WrittenVolume, found: StageResults, settings: Reconstr
 
 
 def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
-    """What the volume shows in unseen voxels, in words."""
+    """Words for the content of unseen voxels."""
     if not settings.fill_unseen:
         return "blank"
     return "estimate from other brains" if prior.has_template else "smooth continuation"

@@ -86,7 +86,7 @@ class LiveBoard(Reporter):
         self.stage, self.stage_begun_s, self.sections_s = str(stage), time.monotonic(), 0.0
 
     def ended(self, stage: str, found: object, *, resumed: bool = False) -> None:
-        """See `Reporter`; writes the seconds of the stage, and what it found."""
+        """See `Reporter`; writes the seconds of the stage, and its result."""
         self.stage = str(stage)
         now = time.monotonic()
         with self._as_long_as_it_works():
@@ -215,7 +215,7 @@ def middle_planes(grid: VolumeGrid, mask: NDArray[np.bool_]) -> Planes:
 
 
 def _of_slices(slices: SliceMoment, origin_mm: NDArray[np.float64]) -> dict[str, float]:
-    """How far slices have moved since the fit began, and their gains."""
+    """Motion of slices since the fit began, and their gains and weights."""
     moved_mm, turned_deg = slices.moved(origin_mm)
     gain = slices.state.gain
     return {

@@ -28,7 +28,7 @@ class VolumeMaps:
     Attributes:
         uncertainty: float32 [I, J, K], expected error in units of the stacks.
         prior_share: float32 [I, J, K], from 0 to 1; also None without a prior.
-        record: for run.json.
+        record: entries for run.json.
     """
 
     uncertainty: NDArray[np.float32] | None = None

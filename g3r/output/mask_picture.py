@@ -35,7 +35,7 @@ def save_mask_picture(path: str | os.PathLike[str], stacks: Sequence[Stack]) -> 
 
     Args:
         path: the file; it appears whole or not at all.
-        stacks: with their masks.
+        stacks: stacks with their masks.
 
     Raises:
         InputError: the file cannot be written.

@@ -64,7 +64,7 @@ class Mixture:
         return np.where(weight < LEAST_WEIGHT, 0, weight).clip(self.least_weight, 1).astype(np.float32)
 
     def seen(self, grid: VolumeGrid) -> NDArray[np.bool_]:
-        """Where [I, J, K] slices looked."""
+        """Mask [I, J, K] of the voxels that slices saw."""
         return self.density_on(grid) >= UNSEEN_BELOW
 
     def volume(self, cloud: GaussianCloud, grid: VolumeGrid) -> NDArray[np.float32]:
@@ -75,7 +75,7 @@ class Mixture:
 
         Args:
             cloud: the Gaussians.
-            grid: with orthogonal axes.
+            grid: grid with orthogonal axes.
 
         Raises:
             ValueError: a grid with sheared axes.
@@ -100,7 +100,7 @@ class Mixture:
         return (self._region(self.support, self.prior_grid) * (1 - left)).astype(np.float32)
 
     def _shown(self, grid: VolumeGrid) -> NDArray[np.float32]:
-        """How much [I, J, K] of the volume is shown on a grid."""
+        """The edge [I, J, K] on a grid: how much of the volume is shown."""
         return on_grid(self.edge, self.grid, grid, outside=0.0)
 
     def _region(self, inside: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.bool_]:
@@ -110,7 +110,7 @@ class Mixture:
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedVolume:
-    """The volume [I, J, K] in intensities of the fit, the brain's mask on the same grid, and what no slice saw."""
+    """The volume [I, J, K] in intensities of the fit, the brain's mask on the same grid, and the unseen part."""
 
     volume: NDArray[np.float32]
     mask: NDArray[np.bool_]

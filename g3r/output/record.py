@@ -39,7 +39,7 @@ MAX_RECORD_BYTES = 50_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationRecord:
-    """How the poses were found.
+    """Record of the registration.
 
     Attributes:
         reliable: whether all stacks are registered; None for a single stack, which nothing checks.
@@ -47,7 +47,7 @@ class RegistrationRecord:
         initialisation: where the search started.
         held_out_correlation: held-out correlation of each stack, by initialisation.
         space: "standard" or "scanner".
-        correlation_with_template: of the head with the atlas template; None in scanner space.
+        correlation_with_template: correlation of the head with the atlas template; None in scanner space.
         correlation_of_rival: the same for the best of all other orientations; None if none comes near, in scanner
             space, and with several stacks.
         orientation_doubtful: whether the rival is about as high (`MIN_RIVAL_MARGIN` in `registration/thresholds.py`).
@@ -74,9 +74,9 @@ class RegistrationRecord:
         """The record of a registration.
 
         Args:
-            registration: of all stacks.
+            registration: registration of all stacks.
             qualities: one per stack.
-            slices: in their final poses.
+            slices: slices in their final poses.
         """
         orientation = registration.orientation
         return cls(
@@ -173,7 +173,7 @@ class RunRecord:
         edge_by_image: whether the volume ends where slices become black beside the brain, not by their masks alone.
         gaussian_spacing_mm: spacing of the lattice of Gaussians; None if the run was interrupted before them.
         n_rollbacks: times that the fit to the slices went back to its best state.
-        loss: by stage, figures of each step.
+        loss: figures of each step, by stage.
         unseen: the part of the brain that no slice saw.
         uncertainty: what `uncertainty.nii.gz` means; None if the run was interrupted.
         verdict, reasons: of the report: whether the volume may be used, and why; None without a report.

@@ -51,7 +51,7 @@ class ReconstructionResult:
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
         correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None where there is none.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
-        slices: in their final poses.
+        slices: slices in their final poses.
         gain, weight, ncc: [K] intensity factor, weight and correlation with the volume of each slice.
         uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask. None,
             and not written, if the run was interrupted (`record.partial`).
@@ -103,7 +103,7 @@ class ReconstructionResult:
         """Write every output into a folder; it appears whole or not at all.
 
         Args:
-            folder: to write.
+            folder: folder to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
             run: holds this folder already; None takes it for this call alone.
             also: writes more files of `OUTPUT_NAMES`; called with the folder in which the others are.

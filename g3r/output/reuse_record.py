@@ -29,7 +29,7 @@ class StackGrid:
     """The voxels of a stack.
 
     Attributes:
-        grid: with the slices along the third axis.
+        grid: grid with the slices along the third axis.
         axes: how arrays of the file become arrays on the grid.
     """
 

@@ -25,7 +25,7 @@ class StackRecord:
     """One stack: its geometry, its PSF, and how its slices were registered.
 
     Attributes:
-        name: of its file.
+        name: name of its file.
         thickness_mm, thickness_from: slice thickness and its source: the option, the sidecar, or, if unknown, assumed
             equal to the slice spacing ("spacing").
         in_plane_fwhm_pixels: width of the PSF along the two axes of a slice.
@@ -94,7 +94,7 @@ def stack_records(
     """One record per given stack.
 
     Args:
-        stacks: in the order of their numbers in the slices.
+        stacks: stacks, in the order of their numbers in the slices.
         registration: has an entry for each stack with slices; a given stack may have none.
         qualities: one per stack.
         weight: [K] slice weights at the end of the fit.

@@ -14,7 +14,7 @@ def check_tensorboard(folder: Path, output: Path) -> None:
     """Raise `InputError` if TensorBoard could not be written, before the work begins.
 
     Args:
-        folder: to write into.
+        folder: folder to write into.
         output: folder of the result, which must not contain it, because the result is put in place as a whole.
     """
     if find_spec("tensorboard") is None:

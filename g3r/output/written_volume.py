@@ -34,12 +34,12 @@ class WrittenVolume:
     Attributes:
         volume: float32 [I, J, K].
         mixed: float32 [I, J, K], the same before the correction by the slices.
-        mask: bool [I, J, K] of the brain.
-        support: bool [I, J, K] of what is shown.
+        mask: bool [I, J, K], brain mask.
+        support: bool [I, J, K], where the volume is shown.
         edge: float16 [I, J, K], factor by which the support fades.
         edge_by_image: whether the edge follows from slices that are black beside the brain, not from masks alone.
-        seen: bool [I, J, K], where slices looked.
-        unseen: bool [I, J, K], brain where none did.
+        seen: bool [I, J, K], voxels that slices saw.
+        unseen: bool [I, J, K], brain voxels that no slice saw.
         grid: grid of all these.
         mixture: mixture of Gaussians, V_prior and the correction.
         check: the volume compared with those before the fit; None without a prior.
@@ -67,7 +67,7 @@ def written_volume(
 
     Args:
         cloud: mean of the fit's lattices.
-        fit: to the slices, or its stand-in if there was none.
+        fit: fit to the slices, or its stand-in if there was none.
         found: results of the stages.
         settings: as used.
         run: takes notes.

@@ -142,7 +142,7 @@ def scattered(
         points_mm: [S, P, 3]; each is shared among the eight voxels around it; outside points are dropped.
         value: [S, P].
         weight: [S, P]; points of zero weight are skipped.
-        group: [S] volume that a block of points goes to.
+        group: [S] volume to which each block of points is added.
         n_groups: G.
         shape: voxels per edge.
         spacing_mm: voxel size.

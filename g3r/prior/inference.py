@@ -24,7 +24,7 @@ def estimate_prior(
     mean over some is better than any single one ("geometric self-ensemble", Lim et al., CVPRW 2017).
 
     Args:
-        network: on any device; its mode is not changed.
+        network: the network, on any device; its mode is not changed.
         maps: intensities already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
         n_views: number of mirror images and half turns to average over, 1 to 8.
         tiling: how large volumes are cut into tiles.

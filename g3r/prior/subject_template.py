@@ -29,7 +29,7 @@ class PlacedTemplate:
         """The head nearest in age, enlarged about its centre.
 
         Args:
-            template: in the frame of the slices, which is the atlas frame.
+            template: atlas template in the frame of the slices, which is the atlas frame.
             weeks: the subject's age, as found by registration.
             scale: factor by which a template of that age has to be enlarged.
         """
@@ -48,7 +48,7 @@ class PlacedTemplate:
     def fitted(
         self, head: NDArray[np.float32], share: NDArray[np.float32], density: NDArray[np.float32], grid: VolumeGrid
     ) -> TemplateFit:
-        """The template fitted to what slices saw of a head.
+        """The template fitted to the seen voxels of a head.
 
         Args:
             head: [I, J, K] V_sharp.

@@ -27,7 +27,7 @@ class Chart:
     """A drawing of one kind of motion.
 
     Attributes:
-        title: with the unit.
+        title: title with the unit.
         lines: one per stack and axis.
         ticks: position and text of the horizontal grid lines.
         stacks: left end, width and name of each stack's part.
@@ -55,12 +55,12 @@ def motion_chart(
     """Lay out three lines for each stack.
 
     Args:
-        title: with the unit.
+        title: title with the unit.
         axes: names of the three columns.
         values: [K, 3] in the order of acquisition, stack after stack.
         stack: [K] number of the stack.
         counts_less: [K] down-weighted slices; they are marked, and do not set the range.
-        names: of all stacks.
+        names: names of all stacks.
     """
     counted = values[~counts_less] if (~counts_less).any() else values
     limit = _nice(float(np.abs(counted).max(initial=0)))

@@ -78,7 +78,7 @@ class ReportedResult(ReconstructionResult):
         """Write every output and report.html into a folder; it appears whole or not at all.
 
         Args:
-            folder: to write.
+            folder: folder to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
             run: holds this folder already; None takes it for this call alone.
             also: writes more files of `OUTPUT_NAMES`; called with the folder in which all others are.

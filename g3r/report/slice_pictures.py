@@ -23,7 +23,7 @@ class SlicePicture:
 
     Attributes:
         stack: name of its file.
-        number: in the stack, counted from 0 as in slices.tsv.
+        number: number in the stack, counted from 0 as in slices.tsv.
         weight, ncc: weight in the volume and correlation with it.
         reason: why it is down-weighted.
         measured, predicted, difference: PNG pictures as base64.
@@ -52,8 +52,8 @@ def slice_pictures(slices: Slices, rows: SliceRows, names: list[str], volume: Vo
     Args:
         slices: [K] in their final poses, with their pixels.
         rows: [K] rows of slices.tsv.
-        names: of the stacks.
-        volume: as written, in the space of the poses.
+        names: names of the stacks.
+        volume: the written volume, in the space of the poses.
     """
     chosen = worst_first(rows)
     some = slices.take(chosen)

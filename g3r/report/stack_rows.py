@@ -30,13 +30,13 @@ class StackRow:
     """One stack in words.
 
     Attributes:
-        name: of the file.
+        name: name of the file.
         thickness, thickness_from: slice thickness and its source.
         thickness_assumed: whether the thickness is unknown and assumed equal to the slice spacing.
         spacing: distances of pixels and of slices.
         mask, mask_from: volume of the mask and its source.
         used, n_slices: slices of at least half the full weight, and all slices.
-        agreement: with the other stacks, as text.
+        agreement: correlation with the other stacks, as text.
         place: position of the agreement on the scale, 0 to 1; None if nothing was compared.
         judgement: "good", "doubtful", "bad", "left out" or "not checked".
         segments: how often the head jumped while it was acquired, in words.

@@ -98,7 +98,7 @@ def line(name: str, facts: Mapping[str, object], *, resumed: bool = False) -> st
     """A line of the table, filled in.
 
     Args:
-        name: in `LINES`.
+        name: key of `LINES`.
         facts: values to fill in.
         resumed: whether the stage was taken from an earlier run.
     """

@@ -159,7 +159,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _is_said_otherwise(line: str, record: RunRecord) -> bool:
-    """Whether a warning of the run has a message of its own in the table."""
+    """Whether a warning of the run has its own message in the table."""
     if line.startswith("the loss of the fit rose: "):
         return record.n_rollbacks > 0
     if line.startswith(PARALLEL):

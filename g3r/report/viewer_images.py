@@ -35,7 +35,7 @@ class Layer:
     """One image of the folder as the viewer shows it.
 
     Attributes:
-        name: of the file, without its ending.
+        name: name of the file, without its ending.
         title: label of its button.
         caption: how to read it.
         kind: "grey" for intensities, "map" for values in colour, "mark" for an outlined part.

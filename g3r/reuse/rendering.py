@@ -83,7 +83,7 @@ def render_volume(run: FinishedRun, grid: VolumeGrid) -> NDArray[np.float32]:
 
     Args:
         run: has Gaussians, prior and density.
-        grid: with orthogonal axes.
+        grid: grid with orthogonal axes.
 
     Raises:
         InputError: a file of the run is missing or damaged.

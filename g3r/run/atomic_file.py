@@ -52,7 +52,7 @@ def remove_leftovers(folder: Path, suffix: str) -> None:
 
     Args:
         folder: searched folder, without its subfolders.
-        suffix: of the files that were being written; other temporary files are left alone.
+        suffix: suffix of the files that were being written; other temporary files are left alone.
     """
     for temporary in folder.glob(f".*{suffix}"):
         if is_left_over(temporary.name.split(".")[1]):

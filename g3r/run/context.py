@@ -83,7 +83,7 @@ class RunContext:
         """Result of a stage whose loop ends after the current step on a stop request; it is not stored then.
 
         Args:
-            name: of the stage.
+            name: name of the stage.
             make: computes it; its loop obeys a deadline from `deadline`.
             steps_of: (steps done, steps in all) of a result.
 

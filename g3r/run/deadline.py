@@ -1,4 +1,4 @@
-"""How long loops run: for a number of steps, until a deadline, or until a stop is requested."""
+"""Length of loops: they run for a number of steps, until a deadline, or until a stop is requested."""
 
 from __future__ import annotations
 

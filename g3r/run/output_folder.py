@@ -40,7 +40,7 @@ class OutputFolder:
 
     Args:
         output: folder of the result.
-        names: of files that a result may have; other files of an earlier result are kept. None replaces
+        names: names of files that a result may have; other files of an earlier result are kept. None replaces
             the whole folder, except what file systems hold of their own (`FOUND_ON_DISKS`).
 
     Raises:
@@ -197,7 +197,7 @@ def check_output_folder(
 
     Args:
         folder: output folder.
-        names: of files that a result may have.
+        names: names of files that a result may have.
         replace: whether the folder may hold an earlier result.
         inputs: files that are read; none of them may be overwritten.
 

@@ -46,7 +46,7 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
     """Read what `write_stage` wrote.
 
     Args:
-        path: of the stage file.
+        path: the stage file.
         records: dataclasses that may be in it.
 
     Raises:

@@ -83,7 +83,7 @@ class StageStore:
         """Store the result of a stage. On a full disk the store is dropped and the run goes on.
 
         Args:
-            name: of the stage.
+            name: name of the stage.
             value: its result.
             seconds: wall-clock time that it took.
             cpu_seconds: processor time that it took.
