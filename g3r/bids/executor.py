@@ -80,7 +80,7 @@ def start(job: Job) -> subprocess.Popen[bytes]:
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # only we pass Ctrl-C on: a second one would kill it with no result
+            start_new_session=True,  # only we pass Ctrl-C on: a second one would end it at once
         )
 
 

@@ -23,7 +23,7 @@ from g3r.uncertainty.prior_share import estimate_prior_share
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeMaps:
-    """Maps of a volume, on its grid; None where they were not estimated.
+    """Maps of a volume, on its grid; None if they were not estimated.
 
     Attributes:
         uncertainty: float32 [I, J, K], expected error in units of the stacks.

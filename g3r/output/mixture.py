@@ -38,7 +38,7 @@ class Mixture:
         least_weight: least weight of V_prior, where slices are dense.
         edge: e [I, J, K] on `grid`, how much of the volume is shown.
         cutoff_sigma: where a Gaussian ends.
-        correction: D [I, J, K] on `prior_grid`; None where there is none.
+        correction: D [I, J, K] on `prior_grid`; None without one.
     """
 
     grid: VolumeGrid

@@ -116,12 +116,12 @@ class CommandRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """The files that a result is made of.
+    """The input files of a result.
 
     Attributes:
         stacks: one per stack.
         masks: one per stack: the file, or the source of the mask and the hash of its voxels.
-        prior, pose_network, mask_network: None where not used.
+        prior, pose_network, mask_network: files of the networks; None if not used.
     """
 
     stacks: tuple[FileHash, ...]
@@ -160,8 +160,8 @@ class RunRecord:
     Attributes:
         settings: as used.
         inputs, command, memory, header_text: added by the command; None from Python.
-        prior, pose_network: the networks' own records; None where one was not used.
-        registration: None where the file is only a configuration.
+        prior, pose_network: the networks' own records; None if not used.
+        registration: None if the file is only a configuration.
         stack_fields: coefficients of each stack's bias field, divided out before the fit; empty for one or two stacks.
         bias_field: coefficients that the fit added; empty if not estimated.
         common_bias_rms: RMS over the brain of the logarithm of the common bias field; 0 without estimate.

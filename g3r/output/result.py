@@ -49,7 +49,7 @@ class ReconstructionResult:
         support: [I, J, K] on `grid`, where Gaussians were fitted.
         edge: [I, J, K] on `grid`, how much of the volume is shown (`Mixture`).
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
-        correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None where there is none.
+        correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None without one.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
         slices: slices in their final poses.
         gain, weight, ncc: [K] intensity factor, weight and correlation with the volume of each slice.

@@ -55,7 +55,7 @@ class ReuseRecord:
         support: [I, J, K] on `grid`, where Gaussians were fitted.
         edge: [I, J, K] on `grid`, how much of the volume is shown, see `Mixture`.
         prior_grid: grid of V_prior, density and correction.
-        correction: [I, J, K] on `prior_grid`, see `Mixture`; None where there is none.
+        correction: [I, J, K] on `prior_grid`, see `Mixture`; None without one.
         intensity_scale: intensity in the stacks of a 1 in the fit.
         stacks: one per stack.
         slices: [K] in their final poses, with their masks and the PSF of the fit; all values are zero.
