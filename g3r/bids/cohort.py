@@ -192,7 +192,7 @@ class Cohort:
             seconds: duration of its process; None without a process, or if unknown.
         """
         line = " ".join(reason.split())[:MAX_REASON]
-        with suppress(OSError):  # on a full disk the reason is at least printed
+        with suppress(OSError):  # the disk is full: then it is said, at least
             write_failure(session, self.out_dir, line, seconds)
         self.say(f"{session.stem}: failed: {line}")
 

@@ -43,7 +43,7 @@ def _columns() -> int:
 
 
 def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argparse.Namespace:
-    """The parsed command line; if the shell asks for completion, answers it and ends the program."""
+    """The parsed command line; where the shell asks for completion, it is answered and the program ends."""
     if "_ARGCOMPLETE" in os.environ:
         complete(parser)
     return parser.parse_args(argv)

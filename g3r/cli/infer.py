@@ -51,9 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parsed_options(argv)
     import_lean()
     let_threads_sleep()
-    atexit.register(gc.freeze)  # garbage collection of a million objects at exit takes a second
+    atexit.register(gc.freeze)  # the collection of a million objects as Python ends takes a second
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # for file names that the terminal cannot print
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold what the terminal cannot show
     stop_request = StopRequest()
     try:
         with stop_request, _terminal(options, stop_request) as terminal:

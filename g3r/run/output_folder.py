@@ -2,10 +2,10 @@
 
 `DIR.unfinished` holds the stages that are done (`g3r.run.stage_store`) and the result while it is written. The
 lock ends with the process, however that ends. So an unlocked folder belongs to a dead run, and the next run to the
-same output may use or remove what it finds there. Files of a living run are never touched.
+same output may take what it finds there or remove it. Nothing of a living run is ever touched.
 
-If DIR is a mount point, nothing can be renamed onto it: there the staging folder is `DIR/.unfinished`, and the files
-move one by one, the record last.
+Where DIR is a file system of its own (a mount point), nothing can be renamed onto it: there the staging folder is
+`DIR/.unfinished`, and the files move one by one, the record last.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class OutputFolder:
             self._clean()
 
     def _clean(self) -> None:
-        """Remove an unfinished result; complete or undo the exchange of an earlier one."""
+        """Remove a result that was not finished; finish or undo the exchange of an earlier one."""
         if self.is_mount:
             self._clean_mount()
             return
@@ -217,7 +217,7 @@ def check_output_folder(
             raise InputError(f"{folder}: {parent.name} is a file; expected a folder, choose another --output")
         written = [target] if target.exists() else [parent]
         if target.exists() and not is_mount(target):
-            written.append(parent)  # the folder is renamed in it
+            written.append(parent)  # in which the folder is renamed
         if not all(os.access(path, os.W_OK | os.X_OK) for path in written):
             raise InputError(f"{folder}: cannot be written; choose another --output")
         outputs = {(folder / name).resolve() for name in names}

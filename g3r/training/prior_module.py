@@ -121,8 +121,8 @@ class PriorModule(AnnealedModule):
         return int(batch["truth"].shape[0])
 
     def on_validation_epoch_start(self) -> None:
-        """Reset the scores and images of the last epoch."""
-        assert self.voxel_mm is not None  # set by `on_fit_start`
+        """Forget the last epoch's scores and images."""
+        assert self.voxel_mm is not None  # set with the data
         self._scores, self._panels = ValidationScores(self.voxel_mm), {}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -200,7 +200,7 @@ class PriorModule(AnnealedModule):
                 )
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Note the voxel size of the resumed run; `on_fit_start` compares it with the data's."""
+        """Note the voxel size of a run that is resumed; `on_fit_start` compares it with the data's."""
         voxel_mm = checkpoint.get(TRAINING_ENTRY, {}).get("voxel_mm")
         if voxel_mm is not None:
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
