@@ -1,4 +1,4 @@
-"""One run of the command `g3r-infer` in a process of its own: seconds, memory, what it wrote."""
+"""One run of `g3r-infer` in a process of its own: seconds, memory and record."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class CommandRun:
-    """A finished run.
+    """A finished run of the command.
 
     Attributes:
-        seconds: wall time from the start of the process until it had ended, its files written.
-        cpu_seconds: of all its threads.
-        peak_bytes: most memory that it held at once.
+        seconds: wall time from the start to the end of the process, including its files.
+        cpu_seconds: CPU time of all its threads.
+        peak_bytes: its peak memory.
         record: its run.json.
     """
 
@@ -39,7 +39,7 @@ def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]
     """Arguments of g3r-infer for a simulated subject.
 
     Args:
-        case: to reconstruct.
+        case: simulated subject to reconstruct.
         preset: name of the preset.
         output: folder for the results.
     """
@@ -60,15 +60,15 @@ def infer_arguments(case: SimulatedCase, preset: str, output: Path) -> list[str]
 
 
 def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
-    """Run g3r-infer as it is in this package, and measure the process.
+    """Run the g3r-infer of this package, and measure the process.
 
     Args:
-        arguments: with `--output` being `output`.
-        output: folder that it writes; an earlier one is removed.
+        arguments: arguments of g3r-infer, with `output` as `--output`.
+        output: folder for the results; an earlier one is removed.
 
     Raises:
-        InputError: it refused its input (its own line is passed on).
-        NumericalError: it ended in another way.
+        InputError: g3r-infer refused its input; the message is its own line.
+        NumericalError: g3r-infer failed in another way.
     """
     shutil.rmtree(output, ignore_errors=True)
     path = os.pathsep.join(filter(None, [str(PACKAGE_FOLDER), os.environ.get("PYTHONPATH")]))
@@ -80,7 +80,7 @@ def run_infer(arguments: Sequence[str], output: Path) -> CommandRun:
         env={**os.environ, "PYTHONPATH": path},
     )
     assert child.stderr is not None
-    message = child.stderr.read().decode(errors="replace").strip()  # to the end of the process
+    message = child.stderr.read().decode(errors="replace").strip()  # read until the process ends
     _, status, usage = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     child.stderr.close()

@@ -1,4 +1,4 @@
-"""Seconds and memory of one call, disturbed as little as possible by other work of the machine."""
+"""Seconds and memory of one call, with as little influence of other work on the machine as possible."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CLEAR = Path("/proc/self/clear_refs")
 
 
 def min_cpu_seconds(call: Callable[[], object]) -> float:
-    """Least CPU time of several calls, after one that is not counted."""
+    """Least CPU time of several calls, after one unmeasured call."""
     call()
     best, spent, n = float("inf"), 0.0, 0
     while n < MIN_REPEATS or (spent < ENOUGH_SECONDS and n < MAX_REPEATS):
@@ -33,15 +33,15 @@ def min_cpu_seconds(call: Callable[[], object]) -> float:
 
 
 def peak_extra_bytes(call: Callable[[], object]) -> int | None:
-    """Most memory that a call held beyond what the process had before; None on systems other than Linux.
+    """Peak memory of a call beyond that of the process before it; None on systems other than Linux.
 
-    At least one page, so that it has a logarithm.
+    At least one page, so that its logarithm exists.
     """
     gc.collect()
     with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed memory otherwise, and growth does not show
+        ctypes.CDLL(None).malloc_trim(0)  # otherwise glibc keeps freed memory, which hides growth
     try:
-        _CLEAR.write_text("5", encoding="ascii")  # the high-water mark falls to what is held now
+        _CLEAR.write_text("5", encoding="ascii")  # resets the high-water mark to the present memory
         before = psutil.Process().memory_info().rss
         kept = call()
         peak = _high_water_bytes()
@@ -52,7 +52,7 @@ def peak_extra_bytes(call: Callable[[], object]) -> int | None:
 
 
 def _high_water_bytes() -> int:
-    """Most memory since the mark was cleared, which psutil does not read."""
+    """Peak memory since the mark was reset, which psutil does not read."""
     for line in _STATUS.read_text(encoding="ascii").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024

@@ -1,4 +1,4 @@
-"""Fits inside this process: one registration shared by many settings, and quality as a fit goes on."""
+"""Fits inside this process: one registration shared by many settings, and quality during a fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RESOLUTIONS_MM = (0.6, 0.8, 1.0, 1.3, 1.6)
 
 
 def sweeps(base: ReconstructionSettings) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """Sweeps of one thing at a time: sweep, label, change of the settings (see `g3r.planning.presets.changed`)."""
+    """Sweeps of one setting at a time: sweep, label, change of the settings (see `g3r.planning.presets.changed`)."""
     prior_steps, slice_steps = base.prior_stage.n_steps, base.slice_stage.n_steps
     return {
         "Gaussians": {
@@ -51,11 +51,11 @@ def sweeps(base: ReconstructionSettings) -> dict[str, dict[str, Mapping[str, Any
 
 
 class FitWatch:
-    """Keeps the cloud and the poses now and then, with the seconds of the fit less those of keeping.
+    """Keeps cloud and poses at intervals, with the seconds of the fit minus those spent here.
 
     Args:
-        n_steps: that the fit will take.
-        n_samples: how many to keep.
+        n_steps: number of steps of the fit.
+        n_samples: number of samples to keep.
     """
 
     def __init__(self, n_steps: int, n_samples: int = SAMPLES_PER_FIT) -> None:
@@ -78,7 +78,7 @@ class FitWatch:
         self.spent += time.perf_counter() - now
 
     def seconds_before_end(self) -> list[float]:
-        """How long before the last sample each was taken."""
+        """Seconds between each sample and the last one."""
         return [self.seconds[-1] - moment for moment in self.seconds]
 
 
@@ -94,8 +94,8 @@ def measured_fit(
 
     Args:
         case: simulated subject.
-        settings: of the reconstruction, with a fit to the slices.
-        motion: from `shared_registration`; found in this run when None.
+        settings: settings of the reconstruction, with a fit to the slices.
+        motion: from `shared_registration`; None registers in this run.
 
     Returns:
         `seconds`, `cpu_seconds` (sums over the stages), `stages`, `stages_cpu`, `n_gaussians`, `psnr_db`,
@@ -118,10 +118,10 @@ def measured_fit(
 
 
 def measured_sweeps(case: SimulatedCase, settings: ReconstructionSettings) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Every sweep around some settings, on one registration; the settings themselves are fitted once.
+    """Every sweep around some settings, on one registration; the unchanged settings are fitted once.
 
     Yields:
-        Sweep, label, what `measured_fit` gives, with `same_as_base` where nothing was changed.
+        Sweep, label, and figures of `measured_fit` with `same_as_base`, which is True for unchanged settings.
     """
     motion = shared_registration(case, settings)
     base = measured_fit(case, settings, motion)

@@ -1,4 +1,4 @@
-"""Seconds of the renderer's passes and of an optimiser step, and what one core can do at best."""
+"""Seconds of the renderer's passes and of an optimiser step, and the limits of one core."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 
 CLOCK = time.thread_time
 STEP_FACTOR = 0.1
-"""Factor on the step sizes while steps are timed, as near the end of a fit."""
+"""Factor on the step sizes of timed steps, as near the end of a fit."""
 
 STEPS = 10
 
@@ -29,17 +29,17 @@ STEPS = 10
 f32 = np.float32
 
 COPY_BYTES = 2**27
-"""Beyond any cache."""
+"""Larger than any cache."""
 
 N_IN_CACHE, N_TURNS, N_FUSED = 2048, 2000, 64
-"""Numbers that stay in the innermost cache, how often they are taken, and operations on each."""
+"""Numbers that fit into the innermost cache, rounds over them, and operations on each number in a round."""
 
 
 def best_seconds(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Least time of several calls, after one that is not counted.
+    """Least time of several calls, after one unmeasured call.
 
     Args:
-        call: to be timed.
+        call: call to time.
         repeats: number of timed calls.
         clock: seconds since any fixed moment.
     """
@@ -119,12 +119,12 @@ def numba_rates(n_gaussians: int, repeats: int) -> dict[str, float]:
 
 
 def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, float]:
-    """Time one pass of the dense torch reference, which has no cut-off: every pair has every pixel.
+    """Time one pass of the dense torch reference, which has no cut-off, so every pair has every pixel.
 
     Args:
-        n_gaussians: in the scene.
-        n_slices: in the scene.
-        repeats: passes, of which the fastest counts; at most three are made.
+        n_gaussians: Gaussians in the scene.
+        n_slices: slices of each stack.
+        repeats: number of passes, at most three, of which the fastest counts.
     """
     scene = head_scene(n_gaussians, n_slices)
     leaves = [p.clone().requires_grad_() for p in scene.cloud.parameters]
@@ -152,7 +152,7 @@ def reference_rates(n_gaussians: int, n_slices: int, repeats: int) -> dict[str, 
 
 
 def step_seconds(n_gaussians: int, repeats: int) -> dict[str, float]:
-    """A whole optimiser step of the slice stage over the two kernel calls, and the share outside its kernel.
+    """Time of an optimiser step of the slice stage, its ratio to two kernel calls, and its share outside its kernel.
 
     The step has poses, gains and the scale regulariser; the two calls are `forward` and `backward` on the
     pairs that the step uses.

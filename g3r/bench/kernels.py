@@ -1,4 +1,4 @@
-"""`g3r-bench kernels`: rates of the renderer against what the machine can do, and the rest of a step."""
+"""`g3r-bench kernels`: rates of the renderer relative to the limits of the machine, and the rest of a step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from g3r.bench.record import add_output_arguments, machine, markdown_table, run_
 
 SIZES = (1000, 4000, 16000, 64000)
 REFERENCE_GAUSSIANS, REFERENCE_SLICES = 200, 2
-"""The dense reference compares every Gaussian with every pixel: it is timed on this much alone."""
+"""The dense reference evaluates every Gaussian at every pixel, so it is timed on this small scene only."""
 
 EXPLANATION = (
     "A pixel counts once for each Gaussian whose ellipse holds it; the set-up of pairs and, backward, the "
@@ -30,15 +30,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure, and write what was found; returns the exit code."""
+    """Measure, and write the results; returns the exit code."""
     return run_measurement(options, "kernels", measure=lambda keep: _measure(options, keep), tables=table)
 
 
 def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """All measurements, by one thread: CPU seconds, the least of several.
 
-    The copy and fused-multiply-add rates are measured before each size again, so that a machine that others
-    use too is compared with itself.
+    The copy and fused-multiply-add rates are measured again before each size, so that a machine that others
+    use, too, is compared with itself.
     """
     import numba
 
@@ -72,7 +72,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
 
 
 def _row(backend: str, n_gaussians: int, limits: dict[str, float], rates: dict[str, float]) -> dict[str, Any]:
-    """Rates, and what the machine could have done in their time."""
+    """Rates, and the operations that the machine could have done in the same time."""
     row: dict[str, Any] = {"backend": backend, "n_gaussians": n_gaussians, **limits, **rates}
     for name in ("forward", "backward"):
         seconds, n_pixels = rates[f"{name}_seconds"], rates["n_pixels"]
@@ -84,7 +84,7 @@ def _row(backend: str, n_gaussians: int, limits: dict[str, float], rates: dict[s
 
 
 def table(record: dict[str, Any]) -> str:
-    """The record as Markdown."""
+    """The record as a Markdown table."""
     where = record["machine"]
     head = [
         "backend",

@@ -1,4 +1,4 @@
-"""Records of measurements: on which machine, as JSON, as tables between a document's markers; and how each is run."""
+"""Records of measurements: machine, JSON, tables between the markers of a document; and how commands make them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from g3r.run import atomic_file
 from g3r.run.machine import available_cores
 
 PACKAGES = ("numpy", "torch", "numba")
-"""Whose versions decide speed."""
+"""Packages whose versions influence speed."""
 
 
 def machine(n_threads: int | None = None) -> dict[str, Any]:
     """The conditions of a timing: processor, cores, memory, versions, and the commit of a checkout.
 
     Args:
-        n_threads: that the measurement used; as many as there are cores when None.
+        n_threads: threads of the measurement; None for one per core.
     """
     return {
         "processor": _processor(),
@@ -41,7 +41,7 @@ def machine(n_threads: int | None = None) -> dict[str, Any]:
 
 
 def machine_line(found: dict[str, Any]) -> str:
-    """One line of what `machine` found, for under a table."""
+    """The result of `machine` in one line, for below a table."""
     return (
         f"{found['processor']}, {found['cores']} cores, {found['threads']} threads; "
         f"Python {found['python']}, torch {found['torch']}, numba {found['numba']}; "
@@ -50,12 +50,12 @@ def machine_line(found: dict[str, Any]) -> str:
 
 
 def add_output_arguments(parser: argparse.ArgumentParser, name: str, figure: str) -> None:
-    """Options of every measuring command: where its record, tables and figure go.
+    """Add the options of every measuring command for its record, tables and figure.
 
     Args:
-        parser: of the command.
-        name: of the command.
-        figure: what the figure shows; empty where there is none.
+        parser: parser of the command.
+        name: name of the command.
+        figure: what the figure shows; empty if there is none.
     """
     folder = Path("runs") / "bench" / name
     parser.add_argument("--output", type=Path, default=folder, help=f"for {name}.json and {name}.md")
@@ -76,14 +76,14 @@ def run_measurement(
     """Measure (or read the earlier record), write record, tables and figure; returns the exit code.
 
     Args:
-        options: with those of `add_output_arguments`.
-        name: of the command, its files and its markers.
-        measure: makes the record; called with what keeps the record so far.
-        tables: the record as Markdown.
-        draw: the record as a figure; None where there is none.
+        options: has those of `add_output_arguments`.
+        name: name of the command, its files and its markers.
+        measure: makes the record; called with a function that stores the record so far.
+        tables: makes Markdown of the record.
+        draw: draws the record as a figure; None for no figure.
 
     Raises:
-        InputError: no earlier record, one that is damaged, or files that cannot be written.
+        InputError: there is no earlier record, it is damaged, or files cannot be written.
     """
     path = options.output / f"{name}.json"
     if draw is not None and options.figure and options.figure.suffix != ".png":
@@ -115,7 +115,7 @@ def _earlier(path: Path, tables: Callable[[dict[str, Any]], str]) -> tuple[dict[
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         return record, tables(record)
-    except (ValueError, LookupError, TypeError, AttributeError) as error:  # no JSON, or another one
+    except (ValueError, LookupError, TypeError, AttributeError) as error:  # not JSON, or not such a record
         raise InputError(
             f"{path}: holds no record of g3r-bench {path.stem} ({type(error).__name__}: {error}); measure again, "
             "without --redraw"
@@ -146,7 +146,7 @@ def _installed(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that holds this file, with a + for changes that are not committed."""
+    """Commit of the checkout that holds this file, with a + for uncommitted changes."""
     here = Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():
         return None
@@ -172,7 +172,7 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str
         rows: cells.
 
     Raises:
-        ValueError: a row of another length than the head.
+        ValueError: a row differs in length from the head.
     """
     for row in rows:
         if len(row) != len(head):
@@ -182,12 +182,12 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str
 
 
 def between_markers(text: str, name: str, content: str) -> str:
-    """The text with another content between `<!-- name:begin -->` and `<!-- name:end -->`.
+    """The text with new content between `<!-- name:begin -->` and `<!-- name:end -->`.
 
     Args:
-        text: of a document.
-        name: of the markers.
-        content: that goes between them.
+        text: text of a document.
+        name: name of the markers.
+        content: new content between them.
 
     Raises:
         InputError: the markers are not there exactly once, in this order.
@@ -203,12 +203,12 @@ def put_between_markers(path: Path, name: str, content: str) -> None:
     """Rewrite one table of a document in place.
 
     Args:
-        path: of the document.
-        name: of the markers.
-        content: that goes between them.
+        path: path of the document.
+        name: name of the markers.
+        content: new content between them.
 
     Raises:
-        InputError: no such file, or no markers in it.
+        InputError: the file does not exist, or has no such markers.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a document with {name} markers")
@@ -220,12 +220,12 @@ def put_between_markers(path: Path, name: str, content: str) -> None:
 
 
 def write_json(path: Path, record: Any) -> None:
-    """Write a record, whole or not at all; folders are made."""
+    """Write a record, whole or not at all; folders are created."""
     _write(path, json.dumps(record, indent=1) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text, whole or not at all; folders are made."""
+    """Write a text, whole or not at all; folders are created."""
     _write(path, text.rstrip("\n") + "\n")
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from g3r.gaussians import GaussianCloud
 
 STEP, SEARCH, AMPLITUDES, WRITING = "optimiser step", "overlap search", "amplitudes", "volume"
-"""Operations measured: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
+"""Measured operations: forward, backward and update; `find_overlaps`; `solve_amplitudes`; `render` of a volume."""
 
 GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "Gaussians": ("n_gaussians", 500, (STEP, SEARCH, AMPLITUDES, WRITING)),
@@ -26,13 +26,13 @@ GROWING: dict[str, tuple[str, int, tuple[str, ...]]] = {
     "pixels per slice": ("n_pixels", 1024, (STEP, AMPLITUDES)),
     "output voxels": ("n_voxels", 27_000, (WRITING,)),
 }
-"""Sizes that grow: the field of `SceneSize`, the smallest size, and what of the pipeline should grow with it."""
+"""Sizes that grow: the field of `SceneSize`, the smallest size, and the operations that should grow with it."""
 
 PIXEL_FIELDS = ("n_pixels", "n_voxels")
-"""These leave the number of pairs (nearly) as it is, whose set-up is then no part of what grows."""
+"""Sizes that leave the number of pairs (nearly) unchanged, so that the set-up of pairs does not grow."""
 
 N_SIZES = 8
-"""Each twice the one before: 2^7 = 128, two decades."""
+"""Number of sizes, each twice the one before: 2^7 = 128, two decades."""
 
 AMPLITUDE_ITERATIONS = 4
 TIMED_STEPS = 6
@@ -41,14 +41,14 @@ MIN_EXPONENT, MAX_EXPONENT = 0.9, 1.15
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the options of the command."""
     add_output_arguments(parser, "scaling", "seconds against size")
     parser.add_argument("--sizes", type=int, default=N_SIZES, help="how many, each twice the one before")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads; seconds are CPU time of all")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure, and write what was found; returns the exit code."""
+    """Measure, and write the results; returns the exit code."""
     from g3r.bench.scaling_tables import draw_scaling, scaling_tables
 
     if options.sizes < 2:
@@ -72,7 +72,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
 def measured_growth(name: str, n_sizes: int = N_SIZES) -> list[dict[str, Any]]:
     """A row per size: `size`, `pairs`, `evaluations`, and of each operation `seconds` and `bytes`.
 
-    Where pixels grow and pairs do not, also `setup_seconds`: those of the same pairs without pixels.
+    If pixels grow and pairs do not, also `setup_seconds`: seconds of the same pairs with four pixels per plane.
     """
     from g3r.bench.scenes import SceneSize
 
@@ -86,9 +86,9 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
     """One size: work, seconds and memory of each operation.
 
     Args:
-        size: of the scene.
-        field: of `SceneSize` that grows.
-        operations: that are measured.
+        size: size of the scene.
+        field: field of `SceneSize` that grows.
+        operations: operations to measure.
     """
     from g3r.bench.cost import peak_extra_bytes
     from g3r.bench.scenes import corner_slices, corners, evaluations, made_cloud, made_slices, made_volume_planes
@@ -116,12 +116,12 @@ def measured_scene(size: SceneSize, field: str, operations: tuple[str, ...]) -> 
 def scene_calls(
     cloud: GaussianCloud, slices: Slices, volume: Planes
 ) -> dict[str, tuple[Callable[[], float], Callable[[], object]]]:
-    """For each operation a function for its seconds, and a single call of it.
+    """For each operation, a function that returns its seconds, and a function that calls it once.
 
     Args:
         cloud: Gaussians.
-        slices: that are fitted.
-        volume: planes of the volume that is written.
+        slices: slices that are fitted.
+        volume: planes of the written volume.
     """
     from g3r.bench.cost import min_cpu_seconds
     from g3r.gaussians import find_overlaps, render, solve_amplitudes
@@ -145,10 +145,10 @@ def scene_calls(
 
 
 def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
-    """CPU seconds of one optimiser step: the least of several in a fit, without its start.
+    """CPU seconds of one optimiser step: the least of several in a fit, without the start of the fit.
 
-    Forward, backward and update of all that a fit of the slices moves; no distillation, and no search for
-    pairs, which does not happen in every step.
+    Forward, backward and update of all parameters of a fit to the slices; without distillation, and without the search
+    for pairs, which does not happen in every step.
     """
     import time
 
@@ -180,7 +180,7 @@ def step_seconds(cloud: GaussianCloud, slices: Slices) -> float:
 
 
 def _actual(field: str, size: SceneSize, plane_shape: Any, volume_shape: Any) -> int:
-    """Sides are whole numbers, so the numbers of pixels and voxels are only near those requested."""
+    """The actual size: sides are whole numbers, so pixels and voxels are only near the requested numbers."""
     if field == "n_pixels":
         return int(plane_shape.prod())
     if field == "n_voxels":

@@ -21,12 +21,12 @@ DECADE = 10.0
 
 @dataclass(frozen=True)
 class Exponent:
-    """Slope of log(cost) over log(size), and the standard error of the slope.
+    """Slope of log(cost) over log(size), with its standard error.
 
     Attributes:
         value: cost grows as size to this power.
-        spread: standard error; zero where there are but two sizes.
-        n_sizes: that the line was laid through.
+        spread: standard error; zero for two sizes.
+        n_sizes: number of sizes in the fit.
     """
 
     value: float
@@ -35,16 +35,16 @@ class Exponent:
 
 
 def fitted_exponent(size: Sequence[float], cost: Sequence[float], largest_decade: bool = False) -> Exponent:
-    """The straight line through the logarithms, by least squares.
+    """The exponent of a straight line through the logarithms, by least squares.
 
     Args:
-        size: ascending.
-        cost: positive.
-        largest_decade: whether only sizes within a factor of 10 of the largest count, so that the fixed cost
-            of small sizes does not.
+        size: sizes, ascending.
+        cost: costs, positive.
+        largest_decade: whether to use only sizes within a factor of 10 of the largest, to leave out the fixed cost
+            of small sizes.
 
     Raises:
-        ValueError: lists of different lengths, fewer than two sizes, or values that are not positive.
+        ValueError: the lists differ in length, there are fewer than two sizes, or values are not positive.
     """
     x, y = np.asarray(size, dtype=np.float64), np.asarray(cost, dtype=np.float64)
     if x.shape != y.shape or x.ndim != 1:
@@ -63,7 +63,7 @@ def fitted_exponent(size: Sequence[float], cost: Sequence[float], largest_decade
 
 
 def scaling_tables(record: Mapping[str, Any]) -> str:
-    """Exponents first, then the figures that they were fitted to, with the machine under them."""
+    """All tables: exponents, then the figures that they were fitted to, with the machine below."""
     parts = [_exponent_table(record)]
     parts += [_growth_table(name, rows) for name, rows in record["growing"].items()]
     parts.append(
@@ -79,7 +79,7 @@ def scaling_tables(record: Mapping[str, Any]) -> str:
 
 
 def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Exponent | None:
-    """Exponent of the largest decade, without the set-up of pairs where that was measured; None if nothing remains."""
+    """Exponent of the largest decade, without the set-up of pairs if that was measured; None if nothing remains."""
     cost = [row["seconds"][operation] - row.get("setup_seconds", {}).get(operation, 0.0) for row in rows]
     if min(cost[-2:]) <= 0:
         return None
@@ -89,10 +89,10 @@ def judged_exponent(rows: Sequence[Mapping[str, Any]], operation: str) -> Expone
 
 
 def exponents(rows: list[dict[str, Any]], operation: str, kind: str) -> tuple[Exponent, Exponent] | None:
-    """Exponents of the largest decade and of all sizes; None where nothing was measured.
+    """Exponents of the largest decade and of all sizes; None if nothing was measured.
 
     Args:
-        rows: of one growing size.
+        rows: rows of one growing size.
         operation: see `g3r.bench.scaling`.
         kind: "seconds" or "bytes".
     """

@@ -1,4 +1,4 @@
-"""Made-up clouds and slices: a head of any number of Gaussians, and scenes of which one size grows at a time."""
+"""Synthetic clouds and slices: a head of any number of Gaussians, and scenes in which one size grows at a time."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ SEMI_AXES_MM = np.array([40.0, 48.0, 38.0])
 """Semi-axes of the ellipsoid that `head_scene` fills with Gaussians."""
 
 SIGMA_PER_SPACING, LOG_SIGMA_SPREAD = 0.6, 0.25
-"""Sigma of its Gaussians over the edge of their share of the head, as the fit seeds them; deviation of ln sigma."""
+"""Sigma of its Gaussians over the lattice spacing, as the fit seeds them; standard deviation of ln sigma."""
 
 HEAD_THICKNESS_MM = 2.2
 
 CUBE_MM = 50.0
-"""Edge of the cube that Gaussians, slices and voxels of the growing scenes share."""
+"""Edge of the cube that holds Gaussians, slices and voxels of the growing scenes."""
 
 SIGMA_MM = 1.2
 THICKNESS_MM = 2.5
 
 PIXEL_MM = 0.8
-"""In-plane width of the PSF, whatever the spacing of the pixels: finer pixels must not change the scene."""
+"""Pixel size for the in-plane PSF, whatever the pixel spacing: finer pixels must not change the scene."""
 
 FRAMES = (
     np.eye(3),
@@ -44,7 +44,7 @@ FRAMES = (
 
 @dataclass(frozen=True)
 class HeadScene:
-    """A cloud and three stacks of slices of it, each cropped to the head and slightly tilted."""
+    """A cloud and three stacks of its slices; each slice is cropped to the head and slightly tilted."""
 
     cloud: GaussianCloud
     slices: Slices
@@ -54,14 +54,14 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
     """Random Gaussians that fill an ellipsoid, and slices of noise (their values do not matter).
 
     Args:
-        n_gaussians: in the head; their size follows.
-        n_slices: of each stack; None covers the head.
-        seed: of everything random.
+        n_gaussians: Gaussians in the head; their number determines their size.
+        n_slices: slices of each stack; None covers the head.
+        seed: seed of all random numbers.
     """
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n_gaussians, 3))
     points *= (rng.random(n_gaussians) ** (1 / 3) / np.linalg.norm(points, axis=1))[:, None]
-    points = (points * SEMI_AXES_MM)[np.lexsort(np.rint(points * SEMI_AXES_MM / 4).T)]  # neighbours near in memory
+    points = (points * SEMI_AXES_MM)[np.lexsort(np.rint(points * SEMI_AXES_MM / 4).T)]  # neighbours adjacent in memory
     spacing_mm = float(4 / 3 * np.pi * SEMI_AXES_MM.prod() / n_gaussians) ** (1 / 3)
     log_scale = np.log(SIGMA_PER_SPACING * spacing_mm) + rng.normal(0, LOG_SIGMA_SPREAD, (n_gaussians, 3))
     cloud = _cloud(points, log_scale, rng.normal(size=(n_gaussians, 4)), rng.uniform(0, 1, n_gaussians))
@@ -92,13 +92,13 @@ def head_scene(n_gaussians: int, n_slices: int | None = None, seed: int = 0) -> 
 
 @dataclass(frozen=True)
 class SceneSize:
-    """How much there is of everything.
+    """The sizes of a scene.
 
     Args:
-        n_gaussians: of the same size in the same cube, so that each touches as many planes and pixels as before.
-        n_slices: through the same cube, in three stacks.
-        n_pixels: per slice, over the same area.
-        n_voxels: of the volume, over the same cube.
+        n_gaussians: of constant size in the same cube, so that each touches a constant number of planes and pixels.
+        n_slices: slices through the same cube, in three stacks.
+        n_pixels: pixels per slice, over the same area.
+        n_voxels: voxels of the volume, over the same cube.
     """
 
     n_gaussians: int = 8000
@@ -121,8 +121,8 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
 
     Args:
         size: number of slices and of their pixels.
-        cloud: that is imaged.
-        seed: of the noise.
+        cloud: imaged cloud.
+        seed: seed of the noise.
     """
     rng = np.random.default_rng(seed)
     per_stack = [len(part) for part in np.array_split(np.arange(size.n_slices), len(FRAMES))]
@@ -143,7 +143,7 @@ def made_slices(size: SceneSize, cloud: GaussianCloud, seed: int = 1) -> Slices:
 
 
 def corners(planes: Planes) -> Planes:
-    """The same rectangles with a pixel in each corner only: the same overlaps, and hardly a pixel in them."""
+    """The same rectangles with a pixel in each corner only: the same overlaps, but hardly any pixels."""
     return replace(planes, shape=np.full((len(planes), 2), 2), spacing_mm=(planes.shape - 1) * planes.spacing_mm)
 
 
@@ -163,7 +163,7 @@ def made_volume_planes(size: SceneSize) -> Planes:
 
 
 def evaluations(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> tuple[int, int]:
-    """The work of rendering: pixels inside the cut-off, one for each Gaussian, and (Gaussian, plane) pairs with any.
+    """The work of rendering: (Gaussian, pixel) evaluations inside the cut-off, and (Gaussian, plane) pairs with any.
 
     Args:
         cloud: N Gaussians.
@@ -195,12 +195,12 @@ def _count(shapes, planes, overlaps, cut, projections):
 
 
 def _cloud(*arrays: NDArray[np.float64]) -> GaussianCloud:
-    """Centres, log-scales, quaternions and amplitudes as a cloud about the world's origin."""
+    """A cloud around the world's origin from centres, log-scales, quaternions and amplitudes."""
     return GaussianCloud.of([torch.from_numpy(array.astype(np.float32)) for array in arrays], np.zeros(3))
 
 
 def _slices(planes: Planes, value: NDArray[np.float32], stack_id: NDArray[np.int64], thickness_mm: float) -> Slices:
-    """Planes with pixels as slices without a mask, numbered in each stack."""
+    """Slices from planes with pixels, unmasked, numbered in each stack."""
     k = len(planes)
     index = np.arange(k) - np.searchsorted(stack_id, stack_id)
     thickness = np.full(k, thickness_mm)

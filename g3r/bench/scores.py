@@ -1,4 +1,4 @@
-"""How good a result is, on a simulated subject: PSNR and SSIM after alignment, error of the poses."""
+"""Quality of a result on a simulated subject: PSNR and SSIM after alignment, error of the poses."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Quality:
     """Scores of a volume and its poses.
 
     Attributes:
-        psnr_db, ssim: of the volume in the truth's mask, after one rigid motion and an affine fit of the
+        psnr_db, ssim: scores of the volume in the truth's mask, after one rigid motion and an affine fit of the
             intensities, as `g3r-evaluate --align` scores.
-        tre_mm: median over slices of the error of their poses.
-        remaining: the motion of the volume, after the slices' common one, that alignment still found; takes
+        tre_mm: median over slices of their TRE.
+        remaining: motion of the volume that alignment finds after the slices' common motion is removed; maps
             the truth to the volume.
     """
 
@@ -36,21 +36,21 @@ class Quality:
     remaining: RigidPose
 
     def record(self) -> dict[str, float]:
-        """The figures."""
+        """The scores, rounded."""
         return {"psnr_db": round(self.psnr_db, 3), "ssim": round(self.ssim, 4), "tre_mm": round(self.tre_mm, 3)}
 
 
 def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.float64], poses: PoseTable) -> Quality:
     """Score a volume [I, J, K] and the slices' poses.
 
-    The volume may be oriented too differently from the truth for alignment: the common motion of the slices
-    is applied first.
+    The common motion of the slices is applied first, because the volume may be oriented too differently from the
+    truth for alignment.
 
     Args:
-        case: with the truth.
+        case: has the truth.
         data: [I, J, K] reconstructed volume.
         affine: [4, 4], world (RAS+, mm) from index.
-        poses: of the slices, as reconstructed.
+        poses: reconstructed poses of the slices.
     """
     error = target_registration_error(case.points_mm, case.true, poses)
     grid = VolumeGrid(data.shape, affine).moved(error.common)
@@ -61,7 +61,7 @@ def quality(case: SimulatedCase, data: NDArray[np.float32], affine: NDArray[np.f
 
 
 def quality_of_folder(case: SimulatedCase, folder: Path) -> Quality:
-    """Score what g3r-infer wrote."""
+    """Score the output folder of g3r-infer."""
     volume = load_volume(folder / "volume.nii.gz")
     return quality(case, volume.data, volume.affine, read_poses(folder / "slices.tsv"))
 
@@ -69,15 +69,15 @@ def quality_of_folder(case: SimulatedCase, folder: Path) -> Quality:
 def cloud_psnr_db(
     case: SimulatedCase, cloud: GaussianCloud, poses: PoseTable, remaining: RigidPose, cutoff_sigma: float
 ) -> float:
-    """PSNR of a cloud in the midst of a fit, read on the truth's own grid.
+    """PSNR of a cloud during a fit, rendered on the grid of the truth.
 
-    Poses drift together with the volume during a fit, so the slices' common motion is that of the moment;
-    what alignment found at the end is added.
+    Poses drift together with the volume during a fit, so the slices' common motion at that moment is removed, and then
+    the motion that alignment found at the end.
 
     Args:
-        case: with the truth.
+        case: has the truth.
         cloud: Gaussians in the frame of the poses.
-        poses: of the same moment.
+        poses: poses at the same moment.
         remaining: see `Quality`.
         cutoff_sigma: see `render`.
     """

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from g3r.evaluation.case import SimulatedCase
 
 OUTSIDE_STAGES = "start-up, reading, writing"
-"""Name for the time outside the stages that run.json records."""
+"""Name of the time outside the stages of run.json."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the options of the command."""
     parser.add_argument("cases", nargs="*", type=Path, metavar="CASE", help="folders of g3r-simulate")
     add_output_arguments(parser, "trade", "PSNR against seconds")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each command; medians are shown")
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure, and write what was found; returns the exit code."""
+    """Measure, and write the results; returns the exit code."""
     from g3r.bench.trade_figure import draw_trade
     from g3r.bench.trade_tables import trade_tables
 
@@ -59,7 +59,7 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
         )
     cases = [load_case(folder, options.thickness) for folder in options.cases]
     for case in cases:
-        _ = case.truth_mask  # before any work
+        _ = case.truth_mask  # fails before any work
     threads = options.threads or available_cores()
     record: dict[str, Any] = {
         "machine": machine(threads),
@@ -87,11 +87,11 @@ def _measure(options: argparse.Namespace, keep: Callable[[dict[str, Any]], None]
 
 
 def measured_command(case: SimulatedCase, arguments: list[str], output: Path, repeats: int) -> dict[str, Any]:
-    """Medians over runs of one command, and the quality of what the last of them wrote.
+    """Medians over runs of one command, and the quality of the last run's result.
 
     Args:
         case: simulated subject.
-        arguments: of g3r-infer.
+        arguments: arguments of g3r-infer.
         output: its output folder.
         repeats: number of runs.
     """
@@ -122,7 +122,7 @@ def measured_command(case: SimulatedCase, arguments: list[str], output: Path, re
 def _measure_fits(
     case: SimulatedCase, options: argparse.Namespace, record: dict[str, Any], keep: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Curves during the fit of each preset that fits, and the sweeps, into the record of a case."""
+    """Add to the record of a case the curves during the fit of each preset with a fit, and the sweeps."""
     from g3r.bench.fits import measured_fit, measured_sweeps
     from g3r.planning.presets import PRESETS
 

@@ -1,4 +1,4 @@
-"""The figure of `g3r-bench trade`: PSNR against seconds, a panel per case."""
+"""The figure of `g3r-bench trade`: PSNR against seconds, one panel per case."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ COLOURS = {"preview": "#cc79a7", "fast": "#e69f00", "balanced": "#0072b2", "accu
 SWEEP_COLOURS = {"Gaussians": "#7f3c8d", "iterations": "#d55e00", "cut-off": "#56b4e9", "resolution": "#8c6d31"}
 
 MIN_SHOWN_DB = 6.0
-"""The axis begins this far under the worst preset; curves may begin deeper."""
+"""The axis begins half of this below the worst preset; curves may begin lower."""
 
 
 def draw_trade(record: Mapping[str, Any], path: Path) -> None:
-    """Draw a panel per case and write it as PNG.
+    """Draw one panel per case, and write the figure as PNG.
 
-    Presets are markers, sweeps thin lines with dots, the quality during each preset's fit dashed (at the time
-    at which the command would have ended, had the fit been stopped there); the Pareto front is a grey band.
+    Presets are markers, sweeps are thin lines with dots, and the quality during each preset's fit is a dashed line (at
+    the time at which the command would have ended if the fit had been stopped there). The Pareto front is a grey band.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

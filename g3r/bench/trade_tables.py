@@ -12,7 +12,7 @@ ALLOWED_SECONDS = {"preview": 15.0, "fast": 30.0, "balanced": 75.0, "accurate": 
 """Time limit of the whole command by preset, on two cores, for three stacks of a 30-week head."""
 
 ALLOWED_LOSS_DB = {"preview": 4.0, "fast": 1.5, "balanced": 0.5}
-"""Against `accurate` on the same case."""
+"""Largest loss of PSNR against `accurate` on the same case."""
 
 BEST = "accurate"
 
@@ -30,10 +30,10 @@ class Point:
 
 
 def points_of(case: Mapping[str, Any], base: str) -> list[Point]:
-    """Presets, and sweeps on the presets' scale of time.
+    """Points of the presets, and of the sweeps on the presets' time scale.
 
-    A sweep is measured without start-up and registration: its seconds are those of the command of the preset
-    that it varies, with the stages that differ exchanged.
+    A sweep is measured without start-up and registration. Its seconds are those of the command of the varied preset,
+    with the stages that differ exchanged.
     """
     presets = case["presets"]
     points = [Point("preset", name, row["seconds"], row["psnr_db"]) for name, row in presets.items()]
@@ -48,9 +48,9 @@ def points_of(case: Mapping[str, Any], base: str) -> list[Point]:
 
 
 def sweep_offset(case: Mapping[str, Any], base: str) -> float:
-    """Seconds of the base preset's command that its fit on a given registration does not show.
+    """Seconds of the base preset's command outside its fit on a given registration.
 
-    Zero where the preset was not measured as a command.
+    Zero if the preset was not measured as a command.
     """
     alike = [row for variants in case["sweeps"].values() for row in variants.values() if row["same_as_base"]]
     if base not in case["presets"] or not alike:
@@ -59,7 +59,7 @@ def sweep_offset(case: Mapping[str, Any], base: str) -> float:
 
 
 def pareto_front(seconds: Sequence[float], quality: Sequence[float]) -> list[int]:
-    """Numbers of the points that no other reaches in less time and with better quality, fastest first.
+    """Indices of the points that no other point beats in both time and quality, fastest first.
 
     Among points with equal values the first is kept.
 
@@ -68,7 +68,7 @@ def pareto_front(seconds: Sequence[float], quality: Sequence[float]) -> list[int
         quality: more is better.
 
     Raises:
-        ValueError: lists of different lengths.
+        ValueError: the lists differ in length.
     """
     if len(seconds) != len(quality):
         raise ValueError(f"{len(seconds)} times and {len(quality)} qualities; expected as many")
@@ -80,7 +80,7 @@ def pareto_front(seconds: Sequence[float], quality: Sequence[float]) -> list[int
 
 
 def trade_tables(record: Mapping[str, Any]) -> str:
-    """All tables, with the machine under them."""
+    """All tables, with the machine below them."""
     parts = [_preset_table(record)]
     if any(BEST in case["presets"] for case in record["cases"].values()):
         parts.append(_check_table(record))
@@ -129,7 +129,7 @@ def _preset_table(record: Mapping[str, Any]) -> str:
 
 
 def _check_table(record: Mapping[str, Any]) -> str:
-    """Seconds and losses against what they may be; what is over is marked (!)."""
+    """Seconds and losses against their limits; values above are marked (!)."""
     rows = []
     for name, case in record["cases"].items():
         best = case["presets"].get(BEST)
@@ -151,7 +151,7 @@ def _judged(value: float, most: float, form: str) -> str:
 
 
 def _stage_table(name: str, case: Mapping[str, Any]) -> str:
-    """Wall and CPU seconds of each stage; a row per stage, two columns per preset."""
+    """Wall and CPU seconds of each stage: one row per stage, two columns per preset."""
     presets = case["presets"]
     stages = list(dict.fromkeys(stage for row in presets.values() for stage in row["stages"]))
     head = [f"{name}: stage", *[f"`{p}` {kind}" for p in presets for kind in ("wall", "CPU")]]

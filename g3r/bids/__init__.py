@@ -1,1 +1,1 @@
-"""BIDS: stacks and masks of a data set in, a derivative data set out, one process of g3r-infer for each session."""
+"""BIDS: from a data set with stacks and masks to a derivative data set, by one process of g3r-infer per session."""

@@ -1,4 +1,4 @@
-"""Sessions of a data set, one process of g3r-infer each, and what becomes of them."""
+"""Reconstruction of the sessions of a data set, by one process of g3r-infer each."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from g3r.run.hidden_folders import HiddenFolders
 INFER = (sys.executable, "-m", "g3r.cli.infer")
 
 AUTO = "auto"
-"""In place of a mask's file: g3r-infer is to find it."""
+"""Stands for a mask's file: g3r-infer finds the mask itself."""
 
 SPEAKER = "g3r-infer: "
-"""How the lines of the command begin."""
+"""Prefix of the lines that the command prints."""
 
 DEFECT = 1
 """Exit code of Python after a traceback; g3r-infer has others for what it knows."""
@@ -35,13 +35,13 @@ MAX_REASON = 500
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What is to be done for a session.
+    """The command of one session, with its inputs and its folder.
 
     Attributes:
-        session: to reconstruct.
+        session: session to reconstruct.
         inputs: stacks and masks.
-        words: the command line.
-        folder: what is not finished.
+        words: words of the command line.
+        folder: folder of this session in the work folder.
     """
 
     session: Session
@@ -60,7 +60,7 @@ class Work:
         return self.folder / "command.json"
 
     def is_done(self) -> bool:
-        """Whether this very command has written its whole result."""
+        """Whether exactly this command has written its complete result."""
         try:
             words = json.loads(self.note.read_text(encoding="utf-8"))
             return words == list(self.words) and not read_object(self.result / RECORD).get("partial", True)
@@ -70,19 +70,19 @@ class Work:
 
 @dataclass(kw_only=True)
 class Cohort:
-    """How sessions are reconstructed.
+    """Settings and procedure of the reconstruction of sessions.
 
     Args:
         bids_dir: the data set.
         out_dir: the derivative data set.
-        options: of g3r-infer, for all sessions.
-        whole_image: whether they say that no mask is needed.
-        resumes: whether a run that was cut short is gone on with.
-        force: whether what is done is done again.
-        mask_derivative: folder of `derivatives/` that the masks are in; None for any.
-        n_threads: of each process; None where the options say it.
+        options: options of g3r-infer, for all sessions.
+        whole_image: whether these options say that no mask is needed.
+        resumes: whether interrupted runs are resumed.
+        force: whether finished sessions are run again.
+        mask_derivative: name of the folder in `derivatives/` with the masks; None for any.
+        n_threads: threads of each process; None if the options state them.
         keep_work: whether all of g3r-infer's files stay in the work folder.
-        command: that makes a result.
+        command: the command that makes a result.
         say: called with a line for each session that starts or ends.
     """
 
@@ -99,11 +99,11 @@ class Cohort:
     say: Callable[[str], None] = lambda line: None
 
     def run(self, sessions: Sequence[Session], executor: Executor) -> None:
-        """Reconstruct what is not done yet.
+        """Reconstruct the sessions that are not done yet.
 
         Args:
-            sessions: of the data set.
-            executor: of the processes.
+            sessions: sessions of the data set.
+            executor: runs the processes.
 
         Raises:
             KeyboardInterrupt: a stop was requested; no process is left.
@@ -136,7 +136,7 @@ class Cohort:
         """The command of a session.
 
         Raises:
-            InputError: its masks cannot be told, or a sidecar cannot be read.
+            InputError: its masks are ambiguous, or a sidecar cannot be read.
         """
         folder = self.out_dir / WORK / session.stem
         masks = [] if self.whole_image else find_masks(session, self.bids_dir, self.out_dir, self.mask_derivative)
@@ -150,12 +150,12 @@ class Cohort:
         return Work(session=session, inputs=inputs, words=tuple(words), folder=folder)
 
     def _with_inherited(self, stack: Path, folder: Path) -> Path:
-        """The stack, or a link to it beside which its sidecar is whole."""
+        """The stack; if it inherits sidecar keys, a link to it with a complete sidecar beside it."""
         keys = inherited(stack, self.bids_dir)
         return stack if keys is None else with_sidecar(stack, keys, folder)
 
     def _begin(self, work: Work, begun: str) -> None:
-        """Make way for its process."""
+        """Prepare folders and the note for the process of a session."""
         session = work.session
         failure_path(session, self.out_dir).unlink(missing_ok=True)
         for folder in (log_path(session, self.out_dir).parent, work.folder):
@@ -173,7 +173,7 @@ class Cohort:
             self._finish(work)
 
     def _finish(self, work: Work) -> None:
-        """Make the derivative of a session, and forget the work."""
+        """Make the derivative of a session, and remove its work folder."""
         session, staging = work.session, work.folder / "derivative"
         try:
             make_derivative(session, work.result, work.inputs, self.bids_dir, self.out_dir, staging)
@@ -188,12 +188,12 @@ class Cohort:
         self.say(f"{session.stem}: done")
 
     def _failed(self, session: Session, reason: str, seconds: float | None = None) -> None:
-        """Say and keep why a session failed; the others go on.
+        """Print and record why a session failed; the others go on.
 
         Args:
-            session: that failed.
+            session: the failed session.
             reason: why.
-            seconds: that its process took; None where it had none, or nobody could tell.
+            seconds: duration of its process; None without a process, or if unknown.
         """
         hidden = HiddenFolders([str(self.bids_dir), str(self.out_dir)])  # the data set is passed on
         line = " ".join(hidden.left_out_of(reason).split())[:MAX_REASON]
@@ -203,7 +203,7 @@ class Cohort:
 
 
 def _reason(log: Path, code: int) -> str:
-    """Why a process failed, in one line, from what it said last."""
+    """The reason why a process failed, in one line, from the end of its log."""
     try:
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError:

@@ -11,7 +11,7 @@ from g3r.bids.names import BidsName, parsed_name
 from g3r.errors import InputError
 
 READ_ENTITIES = {"sub", "ses", "acq", "run"}
-"""A T2w file with others is no stack of slices as it was scanned: a reconstruction (rec), an echo, a phase image."""
+"""Entities of a scanned stack. A T2w file with others is a reconstruction (rec), an echo or a phase image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +19,9 @@ class Session:
     """One visit of a participant, or all of a participant without sessions.
 
     Attributes:
-        participant, session: labels; no session where the data set has none.
-        stacks: T2w images of its anat folder, by name.
-        left_out: names of T2w images that are no stacks.
+        participant, session: labels; session is None if the data set has none.
+        stacks: T2w images of its anat folder, in order of their names.
+        left_out: names of T2w images that are not stacks.
     """
 
     participant: str
@@ -31,12 +31,12 @@ class Session:
 
     @property
     def stem(self) -> str:
-        """How its files begin: sub-01_ses-02."""
+        """Beginning of its file names, such as sub-01_ses-02."""
         return f"sub-{self.participant}" + (f"_ses-{self.session}" if self.session else "")
 
     @property
     def folder(self) -> Path:
-        """Where its files are in a data set."""
+        """Its folder, relative to the data set."""
         return Path(*self.stem.split("_"))
 
 
@@ -51,7 +51,7 @@ def find_sessions(
         sessions: labels, with `ses-` or without; None for all.
 
     Raises:
-        InputError: no data set, a participant or session that is not in it, or no stack at all.
+        InputError: there is no data set, it lacks a participant or session, or it has no stack.
     """
     if not bids_dir.is_dir():
         raise InputError(f"{bids_dir}: is no folder; expected a BIDS data set, check the path")
@@ -76,18 +76,18 @@ def find_sessions(
 
 
 def find_masks(session: Session, bids_dir: Path, out_dir: Path, derivative: str | None = None) -> list[Path | None]:
-    """The brain mask of each stack of a session; None where no derivative has one.
+    """The brain mask of each stack of a session; None if no derivative has one.
 
-    Masks that g3r found are not taken for the user's own: data sets that it made are passed by unless they are named.
+    Masks found by g3r are not the user's own, so derivative data sets that it made are skipped unless they are named.
 
     Args:
-        session: whose stacks.
-        bids_dir: whose `derivatives/*/` are looked through.
-        out_dir: passed by, since masks there were made from these stacks.
-        derivative: name of the only folder of `derivatives/` to look in.
+        session: the session of the stacks.
+        bids_dir: the data set; its `derivatives/*/` are searched.
+        out_dir: skipped, because masks there were made from these stacks.
+        derivative: name of the only folder of `derivatives/` to search.
 
     Raises:
-        InputError: one stack has two masks, or the folder that is named cannot be looked in.
+        InputError: one stack has two masks, or the named folder cannot be searched.
     """
     root = bids_dir / "derivatives"
     masks: dict[frozenset[tuple[str, str]], list[Path]] = {}
@@ -120,12 +120,12 @@ def _mask_folders(root: Path, out_dir: Path, derivative: str | None) -> list[Pat
 
 
 def _is_same(folder: Path, other: Path) -> bool:
-    """Whether two paths are one folder, by whatever link or spelling."""
+    """Whether two paths are the same folder, by any link or spelling."""
     return other.exists() and folder.samefile(other)
 
 
 def _several_masks(stack: Path, masks: list[Path]) -> InputError:
-    """The refusal of a stack with several masks, by what can be done about it."""
+    """The error for a stack with several masks, with the remedy that fits."""
     folders = list(dict.fromkeys(path.parts[0] for path in masks))
     if len(folders) > 1:
         named = " and ".join(f"derivatives/{folder}" for folder in folders)
@@ -139,12 +139,12 @@ def _several_masks(stack: Path, masks: list[Path]) -> InputError:
 
 
 def _is_brain_mask(name: BidsName) -> bool:
-    """Whether it is named in one of three ways: ..._desc-brain_mask, ..._T2w_desc-brain_mask, ..._run-1_mask."""
+    """Whether it is a brain mask by its name: ..._desc-brain_mask, ..._T2w_desc-brain_mask, ..._run-1_mask."""
     return name.words in (("mask",), ("T2w", "mask")) and name.entities.get("desc", "brain") == "brain"
 
 
 def _session(folder: Path, participant: str, session: str | None) -> Session | None:
-    """The T2w images of an anat folder; None where it has none."""
+    """The session of an anat folder; None if the folder has no T2w images."""
     stacks, left_out = [], []
     for path in sorted((folder / "anat").glob("*_T2w.nii*")):
         name = parsed_name(path)
@@ -159,10 +159,10 @@ def _session(folder: Path, participant: str, session: str | None) -> Session | N
 
 
 def _chosen(folder: Path, key: str, labels: Sequence[str] | None, where: str) -> dict[str, Path]:
-    """Folders `key-LABEL`, all or those of some labels.
+    """Folders `key-LABEL` by label: all, or those of the given labels.
 
     Raises:
-        InputError: a label without a folder.
+        InputError: a label has no folder.
     """
     found = _labelled(folder, key)
     if labels is None:
@@ -173,7 +173,7 @@ def _chosen(folder: Path, key: str, labels: Sequence[str] | None, where: str) ->
 
 
 def _check_labels(wanted: Sequence[str], found: Collection[str], key: str, where: str) -> None:
-    """Refuse a label that is not there.
+    """Refuse labels that were not found.
 
     Raises:
         InputError: see above.
@@ -186,7 +186,7 @@ def _check_labels(wanted: Sequence[str], found: Collection[str], key: str, where
 
 
 def _labelled(folder: Path, key: str) -> dict[str, Path]:
-    """Folders `key-LABEL` in order, by label."""
+    """Folders `key-LABEL` in order of their names, by label."""
     paths = sorted(path for path in folder.glob(f"{key}-*") if path.is_dir())
     return {_bare(path.name, key): path for path in paths}
 

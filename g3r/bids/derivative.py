@@ -1,4 +1,4 @@
-"""From the folder of a result to the files of one session in the derivative data set, whole or not at all."""
+"""Conversion of a result folder to the files of one session in the derivative data set, whole or not at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ XFM = "from-scanner_to-standard_mode-image_xfm.txt"
 
 @dataclass(frozen=True)
 class Image:
-    """An image of the derivative: end of its name, what it shows, and further keys of its sidecar."""
+    """An image of the derivative: end of its name, its content in words, and further keys of its sidecar."""
 
     end: str
     shows: str
@@ -46,7 +46,7 @@ IMAGES = {
     "density.nii.gz": Image("desc-coverage_T2w", "coverage by slices: 1 is one stack without gaps", (("Units", "1"),)),
     "unseen.nii.gz": Image("desc-unseen_mask", "brain that no slice saw", (("Type", "ROI"),)),
 }
-"""By the name in the folder of a result."""
+"""Images of the derivative by their name in the result folder."""
 
 SECTIONS, THUMBNAIL, REPORT = "desc-sections_T2w.png", "desc-thumbnail_T2w.png", "desc-report_T2w.html"
 
@@ -59,17 +59,17 @@ WORDS = {
 
 
 def record_path(session: Session, out_dir: Path) -> Path:
-    """The record of a session that is done; it is there as soon as all of it is."""
+    """Path of the record of a session; the file exists only once the session is complete."""
     return out_dir / session.folder / "anat" / f"{session.stem}_{REC}_run.json"
 
 
 def figure_path(session: Session, out_dir: Path, end: str = SECTIONS) -> Path:
-    """A picture of a session.
+    """Path of a picture of a session.
 
     Args:
-        session: of the data set.
+        session: session of the data set.
         out_dir: the derivative data set.
-        end: of its name; the picture of the volume's sections unless said otherwise.
+        end: end of the file's name; by default that of the picture of sections.
     """
     return out_dir / session.folder / "figures" / f"{session.stem}_{REC}_{end}"
 
@@ -79,16 +79,16 @@ def make_derivative(
 ) -> None:
     """Put the result of a session into the derivative data set.
 
-    The anat folder is renamed as a whole and comes last. An earlier one is replaced; files in it that others made
+    The anat folder is renamed as a whole, last. An earlier one is replaced, but files in it that other programs made
     are kept.
 
     Args:
-        session: of the result.
+        session: session of the result.
         result: folder that g3r-infer wrote.
         inputs: stacks and masks that it read.
         bids_dir: the input data set.
         out_dir: the derivative data set.
-        staging: folder to use meanwhile, on the file system of `out_dir`.
+        staging: temporary folder, on the file system of `out_dir`.
 
     Raises:
         OSError: something cannot be written.
@@ -130,9 +130,9 @@ def _sidecar(path: Path, image: Image, where: str, volume: str) -> dict[str, Any
 
     Args:
         path: the image.
-        image: what it is.
+        image: its kind.
         where: the space of its grid, in words.
-        volume: URI of the volume on whose space it is.
+        volume: URI of the volume whose space it is in.
     """
     zooms = nib.Nifti1Image.from_filename(path).header.get_zooms()
     is_volume = image.end == "T2w"
@@ -146,7 +146,7 @@ def _sidecar(path: Path, image: Image, where: str, volume: str) -> dict[str, Any
 
 
 def _write_transforms(session: Session, record: dict[str, Any], anat: Path) -> None:
-    """The way from the scanner, of all slices and of those of each stack; none from scanner space."""
+    """Write transforms from the scanner, for all slices and for each stack; none if the result is in scanner space."""
     motions = {f"{session.stem}_{REC}": (record.get("registration") or {}).get("standard_from_scanner")}
     for one in record.get("stacks", []):
         motions[_scan(str(one.get("name")))] = one.get("standard_from_scanner")
@@ -156,7 +156,7 @@ def _write_transforms(session: Session, record: dict[str, Any], anat: Path) -> N
 
 
 def _copy_found_masks(session: Session, result: Path, record: dict[str, Any], bids_dir: Path, anat: Path) -> None:
-    """Masks that were found are derivatives of their stacks, on the stacks' grids."""
+    """Copy masks that were found; they are derivatives of their stacks, on the stacks' grids."""
     stacks = {path.name: path for path in session.stacks}
     for n, one in enumerate(record.get("stacks", [])):
         path, stack = result / f"brain-mask-{n}.nii.gz", stacks.get(one.get("name"))
@@ -174,7 +174,7 @@ def _copy_found_masks(session: Session, result: Path, record: dict[str, Any], bi
 
 
 def _keep_others(earlier: Path, new: Path, begin: str) -> None:
-    """Copy what others put beside an earlier result, whose files begin with `begin`."""
+    """Copy files of other programs beside an earlier result, whose own files begin with `begin`."""
     ends = [f"{image.end}{ending}" for image in IMAGES.values() for ending in (".nii.gz", ".json")]
     own = {f"{begin}_{end}" for end in (*ends, "run.json", "slices.tsv")}
     of_stacks = ("_desc-brain_mask.nii.gz", "_desc-brain_mask.json", XFM)
@@ -187,7 +187,7 @@ def _keep_others(earlier: Path, new: Path, begin: str) -> None:
 
 
 def _exchange(new: Path, target: Path, staging: Path) -> None:
-    """Rename a folder to its place; an earlier one steps aside."""
+    """Rename a folder to its place; an earlier one is moved aside."""
     if target.exists():
         os.rename(target, staging / f"earlier-{target.name}")
     os.rename(new, target)
@@ -202,7 +202,7 @@ def _put_back(staging: Path, target: Path) -> None:
 
 
 def _scan(name: str) -> str:
-    """The name of a stack's file without suffix and ending: its entities."""
+    """The entities of a stack's file name, without suffix and ending."""
     ending = next((one for one in NIFTI_ENDINGS if name.endswith(one)), "")
     return name.removesuffix(ending).removesuffix("_T2w")
 

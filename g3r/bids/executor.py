@@ -1,4 +1,4 @@
-"""One process for each session, and what may run them: the pool of this machine, or arrays of Slurm."""
+"""Executors of one process per session: the pool of this machine, or arrays of Slurm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Protocol
 from g3r.run.hidden_folders import name_alone
 
 GRACE_S = 30.0
-"""For a run that is asked to stop to end its step and write what it has."""
+"""Seconds for a run to end its step and write its result after a stop request."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Job:
 
     Attributes:
         words: its command line.
-        log: file for what it says.
+        log: file for its output.
     """
 
     words: tuple[str, ...]
@@ -36,9 +36,9 @@ class Ended:
     """How a process ended.
 
     Attributes:
-        code: that it returned; None where it was ended from outside.
-        lost: what ended it, in one line; empty where it returned.
-        seconds: that it took; None where nobody could tell.
+        code: exit code; None if it was ended from outside.
+        lost: what ended it, in one line; empty if it returned a code.
+        seconds: its duration; None if unknown.
     """
 
     code: int | None = None
@@ -47,18 +47,18 @@ class Ended:
 
 
 class Executor(Protocol):
-    """Runs processes, some of them at once."""
+    """Runs processes, several at a time."""
 
     @property
     def begun(self) -> str:
-        """What is said of a job that it takes."""
+        """Message for a job that the executor has taken."""
 
     def run_all(self, jobs: Sequence[Job], begin: Callable[[int], None], ended: Callable[[int, Ended], None]) -> None:
         """Run jobs in order until all have ended.
 
         Args:
-            jobs: to run.
-            begin: called with the number of a job just before it is taken.
+            jobs: jobs to run.
+            begin: called with the number of a job just before the executor takes it.
             ended: called with the number of a job and how it ended.
 
         Raises:
@@ -82,12 +82,12 @@ def start(job: Job) -> subprocess.Popen[bytes]:
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # Ctrl-C comes from us, once: a second one would end it without a trace
+            start_new_session=True,  # only we pass Ctrl-C on: a second one would end it at once
         )
 
 
 def end(processes: Collection[subprocess.Popen[bytes]]) -> None:
-    """Ask processes to stop, and kill those that do not; a second request to stop kills at once."""
+    """Ask processes to stop, and kill those that do not; a second stop request kills immediately."""
     for process in processes:
         process.terminate()
     until_s = time.monotonic() + GRACE_S
@@ -100,12 +100,12 @@ def end(processes: Collection[subprocess.Popen[bytes]]) -> None:
 
 
 def ended_with(code: int, seconds: float, remedy: str) -> Ended:
-    """How a process ended, by what the system says of it.
+    """How a process ended, by its exit code.
 
     Args:
-        code: exit code; below zero the signal that ended it.
-        seconds: that it took.
-        remedy: what to do where it lacked memory.
+        code: exit code; if negative, minus the signal that ended the process.
+        seconds: its duration.
+        remedy: advice if it lacked memory.
     """
     if code >= 0:
         return Ended(code=code, seconds=seconds)

@@ -81,14 +81,14 @@ def _row(one: Outcome, out_dir: Path) -> str:
 
 
 def _verdict(one: Outcome, out_dir: Path) -> str:
-    """The word, leading to the page of the session where there is one."""
+    """The verdict, as a link to the report of the session if there is one."""
     word = f'<span class="{one.verdict.replace(" ", "-")}">{escape(one.verdict)}</span>'
     report = figure_path(one.session, out_dir, REPORT)
     return f'<a href="{_link(report, out_dir)}">{word}</a>' if report.is_file() else word
 
 
 def _why(one: Outcome, out_dir: Path) -> str:
-    """The reasons; beside those of a failure a link to what the run said."""
+    """The reasons; for a failure also a link to the log of the run."""
     words = escape("; ".join(one.reasons))
     log = log_path(one.session, out_dir)
     if one.verdict != FAILED or not log.is_file():
@@ -97,7 +97,7 @@ def _why(one: Outcome, out_dir: Path) -> str:
 
 
 def _picture(one: Outcome, out_dir: Path) -> str:
-    """The small picture, leading to the large one; empty where there is none."""
+    """The thumbnail, as a link to the large picture; empty without a picture."""
     large, small = figure_path(one.session, out_dir), figure_path(one.session, out_dir, THUMBNAIL)
     if not large.is_file():
         return ""

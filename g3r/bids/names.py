@@ -1,4 +1,4 @@
-"""File names of BIDS, taken apart: entities (`run-1`) and words (`T2w`)."""
+"""BIDS file names, split into entities (`run-1`) and words (`T2w`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NIFTI_ENDINGS = (".nii.gz", ".nii")
 
 @dataclass(frozen=True)
 class BidsName:
-    """A file name.
+    """A parsed file name.
 
     Args:
         entities: label by key, in the order of the name.
@@ -25,7 +25,7 @@ class BidsName:
 
     @property
     def scan(self) -> frozenset[tuple[str, str]]:
-        """The entities that a scan and what was made of it share; run-01 is run-1."""
+        """The entities that a scan shares with its derivatives; run-01 equals run-1."""
         return frozenset(
             (key, label.lstrip("0") or "0" if key == "run" and label.isdigit() else label)
             for key, label in self.entities.items()
@@ -34,14 +34,14 @@ class BidsName:
 
 
 def parsed_name(path: Path) -> BidsName | None:
-    """The parts of the name of a NIfTI file; None where it is not named as BIDS wants it."""
+    """The parts of the name of a NIfTI file; None if it is not a BIDS name."""
     ending = next((one for one in NIFTI_ENDINGS if path.name.endswith(one)), None)
     name = None if ending is None else parsed_stem(path.name.removesuffix(ending))
     return name if name is not None and "sub" in name.entities else None
 
 
 def parsed_stem(stem: str) -> BidsName | None:
-    """The parts of a name without its ending, which need not name a participant; None where it ends in no suffix."""
+    """The parts of a name without its ending; it may lack a participant. None if it does not end in a suffix."""
     entities: dict[str, str] = {}
     words = []
     parts = stem.split("_")

@@ -1,4 +1,4 @@
-"""What became of a session: what its record says, or why it failed."""
+"""Outcome of a session: the verdict of its record, or why it failed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Outcome:
     """A row of participants_g3r.tsv.
 
     Attributes:
-        session: of the data set.
-        verdict: that of run.json, "failed" or "not run".
-        seconds: of the run.
+        session: session of the data set.
+        verdict: verdict of run.json, or "failed" or "not run".
+        seconds: duration of the run.
         n_stacks, n_slices, n_used: stacks in the volume, slices of all stacks, and slices of at least half the full
             weight.
-        unseen_share: of the brain.
-        reasons: of the verdict; why it failed.
+        unseen_share: unseen share of the brain.
+        reasons: reasons of the verdict or of the failure.
     """
 
     session: Session
@@ -42,28 +42,28 @@ class Outcome:
 
 
 def log_path(session: Session, out_dir: Path) -> Path:
-    """What its last run said."""
+    """Path of the log of the session's last run."""
     return out_dir / LOGS / f"{_plain(session)}.log"
 
 
 def failure_path(session: Session, out_dir: Path) -> Path:
-    """Why its last run failed; absent where it did not."""
+    """Path of the reason why the session's last run failed; the file is absent if it did not fail."""
     return out_dir / LOGS / f"{_plain(session)}.failure.json"
 
 
 def _plain(session: Session) -> str:
-    """A name that readers of BIDS do not take for a file of the session: who failed is not in the data set."""
+    """A name that BIDS readers do not take for a file of the session: failed sessions are not in the data set."""
     return f"g3r-{session.stem.replace('_', '-')}"
 
 
 def write_failure(session: Session, out_dir: Path, reason: str, seconds: float | None) -> None:
-    """Keep why a run failed.
+    """Write down why a run failed.
 
     Args:
-        session: that failed.
+        session: the failed session.
         out_dir: the derivative data set.
         reason: one line.
-        seconds: that it took; None where nobody could tell.
+        seconds: its duration; None if unknown.
 
     Raises:
         OSError: it cannot be written.
@@ -74,7 +74,7 @@ def write_failure(session: Session, out_dir: Path, reason: str, seconds: float |
 
 
 def outcome_of(session: Session, out_dir: Path) -> Outcome:
-    """What became of a session by what lies in the derivative data set."""
+    """The outcome of a session, from the files in the derivative data set."""
     failure, record = failure_path(session, out_dir), record_path(session, out_dir)
     try:
         if failure.exists():
@@ -84,7 +84,7 @@ def outcome_of(session: Session, out_dir: Path) -> Outcome:
             )
         if record.exists():
             return _of_record(session, read_object(record), record.name)
-    except (InputError, AttributeError, TypeError) as error:  # somebody changed the file
+    except (InputError, AttributeError, TypeError) as error:  # the file was edited
         return Outcome(session=session, verdict=FAILED, reasons=(f"{error}; run it again with --force",))
     return Outcome(session=session, verdict=NOT_RUN)
 

@@ -1,4 +1,4 @@
-"""A bounded number of processes at once, which end when the one that started them is asked to stop."""
+"""A pool that runs a limited number of processes at a time, and ends them on a stop request."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from g3r.bids.executor import Ended, Job, end, ended_with, start
 from g3r.run.machine import available_bytes, available_cores
 
 NEEDED_BYTES = 1_500_000_000
-"""Of one run of g3r-infer: with fine stacks and the usual presets 1 to 1.5 GB."""
+"""Memory of one run of g3r-infer; with fine stacks and the usual presets it takes 1 to 1.5 GB."""
 
 POLL_S = 0.05
 
 
 def default_jobs(needed_bytes: int = NEEDED_BYTES) -> int:
-    """Processes for this machine: half its cores, and no more than memory is free for; at least one.
+    """Number of processes for this machine: half its cores, and no more than fit into free memory; at least one.
 
     Args:
-        needed_bytes: of each process.
+        needed_bytes: memory of each process.
     """
     return max(1, min(available_cores() // 2, available_bytes() // needed_bytes))
 
 
 def threads_each(n_jobs: int) -> int:
-    """Threads for each of some processes: its share of the cores, and no more than numba's environment allows."""
+    """Threads for each process: its share of the cores, and at most NUMBA_NUM_THREADS."""
     limit = os.environ.get("NUMBA_NUM_THREADS", "")
     share = max(1, available_cores() // n_jobs)
     return min(share, int(limit)) if limit.isdigit() and int(limit) else share
@@ -38,7 +38,7 @@ class LocalPool:
     """An executor on this machine.
 
     Args:
-        n_jobs: processes at once, at most.
+        n_jobs: largest number of processes at a time.
     """
 
     n_jobs: int

@@ -1,4 +1,4 @@
-"""Sidecars that a stack inherits: a JSON file of a folder above holds for all files whose names have its entities."""
+"""Inherited sidecars: a JSON file in a folder above holds for all files whose names have its entities."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from g3r.bids.names import parsed_name, parsed_stem
 
 
 def inherited(stack: Path, bids_dir: Path) -> dict[str, Any] | None:
-    """The keys that g3r reads and that hold for a stack, nearer files first; None where no file above has any.
+    """The sidecar keys of a stack that g3r reads, nearer files first; None if no file but its own has any.
 
-    g3r-infer reads the file beside a stack by itself. Other keys may name the patient, and are not carried on.
+    g3r-infer reads the file beside a stack itself. Other keys may name the patient and are not copied.
 
     Args:
-        stack: in the data set.
+        stack: a stack of the data set.
         bids_dir: the data set.
 
     Raises:
-        InputError: a file that cannot be read.
+        InputError: a sidecar cannot be read.
     """
     name = parsed_name(stack)
     assert name is not None
@@ -46,9 +46,9 @@ def with_sidecar(stack: Path, keys: dict[str, Any], folder: Path) -> Path:
     """A link to a stack in another folder, with a sidecar beside it; returns its path.
 
     Args:
-        stack: to link to.
-        keys: of the sidecar.
-        folder: to write.
+        stack: file to link to.
+        keys: content of the sidecar.
+        folder: folder of the link.
 
     Raises:
         OSError: it cannot be written.

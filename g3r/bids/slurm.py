@@ -1,4 +1,4 @@
-"""Job arrays of Slurm, one task for each session; submitit writes their scripts and brings back how they ended."""
+"""Job arrays of Slurm, one task per session; submitit writes their scripts and returns how they ended."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from g3r.bids.slurm_request import SlurmRequest
 from g3r.errors import InputError
 
 LONGEST_ARRAY = 1000
-"""Tasks of an array: Slurm allows 1001 unless told otherwise. Further ones follow when it has ended."""
+"""Most tasks of an array: Slurm's default limit is 1001. Further tasks follow in another array after its end."""
 
 POLL_S, LONGEST_POLL_S = 1.0, 10.0
-"""Between two looks for results: for up to a hundred jobs, and at most."""
+"""Seconds between two checks for results: for up to a hundred jobs, and at most."""
 
 LATE_S = 60.0
-"""For a result to be seen here after Slurm says that its job has ended: network file systems take their time."""
+"""Seconds to wait for a result after Slurm says that its job has ended, because network file systems are slow."""
 
 SIGNAL_BEFORE_S = 90
-"""Slurm's signal comes this long before the limit of time: enough to end a step and write what there is."""
+"""Time of Slurm's signal before the time limit: enough to end a step and write the result so far."""
 
 BESIDE_BYTES = 200_000_000
-"""Of the process of submitit's that waits beside that of a session."""
+"""Memory of submitit's process, which waits beside the process of a session."""
 
 SIGNALLED = 128
-"""Exit codes above it say that a signal ended a process."""
+"""Exit codes above it mean that a signal ended the process."""
 
 TOLD = ("TIMEOUT", "OUT_OF_MEMORY", "CANCELLED")
-"""States in which Slurm ends a process, and that say more than its exit code."""
+"""States in which Slurm ends a process; they say more than the exit code."""
 
 MORE_MEMORY = "pass more: --slurm ...,mem=SIZE"
 
@@ -49,12 +49,12 @@ class SlurmArrays:
     """An executor on a cluster.
 
     Args:
-        folder: for scripts and results of the jobs, on a file system that all nodes share.
-        request: what sbatch is told.
-        n_jobs: tasks at once; None for as many as Slurm starts.
-        n_cores: of each task.
-        needed_bytes: of memory, of each task, unless the request says it.
-        cluster: as submitit calls it; others than slurm are for tests.
+        folder: folder for scripts and results of the jobs, on a file system that all nodes share.
+        request: resources and options for sbatch.
+        n_jobs: tasks at a time; None for as many as Slurm starts.
+        n_cores: cores of each task.
+        needed_bytes: memory of each task, unless the request states it.
+        cluster: submitit's name of the cluster; other values than slurm are for tests.
     """
 
     folder: Path
@@ -80,16 +80,16 @@ class SlurmArrays:
             for number in numbers:
                 begin(number)
             self._wait_for(dict(zip(numbers, self._submit([jobs[n] for n in numbers]), strict=True)), note)
-        if not any_lost:  # else what Slurm said there is worth a look
+        if not any_lost:  # else Slurm's output there is worth a look
             shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):
             self.folder.parent.rmdir()  # only where empty
 
     def _make_way(self) -> None:
-        """Remove what an earlier run left.
+        """Remove files of an earlier run.
 
         Raises:
-            InputError: its jobs are not done.
+            InputError: jobs of the earlier run are not done.
         """
         active = active_among(path.name.split("_")[0] for path in self.folder.glob("*_submitted.pkl"))
         if active:
@@ -104,15 +104,15 @@ class SlurmArrays:
         """Submit an array.
 
         Raises:
-            InputError: Slurm is not here, or refuses it.
+            InputError: Slurm is not installed, or refuses the array.
         """
         said = StringIO()
         try:
-            with redirect_stderr(said):  # submitit repeats there what its error says
+            with redirect_stderr(said):  # submitit also prints its error message there
                 executor = submitit.AutoExecutor(self.folder, cluster=self.cluster)
                 executor.update_parameters(**self._parameters(len(jobs)))
                 submitted = executor.map_array(run_job, jobs)
-        except RuntimeError as error:  # submitit's errors are of this kind
+        except RuntimeError as error:  # the class of submitit's errors
             lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
             raise InputError(f"--slurm: no job was taken ({lines[0]}); check the words after --slurm") from None
         if self.cluster != "slurm":
@@ -120,7 +120,7 @@ class SlurmArrays:
         return [QueueJob(folder=job.paths.folder, job_id=job.job_id) for job in submitted]
 
     def _parameters(self, n_tasks: int) -> dict[str, Any]:
-        """What submitit and sbatch are told of an array."""
+        """Parameters of an array for submitit and sbatch."""
         mebibytes = math.ceil((self.needed_bytes + BESIDE_BYTES) / 2**20)
         resources = {"cpus-per-task": str(self.n_cores), "mem": f"{mebibytes}M"}
         return {
@@ -128,12 +128,12 @@ class SlurmArrays:
             "timeout_min": self.request.minutes,
             "slurm_array_parallelism": self.n_jobs or n_tasks,
             "slurm_signal_delay_s": SIGNAL_BEFORE_S,
-            "slurm_srun_args": [f"--cpus-per-task={self.n_cores}"],  # which srun takes no longer from sbatch
+            "slurm_srun_args": [f"--cpus-per-task={self.n_cores}"],  # srun no longer takes it from sbatch
             "slurm_additional_parameters": resources | dict(self.request.options),
         }
 
     def _wait_for(self, running: dict[int, Any], ended: Callable[[int, Ended], None]) -> None:
-        """Report jobs as they end; a request to stop cancels those that are left."""
+        """Report jobs as they end; a stop request cancels the remaining ones."""
         over_s: dict[int, float] = {}
         try:
             while running:
@@ -150,11 +150,11 @@ class SlurmArrays:
             self._cancel(list(running.values()))
 
     def _how(self, job: Any, waits: bool) -> Ended | None:
-        """How a job ended; None where its result may still come.
+        """How a job ended; None if its result may still come.
 
         Args:
-            job: of submitit, that is done.
-            waits: whether it ended just now.
+            job: submitit's job, which is done.
+            waits: whether it ended less than `LATE_S` ago.
         """
         if self.cluster == "slurm" and not job.paths.result_pickle.exists():
             return None if waits and job.state in ("COMPLETED", "FAILED", GONE) else self._lost(job, job.state)
@@ -170,11 +170,11 @@ class SlurmArrays:
         return how
 
     def _lost(self, job: Any, state: str) -> Ended:
-        """A job without a result, by what Slurm says of it.
+        """How a job without a result ended, by its state in Slurm and its output.
 
         Args:
-            job: of submitit.
-            state: of Slurm.
+            job: submitit's job.
+            state: its state in Slurm.
         """
         said = (job.stderr() or "").strip()
         if state == "TIMEOUT" or "TIME LIMIT" in said:
@@ -189,7 +189,7 @@ class SlurmArrays:
         return Ended(lost=f"job {job.job_id} {words}")
 
     def _cancel(self, jobs: Sequence[Any]) -> None:
-        """Cancel jobs, and wait until no process is left."""
+        """Cancel jobs, and wait at most `GRACE_S` and `POLL_S` until no process is left."""
         for job in {job.job_id.split("_")[0]: job for job in jobs}.values():
             job.cancel(check=False)
         until_s = time.monotonic() + GRACE_S + POLL_S
@@ -200,10 +200,10 @@ class SlurmArrays:
 
 
 def run_job(job: Job) -> Ended:
-    """Run a job where Slurm put it; a signal that time is up asks it to stop."""
+    """Run a job on its Slurm node; Slurm's signal before the time limit asks it to stop."""
     began_s = time.monotonic()
     try:
-        # Slurm's signal goes to all processes of the task: this one tells the other what to do
+        # Slurm signals all processes of the task; the child ignores it, and this process asks it to stop
         before = signal.signal(signal.SIGUSR2, signal.SIG_IGN)
         try:
             process = start(job)

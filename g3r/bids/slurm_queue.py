@@ -1,7 +1,7 @@
-"""Jobs of Slurm as submitit has them, with their states by squeue.
+"""Slurm jobs of submitit with their states from squeue.
 
-submitit asks sacct, which needs an accounting data base that not every cluster has; without it a job that was killed
-would seem to run for ever. squeue still lists a job for some minutes after its end.
+submitit asks sacct, which needs an accounting data base that not every cluster has; without it a killed job would
+seem to run for ever. squeue still lists a job for some minutes after its end.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from contextlib import suppress
 from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
 GONE = "GONE"
-"""State of a job that squeue does not know any more."""
+"""State of a job that squeue no longer lists."""
 
 LIST = ("squeue", "--noheader", "--array", "--states=all", "--format=%i|%T")
 
 ACTIVE = {"PENDING", "CONFIGURING", "RUNNING", "COMPLETING", "REQUEUED", "REQUEUE_HOLD", "SUSPENDED", "RESIZING"}
 
 LONGEST_WAIT_S = 30
-"""Between two calls of squeue; the first ones follow each other more closely."""
+"""Longest time between two calls of squeue; the first calls follow each other faster."""
 
 
 class QueueWatcher(SlurmInfoWatcher):
-    """States of all jobs by one call."""
+    """Reads the states of all jobs by one call of squeue."""
 
     def _make_command(self) -> list[str] | None:
         waited_for = self._registered - self._finished
         return [*LIST, f"--user={os.getuid()}"] if waited_for else None
 
     def read_info(self, string: bytes | str) -> dict[str, dict[str, str]]:
-        """States of the jobs that are waited for, by what squeue printed."""
+        """States of the jobs under watch, from the output of squeue."""
         states = _states(string if isinstance(string, str) else string.decode(errors="replace"))
         return {job_id: {"State": states.get(job_id, GONE)} for job_id in self._registered - self._finished}
 
@@ -48,7 +48,7 @@ class QueueJob(SlurmJob):
     watcher = QueueWatcher(delay_s=LONGEST_WAIT_S)
 
     def done(self, force_check: bool = False) -> bool:
-        """Whether its result is there or Slurm says that it has ended; nothing is written to look."""
+        """Whether its result is there, or Slurm says that it has ended; the check writes nothing."""
         return self.paths.result_pickle.exists() or self.watcher.is_done(self.job_id)
 
     def cancel(self, check: bool = True) -> None:
@@ -59,7 +59,7 @@ class QueueJob(SlurmJob):
 
 
 def active_among(array_ids: Iterable[str]) -> list[str]:
-    """Those of some jobs and arrays that Slurm has not ended yet; none where it cannot be asked."""
+    """Ids of the given jobs and arrays that are still active; none if squeue cannot be asked."""
     try:
         said = subprocess.run(
             [*LIST, f"--user={os.getuid()}"], capture_output=True, text=True, check=True, timeout=60
@@ -71,5 +71,5 @@ def active_among(array_ids: Iterable[str]) -> list[str]:
 
 
 def _states(text: str) -> dict[str, str]:
-    """States by job in what squeue printed."""
+    """States by job, from the output of squeue."""
     return dict(line.strip().split("|", 1) for line in text.splitlines() if "|" in line)

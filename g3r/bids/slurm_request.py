@@ -1,4 +1,4 @@
-"""What `--slurm partition=NAME[,key=value...]` asks for: the options of sbatch, those apart that g3r-bids decides."""
+"""The request `--slurm partition=NAME[,key=value...]`: options of sbatch, without those that g3r-bids decides."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ DECIDED = {
 """Options of sbatch that cannot be passed, and why."""
 
 MINUTES = 120
-"""Until a session is ended, unless `time` says otherwise; the longest preset takes 10 minutes on two cores."""
+"""Default time limit of a session, without `time`; the longest preset takes 10 minutes on two cores."""
 
 CORES = 2
-"""Of each session, unless `cpus_per_task` or --threads says otherwise."""
+"""Default cores of each session, without `cpus_per_task` and --threads."""
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<clock>\d+(?::\d+){0,2})")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlurmRequest:
-    """Resources of one session, and what else sbatch is told.
+    """Resources of one session, and further options of sbatch.
 
     Attributes:
-        minutes: until it is ended.
-        n_cores: of its task; None for what the options of g3r-infer say.
-        options: of sbatch, by name without dashes in front.
+        minutes: time limit.
+        n_cores: cores of its task; None for the number in the options of g3r-infer.
+        options: options of sbatch, by name without leading dashes.
     """
 
     minutes: int = MINUTES
@@ -47,7 +47,7 @@ def parsed_request(text: str) -> SlurmRequest:
     """The request in words `key=value,key=value`; a key may be written with `_` or `-`.
 
     Raises:
-        ValueError: a word without a value, a key that is not for the user to decide, no time, no number of cores.
+        ValueError: a word lacks a value, a key is in `DECIDED`, the time or the number of cores is invalid.
     """
     options: dict[str, str] = {}
     for word in text.split(","):
@@ -66,10 +66,10 @@ def parsed_request(text: str) -> SlurmRequest:
 
 
 def _minutes(text: str) -> int:
-    """Minutes in Slurm's ways of saying a time: 90, 90:00, 1:30:00; behind days hours come first: 1-12, 1-12:30.
+    """Minutes from Slurm's time formats: 90, 90:00, 1:30:00; after days hours come first: 1-12, 1-12:30.
 
     Raises:
-        ValueError: it is no time.
+        ValueError: the text is not a time.
     """
     found = TIME.fullmatch(text)
     if not found or not any(map(int, re.findall(r"\d+", text))):

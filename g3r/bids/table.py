@@ -1,4 +1,4 @@
-"""participants_g3r.tsv: a row for each session of the data set."""
+"""participants_g3r.tsv: one row per session of the data set."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS = {
 
 
 def write_table(outcomes: Sequence[Outcome], out_dir: Path) -> Path:
-    """Write the table and what its columns mean; returns the table's path.
+    """Write the table and the descriptions of its columns; returns the table's path.
 
     Raises:
         OSError: it cannot be written.

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 
 def thumbnail(volume: Path) -> bytes:
-    """A PNG of axial, coronal and sagittal sections through the middle of a volume, a pixel for each voxel.
+    """A PNG of axial, coronal and sagittal sections through the middle of a volume, one pixel per voxel.
 
     The patient's right is on the left, as in the large picture.
 
     Args:
-        volume: a NIfTI file, dark beside the brain.
+        volume: a NIfTI file, 0 outside the brain.
 
     Raises:
         OSError: it cannot be read.
@@ -26,7 +26,7 @@ def thumbnail(volume: Path) -> bytes:
     image = nib.as_closest_canonical(nib.Nifti1Image.from_filename(volume))
     data = np.nan_to_num(np.asarray(image.dataobj, dtype=np.float32))
     i, j, k = _middle(data)
-    # axes of canonical data point right, forward and up: both axes of a section are turned to those of a screen
+    # canonical axes point right, forward and up; flip both axes of a section for the screen
     sections = [data[:, :, k].T[::-1, ::-1], data[:, j].T[::-1, ::-1], data[i].T[::-1, ::-1]]
     height = max(section.shape[0] for section in sections)
     row = np.concatenate([_padded(section, height) for section in sections], axis=1)
@@ -38,7 +38,7 @@ def thumbnail(volume: Path) -> bytes:
 
 
 def _middle(data: NDArray[np.float32]) -> list[int]:
-    """The voxel [3] in the middle of what is bright; of the grid where nothing is."""
+    """The voxel [3] in the middle of the positive voxels; of the grid if there are none."""
     found = np.argwhere(data > 0)
     if not len(found):
         return [n // 2 for n in data.shape]

@@ -1,4 +1,4 @@
-"""Rigid transforms as ITK's text files."""
+"""Rigid transforms in ITK's text format."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 def itk_text(standard_from_scanner: Sequence[Sequence[float]]) -> str:
     """The text of a transform that resamples images of the scanner's space into standard orientation.
 
-    ITK resamples by asking where a point of the new image lies in the old one: the file maps points of the standard
+    ITK resamples by looking up each point of the new image in the old one, so the file maps points of the standard
     space to the scanner's.
 
     Args:

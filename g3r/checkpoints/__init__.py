@@ -1,1 +1,1 @@
-"""Exported weights: the one reader and writer of files that may come from anywhere."""
+"""Exported weights: the only reader and writer of these files, which may come from any source."""

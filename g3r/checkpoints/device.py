@@ -1,4 +1,4 @@
-"""Where the networks compute; the rest of a reconstruction always uses the CPU."""
+"""The device of the networks; the rest of a reconstruction always uses the CPU."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def device_of(name: str) -> str:
-    """Where networks are to compute, "cuda" or "cpu".
+    """The device for networks, "cuda" or "cpu".
 
     Args:
-        name: "cpu", "cuda", or "auto", which takes a GPU where torch finds one.
+        name: "cpu", "cuda", or "auto", which takes a GPU if torch finds one.
 
     Raises:
-        InputError: "cuda" where torch finds no GPU, or another name.
+        InputError: "cuda" without a GPU that torch finds, or an unknown name.
     """
     if name not in DEVICES:
         raise InputError(f"device {name!r}; expected {', '.join(DEVICES)}")
@@ -33,7 +33,7 @@ def device_of(name: str) -> str:
 
 
 def knows_no_gpu() -> bool:
-    """Whether there is no GPU for torch, as far as can be told without importing it."""
+    """Whether there is certainly no GPU for torch; determined without importing it."""
     build = version("torch")
     if sys.platform == "darwin" or build.endswith("+cpu"):
         return True
@@ -50,7 +50,7 @@ def has_cuda_driver() -> bool:
 
 
 def is_bfloat16_fast(device_type: str) -> bool:
-    """Whether a device computes in bfloat16; where a CPU only imitates it, a step takes ten times as long."""
+    """Whether a device has native bfloat16; on a CPU that emulates it a step takes ten times as long."""
     if device_type != "cpu":
         return True
     can = torch.cpu.get_capabilities()

@@ -1,4 +1,4 @@
-"""Plain values of a description that may come from anywhere: taken only where type and range are right."""
+"""Plain values from a description of unknown origin, accepted only if type and range are right."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 Config = TypeVar("Config")
 
 MAX_TEXT = 10_000
-"""Characters of a description."""
+"""Most characters of a text in a description."""
 MAX_NUMBER = 1e30
 MAX_LIST = 16
-"""Entries of an argument that is a list: levels of a network, axes of a template."""
+"""Most entries of an argument that is a list: levels of a network, axes of a template."""
 
 
 def config_from_plain(kind: type[Config], found: object) -> Config:
-    """A record of network arguments from plain values: all of them, each of its type.
+    """Network arguments as a record, from plain values: all of them, each of its type.
 
     Args:
         kind: dataclass whose fields are bool, int, float or tuples of int.
-        found: what a file or a training wrote.
+        found: plain values that a file or a training holds.
 
     Raises:
-        TypeError: no dict, or a value of another type.
-        ValueError: names that are missing or unknown, a long list, or values out of range.
+        TypeError: it is not a dict, or a value has another type.
+        ValueError: names are missing or unknown, a list is too long, or values are out of range.
     """
     if not isinstance(found, Mapping) or not all(isinstance(name, str) for name in found):
         raise TypeError("network arguments are not named")
@@ -42,7 +42,7 @@ def _argument(name: str, kind: Any, value: Any) -> object:
     if is_list != isinstance(value, list | tuple) or not all(type(one) in allowed for one in values):
         expected = f"a list of {wanted.__name__}" if is_list else wanted.__name__
         raise TypeError(f"network argument {name} is {shown(value)}, expected {expected}")
-    if len(values) > MAX_LIST or not all(abs(one) <= MAX_NUMBER for one in values):  # NaN is not
+    if len(values) > MAX_LIST or not all(abs(one) <= MAX_NUMBER for one in values):  # false for NaN
         raise ValueError(f"network argument {name} is {shown(value)}, out of bounds")
     return tuple(values) if is_list else wanted(value)
 
@@ -85,7 +85,7 @@ def one_line(error: BaseException) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in a message, kept short."""
+    """A value for a message, shortened."""
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**30):
         return repr(value)
     return repr(value[:60]) if isinstance(value, str) else f"a {type(value).__name__}"

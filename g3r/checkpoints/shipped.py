@@ -1,4 +1,4 @@
-"""The weights that are part of the package: the usual set, and sets with a name of their own."""
+"""The weights that ship with the package: the usual set, and named sets."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from g3r.checkpoints.weights_file import SUFFIX
 WEIGHTS = Path(__file__).parent / "weights"
 
 SET_NAMES = ("cc0",)
-"""Named sets hold a file of each kind. `cc0` is trained on data in the public domain alone; the usual set is not."""
+"""Names of further sets of weights. `cc0` is trained on data in the public domain alone; the usual set is not."""
 
 
 def weights_path(source: str | os.PathLike[str] | None, kind: str) -> Path:
-    """The file that is meant by a path, by the name of a set, or by None, which is the usual set.
+    """The file of a source: a path, the name of a set, or None for the usual set.
 
     Args:
-        source: as the user gave it.
+        source: as given by the user.
         kind: "prior", "pose" or "mask".
     """
     if source is None:
@@ -28,5 +28,5 @@ def weights_path(source: str | os.PathLike[str] | None, kind: str) -> Path:
 
 
 def set_of(source: object) -> str | None:
-    """The name of a set, if it is one: who names it for one kind of weights means it for all."""
+    """The source if it is the name of a set: a set named for one kind of weights applies to all kinds."""
     return source if isinstance(source, str) and source in SET_NAMES else None

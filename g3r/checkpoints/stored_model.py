@@ -1,4 +1,4 @@
-"""An exported network that is loaded when it is needed, or ahead of that: what its file says is known before."""
+"""An exported network that is loaded on demand or in advance; the description in its file is read at once."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 Model = TypeVar("Model", bound="TrainedModel")
 
 OF_THE_FILE = ("format", "format_version", "weights_sha256")
-"""Entries of a description that are about the file, not the network."""
+"""Entries of a description about the file rather than the network."""
 
 
 class StoredModel(Generic[Model]):
-    """A network in its file.
+    """A network in its file, loaded on demand.
 
     Weights that ship with the package are loaded on demand: torch and the network's libraries take seconds to import.
-    In another file anything may be wrong, which is said at once.
+    Other files are loaded at once, so that any error in them shows immediately.
 
     Args:
         source: see `TrainedModel.load`.
-        kind: of the file: "prior".
-        load: the network of a file, on its device.
+        kind: kind of the file, such as "prior".
+        load: builds the network of a file, on its device.
 
     Raises:
         InputError: see `TrainedModel.load`.
@@ -53,11 +53,11 @@ class StoredModel(Generic[Model]):
 
     @property
     def model(self) -> Model:
-        """The network, loaded now if it was not."""
+        """The network, loaded now if it is not loaded yet."""
         return self._model.value()
 
     def start(self) -> None:
-        """Begin to load the network, beside what the caller does next."""
+        """Start loading the network in a background thread."""
         self._model.start()
 
     def record(self) -> dict[str, Any]:
@@ -65,7 +65,7 @@ class StoredModel(Generic[Model]):
         return {name: fact for name, fact in self.file.description.items() if name not in OF_THE_FILE}
 
     def array(self, name: str) -> NDArray[np.float32]:
-        """One of the weights, without torch."""
+        """One of the weights, read without torch."""
         from safetensors.numpy import load
 
         return load(self.file.content)[name].astype(np.float32)

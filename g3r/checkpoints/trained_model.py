@@ -1,4 +1,4 @@
-"""A trained network with the facts that its file carries: what priors and pose networks have in common."""
+"""A trained network with the facts in its file: the common base of prior, pose and mask networks."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 2
 
 TRAINING_ENTRY = "g3r_export"
-"""Entry of a Lightning checkpoint that holds, in plain values, what an export needs apart from the weights."""
+"""Entry of a Lightning checkpoint that holds, as plain values, the facts that an export needs besides the weights."""
 
 DAMAGED = "copy or export it again"
 
 
 class NetworkConfig(Protocol):
-    """A frozen dataclass with the arguments of a network; it refuses what is out of range with `ValueError`."""
+    """A frozen dataclass with the arguments of a network; it raises `ValueError` for values out of range."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -40,17 +40,17 @@ class NetworkConfig(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedModel:
-    """A trained network and what its file says about it.
+    """A trained network and the facts in its file.
 
-    A subclass is one kind of file. It names the kind, its network and what else has to be known to use it.
+    A subclass is one kind of file. It defines the kind, the class of the network, and further facts needed to use it.
 
     Attributes:
-        network: on the CPU, in evaluation mode; its `config` holds its arguments.
-        training_data: what it was trained on, in words.
+        network: the network, on the CPU and in evaluation mode; its `config` holds its arguments.
+        training_data: its training data, in words.
         validation: named scores, for example {"val/psnr_prior": 31.2}.
         g3r_version: version of g3r that exported it.
-        file_name: name of the file that it was read from, without its folder; empty where there is none.
-        file_sha256: of that file's bytes.
+        file_name: name of the file that it was read from, without its folder; empty if there is none.
+        file_sha256: SHA-256 of that file's bytes.
     """
 
     network: Any
@@ -68,7 +68,7 @@ class TrainedModel:
 
     @classmethod
     def own_facts(cls, description: Mapping[str, Any]) -> dict[str, Any]:
-        """The subclass's own attributes from a description; raises what `number` and `text` raise."""
+        """The subclass's own attributes, from a description; raises as `number` and `text` do."""
         raise NotImplementedError
 
     def own_description(self) -> dict[str, Any]:
@@ -106,7 +106,7 @@ class TrainedModel:
         Raises:
             InputError: the file cannot be written.
         """
-        # row-major float32 on the CPU: memory formats are a matter of the machine
+        # row-major float32 on the CPU, because memory formats depend on the machine
         tensors = {
             name: self.stored(
                 name, value.detach().to("cpu", torch.float32).clone(memory_format=torch.contiguous_format)
@@ -119,15 +119,15 @@ class TrainedModel:
 
     @classmethod
     def load(cls, source: str | os.PathLike[str] | WeightsFile | None = None) -> Self:
-        """Read an exported file. Nothing in it is executed, and everything it claims is checked.
+        """Read an exported file. Nothing in it is executed, and all its entries are checked.
 
         Args:
             source: path of a file written by `save`, or that file as `read_weights` gives it; the name of a set of
                 weights that ships with the package (`SET_NAMES`), or None for the usual one.
 
         Raises:
-            InputError: missing, of another kind, format version or convention, damaged, with weights that do not
-                fit the network, or with values that make no sense.
+            InputError: the file is missing, damaged or of another kind, format version or convention, its weights do
+                not fit the network, or values make no sense.
         """
         file = source if isinstance(source, WeightsFile) else read_weights(weights_path(source, cls.kind), cls.kind)
         description = file.description
@@ -152,16 +152,16 @@ class TrainedModel:
 
     @classmethod
     def from_training(cls, entry: Mapping[str, Any], weights: Mapping[str, Tensor], training_data: str) -> Self:
-        """The model that a training has made.
+        """The model from the result of a training.
 
         Args:
-            entry: what the training wrote under `TRAINING_ENTRY`.
-            weights: of the network, by name.
-            training_data: in words.
+            entry: the training's entry `TRAINING_ENTRY`.
+            weights: weights of the network, by name.
+            training_data: its training data, in words.
 
         Raises:
             KeyError: an entry is missing.
-            TypeError, ValueError, RuntimeError: entries or weights that do not fit.
+            TypeError, ValueError, RuntimeError: entries or weights do not fit.
         """
         network = cls.network_type(config_from_plain(cls.config_type, entry["network_arguments"]))
         network.load_state_dict(weights)
@@ -182,23 +182,23 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
 
 
 def _check_identity(file: WeightsFile, kind: str, expected: Mapping[str, object]) -> None:
-    """Raise `InputError` for another kind of file, another version of its format, and other conventions."""
+    """Raise `InputError` if kind, format version or conventions of the file differ from the expected ones."""
     path, description = file.path, file.description
     if description.get("format") != f"g3r-{kind}":
         instead = f"format is {shown(description.get('format'))}, expected {f'g3r-{kind}'!r}"
         raise InputError(f"{path}: is not a {kind} checkpoint ({instead}); {another_file(kind)}")
     for key, value in expected.items():
         found = description.get(key)
-        if type(found) is not type(value) or found != value:  # True is not 1
+        if type(found) is not type(value) or found != value:  # True equals 1 otherwise
             name, again = key.replace("_", " "), f"train and export a {kind} with this version of g3r"
             raise InputError(f"{path}: {name} is {shown(found)}, this g3r reads {value!r}; {again}")
 
 
 def _filled(network_type: type[nn.Module], config: NetworkConfig, file: WeightsFile) -> nn.Module:
-    """The network with the file's weights; built only once the file is known to hold enough to fill it.
+    """The network with the file's weights; built only after a check that the file holds enough values for it.
 
     Raises:
-        InputError: names, dtypes or shapes that do not fit, NaN or infinity.
+        InputError: names, dtypes or shapes do not fit, or weights are NaN or infinite.
     """
     try:
         n_values = sum(math.prod(claim.shape) for claim in file.claims.values())
@@ -209,7 +209,7 @@ def _filled(network_type: type[nn.Module], config: NetworkConfig, file: WeightsF
         network.load_state_dict(file.tensors())
     except (G3RError, MemoryError):
         raise
-    except Exception as error:  # a constructor given other numbers than it expects may raise anything
+    except Exception as error:  # a constructor with unexpected values may raise anything
         raise InputError(
             f"{file.path}: weights and network arguments do not fit together ({one_line(error)}); {DAMAGED}"
         ) from error
@@ -220,7 +220,7 @@ def _filled(network_type: type[nn.Module], config: NetworkConfig, file: WeightsF
 
 
 def _check_claims(network: nn.Module, file: WeightsFile) -> None:
-    """Raise `ValueError` where the header's tensors are not those of the network."""
+    """Raise `ValueError` if the header's tensors differ from those of the network."""
     expected = network.state_dict()
     wrong = sorted(expected.keys() ^ file.claims.keys())
     if wrong:

@@ -1,6 +1,6 @@
 """The format of exported weights: safetensors, with a JSON description in the header. Nothing in it is executed.
 
-A file may come from anywhere. Its header is read first, and the dtypes, shapes and sizes that it claims must agree
+A file may come from any source. Its header is read first, and the dtypes, shapes and sizes that it claims must agree
 with the length of the file before the rest is read.
 """
 
@@ -27,7 +27,7 @@ DESCRIPTION_KEY = "g3r"
 """Entry of the header's `__metadata__` that holds the description, as JSON."""
 
 MAX_HEADER_BYTES = 1_000_000
-"""Ours have about 30 kB."""
+"""Limit of a header; our files have about 30 kB."""
 MAX_FILE_BYTES = 1_000_000_000
 MAX_AXES = 8
 
@@ -36,7 +36,7 @@ BYTES_PER_VALUE = {"F16": 2, "F32": 4, "I64": 8}
 
 
 class DamagedError(ValueError):
-    """The content of a file is impossible."""
+    """The content of a file is inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class WeightsFile:
     It can be read without torch, and handed to `TrainedModel.load` later.
 
     Attributes:
-        path: of the file.
-        description: what it says about its weights; only known to be a dict.
+        path: path of the file.
+        description: description of the weights; only known to be a dict.
         claims: dtype and shape of each tensor by name; together they fill the file.
-        sha256: of all bytes of the file.
+        sha256: SHA-256 of all bytes of the file.
         content: all bytes of the file.
     """
 
@@ -76,7 +76,7 @@ class WeightsFile:
         """Decode all tensors.
 
         Raises:
-            DamagedError: offsets that overlap or leave gaps.
+            DamagedError: offsets overlap or leave gaps.
         """
         from safetensors import SafetensorError
         from safetensors.torch import load
@@ -91,11 +91,11 @@ def read_weights(path: Path, kind: str) -> WeightsFile:
     """Read a file of exported weights; open and hash it once.
 
     Args:
-        path: to read.
-        kind: what the file should be, for the message: "prior".
+        path: file to read.
+        kind: expected kind of the file, for messages, such as "prior".
 
     Raises:
-        InputError: missing, unreadable, of another format, or with a header that does not fit the file.
+        InputError: the file is missing, unreadable or of another format, or its header does not fit it.
     """
     advice = another_file(kind)
     try:
@@ -143,7 +143,7 @@ def _read(stream: BinaryIO, path: Path, kind: str) -> WeightsFile:
 
 
 def _checked_header(header: bytes) -> tuple[dict[str, Any], dict[str, TensorClaim]]:
-    """The header's metadata and claims; `DamagedError` where it is not one of safetensors."""
+    """The header's metadata and claims; raises `DamagedError` if it is not a safetensors header."""
     entries = _parsed(header)
     metadata = entries.pop("__metadata__", {})
     if not isinstance(metadata, dict):
@@ -163,7 +163,7 @@ def _checked_header(header: bytes) -> tuple[dict[str, Any], dict[str, TensorClai
 
 
 def _parsed(text: object) -> dict[str, Any]:
-    """A JSON object."""
+    """Parse a JSON object."""
     try:
         value = json.loads(text)  # type: ignore[arg-type]
     except (TypeError, ValueError, RecursionError):
@@ -177,7 +177,7 @@ def write_weights(path: Path, description: Mapping[str, Any], tensors: Mapping[s
     """Write a file of weights, whole or not at all; an existing one is replaced.
 
     Args:
-        path: to write.
+        path: file to write.
         description: plain values that JSON can hold.
         tensors: contiguous, on the CPU, of the dtypes in `BYTES_PER_VALUE`.
 
@@ -186,7 +186,7 @@ def write_weights(path: Path, description: Mapping[str, Any], tensors: Mapping[s
     """
     from safetensors.torch import save
 
-    # one entry: the library writes several in random order, and equal weights should be equal bytes
+    # a single entry: the library writes several in random order, and equal weights should give equal bytes
     content = save(dict(tensors), {DESCRIPTION_KEY: json.dumps(description)})
     try:
         with atomic_path(path) as temporary:

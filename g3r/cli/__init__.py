@@ -1,1 +1,1 @@
-"""The commands: one thin file each. They parse, call, print, and turn errors into exit codes."""
+"""The commands, one thin file each: they parse, call, print, and turn errors into exit codes."""

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-apply`: other echoes, contrasts or label maps of the same slices, in the poses of a finished run."""
+"""`g3r-apply`: volumes of other echoes, contrasts or label maps of the same slices, in the poses of a finished run."""
 
 from __future__ import annotations
 

@@ -17,11 +17,11 @@ COMMANDS = {
     "scaling": "time and memory as Gaussians, slices, pixels and voxels grow",
     "trade": "seconds and quality of every preset, and of sweeps around one",
 }
-"""Each has a module of its name in g3r.bench, with `add_arguments(parser)` and `run(options)`."""
+"""Each command has a module of its name in g3r.bench, with `add_arguments(parser)` and `run(options)`."""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The first word of the command; the rest belongs to the one that it names."""
+    """The parser of the command's first word, a subcommand that parses the rest itself."""
     lines = "\n".join(f"  {name:<9} {text}" for name, text in COMMANDS.items())
     parser = argparse.ArgumentParser(
         prog="g3r-bench",

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-bids`: every session of a BIDS data set to a derivative data set, as BIDS Apps are called."""
+"""`g3r-bids`: reconstruct every session of a BIDS data set into a derivative data set, with the usage of BIDS Apps."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from g3r.bids.slurm_request import SlurmRequest
 
 FAILED = 1
-"""Exit code where a session failed; the others are done."""
+"""Exit code if a session failed and the others are done."""
 
 OURS = (
     *("stacks", "masks", "output", "force", "resume", "dry_run", "tensorboard"),
     *("dicom_out", "dicom_reference"),  # one examination for all would put every volume under one patient's name
 )
-"""Options of g3r-infer that this command decides itself, or that make no sense for many."""
+"""Options of g3r-infer that this command decides itself, or that make no sense for several sessions."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -110,7 +110,7 @@ def _slurm_request(text: str) -> SlurmRequest:
 
 
 def _infer_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
-    """The options for g3r-infer; ends the program with 2 where one cannot be."""
+    """The options for g3r-infer; ends the program with 2 if one of them is not allowed."""
     before = {"stacks": ["STACK"], "output": "DIR"}
     infer = parsed_options(["--stacks", "STACK", "--output", "DIR", *words])
     decided = [name for name in OURS if getattr(infer, name) and getattr(infer, name) != before.get(name)]
@@ -169,7 +169,7 @@ def _keeps_stages(infer: argparse.Namespace) -> bool:
 
 
 def _executor(options: argparse.Namespace, infer: argparse.Namespace) -> tuple[Executor, int]:
-    """What runs the processes, and the threads of each.
+    """The executor of the processes, and the number of threads of each.
 
     Raises:
         ModuleNotFoundError: the slurm extra is not installed.
@@ -193,7 +193,7 @@ def _executor(options: argparse.Namespace, infer: argparse.Namespace) -> tuple[E
 
 
 def _table(options: argparse.Namespace, sessions: list[Session]) -> int:
-    """Write the table of all sessions; the exit code tells of those that were asked for."""
+    """Write the table of all sessions; returns the exit code for the requested sessions."""
     from g3r.bids.dataset import find_sessions
     from g3r.bids.index_page import write_index
     from g3r.bids.outcome import FAILED as FAILED_VERDICT

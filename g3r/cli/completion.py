@@ -1,4 +1,4 @@
-"""Help that is read on a terminal, and completion of options by the shell (argcomplete); see docs/terminal.md."""
+"""Help formatted for terminals, and completion of options by the shell (argcomplete); see docs/terminal.md."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ BY_METAVAR = {
     "POSE.safetensors": ("safetensors",),
     "MASK.safetensors": ("safetensors",),
 }
-"""Endings of the files that an option takes, by its name for them; for DIR folders alone are offered."""
+"""Endings of the files that an option takes, by its metavar; DIR completes to folders only."""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of description and examples, and has its headings in bold on a terminal."""
+    """Keeps the line breaks of description and examples, and prints headings in bold on a terminal."""
 
     def __init__(self, prog: str, **options: Any) -> None:
         columns = int(os.environ.get("COLUMNS") or 0) or _columns()

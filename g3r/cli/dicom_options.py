@@ -1,4 +1,4 @@
-"""The options of `g3r-infer` about DICOM, and what they mean."""
+"""The DICOM options of `g3r-infer`, and their implementation."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ logger = logging.getLogger(__name__)
 
 
 AUTO = ["auto"]
-"""Masks of all series are to be found."""
+"""Value of --masks by which the masks of all series are found."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DicomInput:
-    """What a run has to do with DICOM.
+    """DICOM input of a run: the examination, and remarks on its series.
 
     Attributes:
-        study: that the volume is written into; None where it is not.
-        warnings: what a user should know of the series; names nobody.
-        notes: for the record.
+        study: examination that the volume is written into; None if it is not written as DICOM.
+        warnings: warnings about the series, without patient data.
+        notes: remarks for the record.
     """
 
     study: SourceStudy | None = None
@@ -43,7 +43,7 @@ class DicomInput:
 
 
 def add_input_options(parser: argparse._ActionsContainer) -> None:
-    """Where the stacks are: NIfTI files, a folder of DICOM, or one of slices."""
+    """Options for the stacks: NIfTI files, a folder of DICOM, or a folder of slices."""
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--stacks", nargs="+", metavar="NIFTI", help="one file per stack")
     source.add_argument(
@@ -64,7 +64,7 @@ def add_input_options(parser: argparse._ActionsContainer) -> None:
 
 
 def add_dicom_output_options(parser: argparse._ActionsContainer) -> None:
-    """The volume as DICOM."""
+    """Options for the volume as DICOM."""
     parser.add_argument(
         "--dicom-out",
         metavar="DIR",
@@ -79,7 +79,7 @@ def add_dicom_output_options(parser: argparse._ActionsContainer) -> None:
 
 
 def check_dicom_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where options on DICOM cannot go together."""
+    """End the program with 2 if DICOM options cannot be combined."""
     if options.series and not options.dicom:
         parser.error("--series is for --dicom, which is not given")
     if options.dicom_reference and (options.dicom or not options.dicom_out):
@@ -101,14 +101,14 @@ def check_dicom_options(parser: argparse.ArgumentParser, options: argparse.Names
 
 @contextmanager
 def stacks_on_disk(options: argparse.Namespace, *, replaces: bool) -> Iterator[DicomInput]:
-    """Make `options.stacks` the paths of NIfTI files; those that are made of DICOM go when the block ends.
+    """Set `options.stacks` to paths of NIfTI files; files converted from DICOM are removed when the block ends.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         replaces: whether earlier results in the output may be replaced.
 
     Raises:
-        InputError: a folder of DICOM that cannot be used, or DICOM in place of NIfTI.
+        InputError: a folder of DICOM cannot be used, or a stack is DICOM instead of NIfTI.
         ModuleNotFoundError: the dicom extra is not installed.
     """
     if options.dicom_out:
@@ -135,10 +135,10 @@ def stacks_on_disk(options: argparse.Namespace, *, replaces: bool) -> Iterator[D
 
 
 def _chosen(options: argparse.Namespace) -> tuple[list[Judged], list[str]]:
-    """The series that are taken, in the order asked for, and what to know of the others; the table is printed.
+    """The chosen series, in the requested order, and warnings about the others; prints the table of series.
 
     Raises:
-        InputError: none can be taken, or they are not of one examination.
+        InputError: no series can be taken, or they are not of one examination.
     """
     from g3r.dicom.choice import check_one_examination, judged
     from g3r.dicom.headers import read_images
@@ -172,7 +172,7 @@ def _check_dicom_out(options: argparse.Namespace) -> None:
     """Refuse a folder that the series cannot be written to.
 
     Raises:
-        InputError: see there; or it is the output itself, or lies in the folder that is read.
+        InputError: as `check_new_folder`; or it is the output itself, or lies in the folder that is read.
     """
     from g3r.dicom.volume_series import check_new_folder
 
@@ -186,7 +186,7 @@ def _check_dicom_out(options: argparse.Namespace) -> None:
 
 
 def _refuse_dicom(options: argparse.Namespace) -> None:
-    """Raise `InputError` for DICOM among the stacks, with the line that works."""
+    """Raise `InputError` for DICOM among the stacks, with the command line that works."""
     from g3r.dicom.files import holds_dicom, is_dicom
 
     for path in options.stacks:
@@ -207,11 +207,11 @@ def _reference(options: argparse.Namespace) -> SourceStudy | None:
 
 
 def write_dicom(options: argparse.Namespace, result: ReconstructionResult, dicom: DicomInput) -> None:
-    """Write the volume as a series of its examination, where that is asked for and the result is whole.
+    """Write the volume as a series of its examination, if asked for and if the result is not partial.
 
     Args:
-        options: of g3r-infer.
-        result: of the run.
+        options: options of g3r-infer.
+        result: result of the run.
         dicom: from `stacks_on_disk`.
 
     Raises:

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-evaluate`: score a reconstruction against the truth, or by what it predicts of a stack that was held out."""
+"""`g3r-evaluate`: score a reconstruction against the truth, or by its prediction of a held-out stack."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def table(comparison: Comparison, pose_error: PoseError | None = None, lpips: fl
     """The scores as a few lines of text.
 
     Args:
-        comparison: of the volume with the truth.
-        pose_error: of the slices; None leaves it out.
-        lpips: mean distance of slices; None leaves it out.
+        comparison: comparison of the volume with the truth.
+        pose_error: pose error of the slices; None leaves it out.
+        lpips: mean LPIPS distance of slices; None leaves it out.
     """
     s, alignment = comparison.scores, comparison.alignment
     lines = [
@@ -98,7 +98,7 @@ def table(comparison: Comparison, pose_error: PoseError | None = None, lpips: fl
 
 
 def _compare(options: argparse.Namespace) -> tuple[Comparison, float | None]:
-    """The volume beside the reference, and their LPIPS where its weights are given."""
+    """Comparison of the volume with the reference, and their LPIPS if its weights are given."""
     from g3r.acquisition.images import load_mask, load_volume
     from g3r.evaluation.compare import compare
 
@@ -108,7 +108,7 @@ def _compare(options: argparse.Namespace) -> tuple[Comparison, float | None]:
     if options.lpips_weights:
         from g3r.evaluation.lpips import Lpips
 
-        lpips = Lpips.load(options.lpips_weights)  # before the alignment: a wrong path shows at once
+        lpips = Lpips.load(options.lpips_weights)  # before the alignment, so that a wrong path fails at once
     comparison = compare(volume, reference, mask, align=options.align)
     if options.sections:
         from g3r.output.sections import save_sections
@@ -130,7 +130,7 @@ def _pose_error(poses: str, slices: str) -> PoseError:
 
     true, estimated = read_poses(poses), read_poses(slices)
     n_stacks = 1 + max(stack for stack, _ in true.keys)
-    # one by one: a table may name a billionth stack, and the first mask that is missing ends it
+    # lazily: a table may name a billionth stack, and the first missing mask ends the loop
     masks = (Path(poses).parent / f"mask-{n}.nii.gz" for n in range(n_stacks))
     return target_registration_error(slice_points(masks), true, estimated)
 

@@ -50,16 +50,16 @@ def _failed(line: str, exit_code: int) -> int:
 
 
 def export(run: Path, file: Path, data_description: str | None = None, *, replace: bool = False) -> TrainedModel:
-    """Write the exported file of a Lightning checkpoint, of a prior, a pose or a mask network.
+    """Export the weights of a Lightning checkpoint of a prior, a pose or a mask network.
 
     Args:
         run: checkpoint written by `PriorModule`, `PoseModule` or `MaskModule` under a Lightning trainer.
-        file: to write; its name ends in .safetensors.
-        data_description: training data in words; None keeps what the run recorded.
+        file: file to write; its name ends in .safetensors.
+        data_description: training data in words; None keeps those that the run recorded.
         replace: overwrite an existing file.
 
     Returns:
-        What was written, read back from the file.
+        The written model, read back from the file.
 
     Raises:
         InputError: `run` is missing, damaged or of another kind; `file` exists, has another ending or cannot be
@@ -84,7 +84,7 @@ def export(run: Path, file: Path, data_description: str | None = None, *, replac
         return kind.load(file)
     except G3RError:
         raise
-    except Exception as error:  # a network given other numbers than it expects may raise anything
+    except Exception as error:  # a network with unexpected values may raise anything
         if is_out_of_memory(error):
             raise
         found = " ".join(str(error).split())[:120]
@@ -108,16 +108,16 @@ def _weights(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_run(run: Path, entry: str) -> dict[str, Any]:
-    """Return a training checkpoint's content, or explain in one line why there is none."""
+    """Return the content of a training checkpoint, or raise `InputError` with the reason in one line."""
     import torch
 
     expected = "expected a training checkpoint of g3r-pretrain, such as .../checkpoints/last.ckpt"
     try:
-        with warnings.catch_warnings(action="ignore"):  # the file's, which the refusal replaces
+        with warnings.catch_warnings(action="ignore"):  # the error message replaces torch's warnings
             content = torch.load(run, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise InputError(f"{run}: no such file; {expected}") from error
-    except Exception as error:  # torch.load says "damaged" in many types
+    except Exception as error:  # torch.load raises many types for a damaged file
         if is_out_of_memory(error):
             raise
         raise InputError(f"{run}: cannot be read as a checkpoint ({type(error).__name__}); {expected}") from error

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-export-poses`: the slice poses of a finished run as files of other programs."""
+"""`g3r-export-poses`: the slice poses of a finished run in the file formats of other programs."""
 
 from __future__ import annotations
 

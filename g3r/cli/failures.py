@@ -7,10 +7,10 @@ import errno
 from g3r.errors import G3RError, InputError, NumericalError, cannot_be_written
 
 EXPECTED = (G3RError, MemoryError, RuntimeError, ImportError, OSError)
-"""Errors that `line_and_code` may know; a defect of the program is none of them, or is raised again."""
+"""Errors that `line_and_code` may handle; it raises those again that are defects of the program."""
 
 OUT_OF_MEMORY_WORDS = ("allocate memory", "failed to map segment", "can't start new thread", "out of memory")
-"""In the messages of numpy, torch, the loader of libraries and the system."""
+"""Phrases for lack of memory in messages of numpy, torch, the library loader and the system."""
 
 EXTRAS = {
     "evaluate": ("skimage",),
@@ -18,7 +18,7 @@ EXTRAS = {
     "dicom": ("pydicom", "dcm2niix"),
     "slurm": ("submitit",),
 }
-"""Packages, as they are imported, that only some commands need."""
+"""Import names of the packages of each extra, which only some commands need."""
 
 LESS_MEMORY = "choose a coarser --resolution or --preset preview, or crop the stacks"
 KERNEL_CACHE = "free space where the output, temporary files or compiled kernels are kept (NUMBA_CACHE_DIR)"
@@ -29,10 +29,10 @@ def line_and_code(error: BaseException, less_memory: str = LESS_MEMORY) -> tuple
 
     Args:
         error: one of `EXPECTED`.
-        less_memory: what to do where memory could not be had.
+        less_memory: advice for lack of memory.
 
     Raises:
-        BaseException: the error itself where it is a defect of the program.
+        BaseException: the error itself, if it is a defect of the program.
     """
     if isinstance(error, G3RError):
         return str(error), error.exit_code
@@ -48,10 +48,10 @@ def line_and_code(error: BaseException, less_memory: str = LESS_MEMORY) -> tuple
 
 
 def missing_extra(error: ModuleNotFoundError) -> str:
-    """The line for a package that an extra brings.
+    """The line for the user about a missing package of an extra.
 
     Raises:
-        ModuleNotFoundError: the error itself where no extra brings it.
+        ModuleNotFoundError: the error itself, if no extra has the package.
     """
     for extra, packages in EXTRAS.items():
         if (error.name or "").split(".")[0] in packages:
@@ -60,7 +60,7 @@ def missing_extra(error: ModuleNotFoundError) -> str:
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or one that led to it, means that memory could not be had."""
+    """Whether an error, or one of its causes, means lack of memory."""
     while error is not None:
         message = str(error).lower()
         if isinstance(error, MemoryError) or any(words in message for words in OUT_OF_MEMORY_WORDS):

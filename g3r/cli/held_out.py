@@ -1,4 +1,4 @@
-"""`g3r-evaluate` without a truth: how well a volume predicts a stack that it was not made from."""
+"""`g3r-evaluate` without a truth: scores of a volume by its prediction of a held-out stack."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LOW_CORRELATION = 0.6
-"""Below this a stack was hardly found in the volume, and its scores may be those of a wrong place."""
+"""Below this correlation the stack was hardly found in the volume, and its scores may be of a wrong pose."""
 
 TAKEN = {
     "reference": (("volume", "reference", "mask"), ("align", "sections", "poses", "slices", "lpips_weights")),
     "held_out_stack": (("volume", "mask"), ("held_out_stack", "thickness", "support", "eroded_pixels")),
     "leave_one_out": (("stacks", "masks"), ("leave_one_out", "thickness", "preset", "ckpt", "eroded_pixels")),
 }
-"""Options that each way of scoring needs, and further ones that it takes; the others would be ignored."""
+"""Options that each way of scoring requires, and those that it accepts; all others would be ignored."""
 
 COLUMNS = {
     "PSNR dB": ("psnr_db", ".2f"),
@@ -36,7 +36,7 @@ COLUMNS = {
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of both ways."""
+    """Add the options of both ways of scoring without a truth."""
     group = parser.add_argument_group("without a truth")
     group.add_argument("--held-out-stack", metavar="NIFTI", help="score how well --volume predicts this stack")
     group.add_argument(
@@ -56,7 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> bool:
-    """Whether a stack is to be predicted; ends the program with 2 where options cannot go together."""
+    """Whether a stack is to be predicted; ends the program with 2 if options cannot be combined."""
     if options.held_out_stack and options.leave_one_out:
         parser.error("--held-out-stack and --leave-one-out exclude each other")
     way = "held_out_stack" if options.held_out_stack else "leave_one_out" if options.leave_one_out else "reference"
@@ -86,10 +86,10 @@ def _option(name: str) -> str:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Predict, and print a row for each stack; returns the scores for --json.
+    """Predict stacks and print a row for each; returns the scores for --json.
 
     Raises:
-        InputError: inputs that cannot be used, or a stack that is not found in the volume.
+        InputError: inputs cannot be used, or a stack is not found in the volume.
     """
     rows = []
     print("  ".join(f"{name:>8}" for name in COLUMNS), " stack")

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-infer`: motion-corrupted stacks in, one volume with maps, poses and a record out."""
+"""`g3r-infer`: reconstruct one volume, with maps, poses and a record, from motion-corrupted stacks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from g3r.run.stage_store import StageStore
 
 NEEDED_LATER = ("SimpleITK", "g3r.output.sections", "g3r.output.mask_picture", "g3r.report.page")
-"""Modules that take a few tenths of a second to import, while slices are registered by code that holds no lock."""
+"""Modules that take a few tenths of a second to import: imported while registration runs and holds no lock."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _terminal(options: argparse.Namespace, stop_request: StopRequest) -> Terminal:
-    """The terminal of this run, with the time that it will probably take."""
+    """The terminal of this run, with its expected duration."""
     compiling = needs_compiling() and not options.dry_run
     expected_s, compiled_s = (expected_seconds(options, compiling=one) for one in (compiling, False))
     log = LogFile(*without_names(options))
@@ -96,7 +96,7 @@ def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Termi
     with terminal.held_back():
         with stacks_on_disk(options, replaces=replaces) as dicom:
             earlier = earlier_run(options)
-            networks = check_files(options, folder, replaces=replaces)  # before an image is read
+            networks = check_files(options, folder, replaces=replaces)  # before any image is read
             task = prepared(options, networks, earlier, terminal)
         for name, facts in task.told():
             terminal.tell(name, facts)
@@ -115,7 +115,7 @@ def _run(options: argparse.Namespace, stop_request: StopRequest, terminal: Termi
         stopped = stop_request.is_requested()
         code = _failed(ended_in_order(result, folder), stop_request.exit_code) if stopped else 0
         _conclude(result, folder, terminal)
-    except KeyboardInterrupt:  # a second one, which waits for nothing
+    except KeyboardInterrupt:  # a second signal, which raises at once
         if not output.is_written:
             raise
         terminal.end_bar()
@@ -172,7 +172,7 @@ def _logged(output: OutputFolder, log: LogFile) -> Iterator[None]:
 
 @contextmanager
 def _reporter(options: argparse.Namespace, task: Task, terminal: Terminal) -> Iterator[Reporter]:
-    """Who hears of the stages: the terminal, and TensorBoard where it is asked for."""
+    """Reporters of the stages: the terminal, and TensorBoard if asked for."""
     if not options.tensorboard:
         yield terminal
         return
@@ -185,7 +185,7 @@ def _reporter(options: argparse.Namespace, task: Task, terminal: Terminal) -> It
 
 
 def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
-    """Where stages are kept; nowhere under a time budget, whose choices follow the clock."""
+    """The stage store; it keeps nothing under a time budget, whose choices depend on the clock."""
     from g3r.output.stored_records import STORED_RECORDS
     from g3r.planning.plan import FixedPlan
     from g3r.run.provenance import provenance
@@ -206,7 +206,7 @@ def _store(options: argparse.Namespace, task: Task, folder: Path) -> StageStore:
 
 
 def _with_command(result: ReconstructionResult, options: argparse.Namespace, task: Task) -> ReconstructionResult:
-    """The result with what only the command knows in its record."""
+    """The result with the command's own facts added to its record."""
     from g3r.acquisition.header_text import read_header_text
     from g3r.output.record import CommandRecord
 
@@ -233,7 +233,7 @@ def _with_command(result: ReconstructionResult, options: argparse.Namespace, tas
 
 
 def _conclude(result: ReconstructionResult, folder: Path, terminal: Terminal) -> None:
-    """Say what there is to look at, and last the verdict."""
+    """Print the files to look at, and last the verdict."""
     from g3r.output.files import MASK_PICTURE, REPORT_NAME
     from g3r.report.verdict import verdict_of
 

@@ -1,4 +1,4 @@
-"""The options of `g3r-infer`, and which of them go together; nothing heavy is imported here."""
+"""The options of `g3r-infer`, and their valid combinations; nothing heavy is imported here."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEFAULTS = {
     "resolution": 0.8,
     "seed": 0,
 }
-"""Defaults of the options that --config replaces; --no-prior and --time-budget are two more of them."""
+"""Defaults of the options that --config replaces; it also replaces --no-prior and --time-budget."""
 
 USAGE = """%(prog)s --stacks NIFTI [NIFTI ...] --output DIR [options]
        %(prog)s --dicom DIR --output DIR [options]
@@ -183,7 +183,7 @@ def _add_saying(parser: argparse.ArgumentParser) -> None:
 
 
 def parsed_options(argv: Sequence[str] | None) -> argparse.Namespace:
-    """The options as they hold, defaults filled in; ends the program with 2 where they cannot go together."""
+    """The parsed options with defaults; ends the program with 2 if they cannot be combined."""
     parser = build_parser()
     options = parsed(parser, argv)
     check_slice_options(parser, options)
@@ -226,7 +226,7 @@ def _names_a_set(weights: str) -> bool:
 
 
 def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where an option needs what only fetal brains have."""
+    """End the program with 2 if an option needs networks or atlas, which exist only for fetal brains."""
     named = {f"--{kind}": getattr(options, kind.replace("-", "_")) for kind in ("ckpt", "pose-ckpt", "mask-ckpt")}
     given = [name for name, value in named.items() if value]
     if options.space == "standard":
@@ -238,11 +238,11 @@ def _check_generic(parser: argparse.ArgumentParser, options: argparse.Namespace)
 
 PATHS = ("stacks", "masks", "config", "ckpt", "pose_ckpt", "mask_ckpt")
 FOLDERS = ("output", "dicom", "slices", "dicom_out", "dicom_reference", "tensorboard")
-"""Options that name files, and folders."""
+"""Options that name files, and options that name folders."""
 
 
 def without_names(options: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """What the log must not name: files, whose folders are left out, and folders."""
+    """Paths to hide from the log: files, whose folders are hidden, and folders."""
     given = [getattr(options, name) for name in PATHS]
     files = [one for value in given if value for one in ([value] if isinstance(value, str) else value)]
     folders = [str(value) for name in FOLDERS if (value := getattr(options, name))]
@@ -250,7 +250,7 @@ def without_names(options: argparse.Namespace) -> tuple[list[str], list[str]]:
 
 
 def told_options(options: argparse.Namespace) -> str:
-    """The options that were given, for the log: files by their names, folders and commands not at all."""
+    """The given options, for the log: files by name only, without folders and commands."""
     told = []
     for name, value in vars(options).items():
         if value in (None, False) or name in (*FOLDERS, "mask_command"):

@@ -1,4 +1,4 @@
-"""From the options of `g3r-infer` to a task: inputs read and checked, settings and deadlines decided."""
+"""The task of `g3r-infer` from its options: inputs read and checked, settings and deadlines decided."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ if TYPE_CHECKING:
     from g3r.run.reporter import Reporter
 
 STARTED_S = time.monotonic()
-"""When the command began; what Python itself needs before is a few hundredths of a second."""
+"""Start of the command; Python itself takes a few hundredths of a second before."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """The task of the command, once its input has been checked.
+    """The task of the command, with checked input.
 
     Attributes:
-        stacks: to reconstruct.
+        stacks: stacks to reconstruct.
         settings: as requested.
-        memory: the settings that stay below the memory limit.
-        reconstructor: with its networks loaded.
+        memory: settings that stay below the memory limit.
+        reconstructor: reconstructor with loaded networks.
         inputs: hashes of all files.
-        n_threads: in use.
+        n_threads: number of threads in use.
         plan: settings and deadlines of the run.
-        slices: that the stacks were made of; None where these were given.
-        warnings: stacks that are left out, and what differs from the run that --config names.
-        notes: for the record.
+        slices: slice folder that the stacks were made from; None if stacks were given.
+        warnings: stacks that are left out, and differences from the run of --config.
+        notes: remarks for the record.
     """
 
     stacks: list[Stack]
@@ -61,7 +61,7 @@ class Task:
     notes: list[str] = field(default_factory=list)
 
     def told(self) -> Iterator[tuple[str, dict[str, object]]]:
-        """Lines of `stage_words` on the input, and what is filled in."""
+        """Lines of `stage_words` about the input, and the values to fill in."""
         n_stacks, sources = len(self.stacks), [stack.mask_source for stack in self.stacks]
         n_given = sources.count("file")
         if self.slices is not None:
@@ -84,13 +84,13 @@ class Task:
 
 
 def earlier_run(options: argparse.Namespace) -> RunRecord | None:
-    """The run that --config names; its anatomy becomes that of the options, by which masks are looked for.
+    """The run of --config; its anatomy is copied to the options, because it decides how masks are found.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
 
     Raises:
-        InputError: a file that cannot be used, or one of an interrupted run or of another number of stacks.
+        InputError: the file cannot be used, or is of an interrupted run or of another number of stacks.
     """
     if not options.config:
         return None
@@ -113,15 +113,15 @@ def _check_number(options: argparse.Namespace, earlier: RunRecord, n_stacks: int
 
 
 def check_files(options: argparse.Namespace, folder: Path, *, replaces: bool) -> dict[str, WeightsFile]:
-    """Refuse what can be seen without reading an image; returns the files of networks, by kind.
+    """Check all files that can be checked without reading an image; returns the files of networks, by kind.
 
     Args:
-        options: of g3r-infer.
-        folder: for the results.
+        options: options of g3r-infer.
+        folder: folder for the results.
         replaces: whether earlier results in the folder may be replaced.
 
     Raises:
-        InputError: a file that is missing or cannot be used, or a folder that must not be written.
+        InputError: a file is missing or cannot be used, or the folder must not be written.
     """
     from g3r.acquisition.sidecar import sidecar_path
     from g3r.checkpoints.shipped import set_of, weights_path
@@ -150,10 +150,10 @@ def prepared(
     """Read and check everything that the run needs.
 
     Args:
-        options: of g3r-infer.
+        options: options of g3r-infer.
         networks: files of networks, by kind.
-        earlier: the run that --config names.
-        reporter: is told what is under way.
+        earlier: the run of --config.
+        reporter: is notified of each step.
 
     Raises:
         InputError: something in the files or options cannot be used.
@@ -207,7 +207,7 @@ def _load(options: argparse.Namespace, masked: MaskedStacks, earlier: RunRecord 
     repeats = earlier is not None and len(earlier.stacks) == len(masked.kept)
     profiles = [stack.profile() for stack in earlier.stacks] if earlier and repeats else None
     paths = [options.stacks[n] for n in masked.kept]
-    told = names_of(options.stacks)  # of all that were given, so that numbers are those of the command line
+    told = names_of(options.stacks)  # of all given stacks, so that the numbers are those of the command line
     names = [told[n] for n in masked.kept]
     return load_stacks(paths, masked.masks, [thickness[n] for n in masked.kept] if thickness else None, profiles, names)
 
@@ -217,7 +217,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 
     preset = PRESETS[options.preset]
     if options.time_budget is not None:
-        preset = PRESETS["accurate"]  # the most that a budget may take, which is what memory is stated for
+        preset = PRESETS["accurate"]  # the most that a budget may use; memory is estimated for it
     registration = replace(
         preset.registration,
         standard_orientation=options.space == "standard",
@@ -239,7 +239,7 @@ def _settings(options: argparse.Namespace) -> ReconstructionSettings:
 def _stack_hashes(
     options: argparse.Namespace, masked: MaskedStacks
 ) -> tuple[tuple[FileHash, ...], tuple[FileHash, ...]]:
-    """Of stacks and of masks."""
+    """Hashes of stacks and of masks."""
     from g3r.acquisition.brain_mask import FoundMask
     from g3r.run.provenance import FileHash
 

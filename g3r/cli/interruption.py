@@ -1,4 +1,4 @@
-"""What there is after a signal ended a run of `g3r-infer`, in a line."""
+"""Final messages of `g3r-infer` after a signal: what was written, in one line."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ if TYPE_CHECKING:
 
 
 def nothing_written(folder: Path) -> str:
-    """Of a run that ended before its result was in place.
+    """Message of a run that ended before its result was in place.
 
     Args:
-        folder: of the result.
+        folder: folder of the result.
     """
     return f"interrupted; nothing was written{_way_on(folder)}"
 
 
 def ended_in_order(result: ReconstructionResult, folder: Path) -> str:
-    """Of a run that heard a first signal, and has written what it had.
+    """Message of a run that obeyed a first signal and wrote its result so far.
 
     Args:
-        result: that was written.
-        folder: that it is in.
+        result: the written result.
+        folder: folder of the result.
     """
     if result.record.partial:
         return f"{result.record.stopped_at}: {folder} holds the volume so far, marked as partial{_way_on(folder)}"
@@ -31,11 +31,11 @@ def ended_in_order(result: ReconstructionResult, folder: Path) -> str:
 
 
 def ended_behind(folder: Path, dicom_out: str | None) -> str:
-    """Of a run that was ended at once when its result was in place already.
+    """Message of a run that was ended at once after its result was in place.
 
     Args:
-        folder: of the result.
-        dicom_out: folder of the DICOM series; None where none was asked for.
+        folder: folder of the result.
+        dicom_out: folder of the DICOM series; None if none was asked for.
     """
     from g3r.output.result import is_partial
 

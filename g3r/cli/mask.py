@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="g3r-mask: %(message)s", stream=sys.stderr)
     stop_request = StopRequest()
     try:
-        with stop_request, _silent("g3r.acquisition.slice_profile"):  # the thickness decides nothing here
+        with stop_request, _silent("g3r.acquisition.slice_profile"):  # the slice thickness does not matter here
             return _run(options)
     except KeyboardInterrupt:
         return _said("interrupted; masks that were printed are whole", stop_request.exit_code)
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _silent(name: str) -> Iterator[None]:
-    """A logger that says nothing but errors for a while, and is then as it was."""
+    """Silence a logger, except for errors, during the block."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -96,7 +96,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _weights(options: argparse.Namespace) -> WeightsFile | None:
-    """The mask network's file, where it is asked."""
+    """The file of the mask network; None if a command makes the masks."""
     if options.mask_command:
         return None
     from g3r.checkpoints.weights_file import read_weights
@@ -108,12 +108,12 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
     """Write the mask of one stack, its picture and its record; returns a line about it.
 
     Args:
-        path: of the stack.
-        target: to write, without an ending.
+        path: path of the stack.
+        target: path of the files to write, without an ending.
         masker: finds the mask.
 
     Raises:
-        InputError: the stack cannot be read, shows no head, or the masker failed.
+        InputError: the stack cannot be read or shows no head, or the masker failed.
     """
     from g3r.acquisition.brain_mask import empty_background_mask
     from g3r.acquisition.images import load_volume, save_volume
@@ -133,7 +133,7 @@ def _mask(path: str, target: Path, masker: Masker) -> str:
 
 
 def _record(path: str, found: FoundMask, volume_ml: float) -> str:
-    """A sidecar with the fields that BIDS has for masks, and ours."""
+    """A sidecar with BIDS's fields for masks, and our own."""
     fields = {
         "Type": "Brain",
         "Sources": [Path(path).name],

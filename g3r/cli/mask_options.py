@@ -1,4 +1,4 @@
-"""The options of `g3r-infer` and `g3r-mask` that say what is brain, and what they mean."""
+"""The mask options of `g3r-infer` and `g3r-mask`, and their implementation."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from g3r.masking.find import MaskedStacks, Masker
 
 AUTO = "auto"
-"""In place of a mask's file: it is to be found."""
+"""Stands for a mask's file: the mask is found automatically."""
 
 
 def add_mask_options(parser: argparse._ActionsContainer) -> None:
-    """The options that say what is brain."""
+    """Add the options for brain masks."""
     parser.add_argument(
         "--masks",
         nargs="+",
@@ -35,7 +35,7 @@ def add_mask_options(parser: argparse._ActionsContainer) -> None:
 
 
 def add_masker_options(parser: argparse._ActionsContainer) -> None:
-    """The options that say who finds masks."""
+    """Add the options for the masker, which finds masks."""
     parser.add_argument(
         "--mask-command",
         metavar="'CMD {stack} {mask}'",
@@ -50,7 +50,7 @@ def add_masker_options(parser: argparse._ActionsContainer) -> None:
 
 
 def check_mask_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where options on masks cannot go together; `auto` alone is for all stacks."""
+    """End the program with 2 if mask options cannot be combined; a single `auto` is applied to all stacks."""
     n_stacks = len(options.stacks)
     if options.masks == [AUTO]:
         options.masks = [AUTO] * n_stacks
@@ -65,7 +65,7 @@ def check_mask_options(parser: argparse.ArgumentParser, options: argparse.Namesp
 
 
 def check_masker_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where options on a masker make no sense."""
+    """End the program with 2 if options of the masker are invalid."""
     missing = [place for place in ("{stack}", "{mask}") if place not in (options.mask_command or place)]
     if missing:
         parser.error(f"--mask-command: no {' and no '.join(missing)} in {options.mask_command!r}; the tool gets both")
@@ -77,18 +77,18 @@ def check_masker_options(parser: argparse.ArgumentParser, options: argparse.Name
 
 
 def check_threads(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where there is no such number of threads."""
+    """End the program with 2 if the number of threads is below 1."""
     if options.threads is not None and options.threads < 1:
         parser.error(f"--threads {options.threads}; expected at least 1")
 
 
 def given_masks(options: argparse.Namespace) -> list[str | None]:
-    """The user's file for each stack; None where the mask is to be found."""
+    """The user's mask file for each stack; None if the mask is to be found."""
     return [None if one == AUTO else one for one in options.masks or [None] * len(options.stacks)]
 
 
 def needs_network(options: argparse.Namespace) -> bool:
-    """Whether the mask network may be asked."""
+    """Whether the mask network may be needed."""
     made_otherwise = options.whole_image or options.mask_command or options.anatomy != FETAL_BRAIN
     return None in given_masks(options) and not made_otherwise
 
@@ -97,8 +97,8 @@ def mask_weights_path(given: str | None, prior: str | None = None) -> Path:
     """The file of the mask network.
 
     Args:
-        given: path of it.
-        prior: path or set of the prior's weights, whose set is meant for all networks.
+        given: path of the file; None for a shipped one.
+        prior: path or set of the prior's weights; a set applies to all networks.
 
     Raises:
         InputError: the set holds no mask network.
@@ -116,14 +116,14 @@ def mask_weights_path(given: str | None, prior: str | None = None) -> Path:
 
 
 def masked_stacks(options: argparse.Namespace, weights: WeightsFile | None) -> MaskedStacks:
-    """Which stacks are used, and with which masks.
+    """The stacks that are used, with their masks.
 
     Args:
-        options: with the paths of stacks and masks.
-        weights: of the mask network; None where it is not needed.
+        options: has the paths of stacks and masks.
+        weights: weights of the mask network; None if not needed.
 
     Raises:
-        InputError: a stack that cannot be read, a masker that fails, or no stack with a brain in it.
+        InputError: a stack cannot be read, the masker fails, or no stack shows a brain.
     """
     from g3r.masking.find import find_masks
 
@@ -139,11 +139,11 @@ def masked_stacks(options: argparse.Namespace, weights: WeightsFile | None) -> M
 
 
 def masker_of(options: argparse.Namespace, weights: WeightsFile | None) -> Masker:
-    """What finds the masks that are not given.
+    """The masker, which finds masks that are not given.
 
     Args:
-        options: of `add_masker_options`, and `threads`.
-        weights: of the mask network; None where it is not asked.
+        options: options of `add_masker_options`, and `threads`.
+        weights: weights of the mask network; None if not needed.
     """
     if options.mask_command:
         from g3r.masking.command import TIMEOUT_S, MaskCommand
@@ -151,7 +151,7 @@ def masker_of(options: argparse.Namespace, weights: WeightsFile | None) -> Maske
         return MaskCommand(options.mask_command, options.mask_timeout or TIMEOUT_S).mask_of
 
     @functools.cache
-    def network() -> AutomaticMask:  # torch takes seconds, and most runs have masks
+    def network() -> AutomaticMask:  # torch takes seconds to import, and most runs have masks
         with lean():
             from g3r.mask_network.model import MaskModel
         from g3r.masking.automatic import AutomaticMask

@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             args=arguments,
         )
     except (KeyboardInterrupt, ValueError, SystemExit, *EXPECTED) as error:
-        # jsonargparse wraps what the model raises in an error of its own, Lightning leaves an interrupted fit by exit
+        # jsonargparse wraps errors of the model in its own, and Lightning ends an interrupted fit by SystemExit
         found = error if isinstance(error, OSError) else _first_known(error)
         if found is None:
             raise
@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _first_known(error: BaseException | None) -> BaseException | None:
-    """The first among an error and those that led to it that the user can act on."""
+    """The first error in the chain of causes that the user can act on; None if there is none."""
     while error is not None and not isinstance(error, (KeyboardInterrupt, G3RError)) and not is_out_of_memory(error):
         error = error.__cause__ or error.__context__
     return error

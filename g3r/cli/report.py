@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""`g3r-report`: report.html of a finished run, one page that says whether its volume may be used, and shows it."""
+"""`g3r-report`: report.html of a finished run, one page with its verdict and its volume."""
 
 from __future__ import annotations
 

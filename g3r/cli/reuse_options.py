@@ -1,4 +1,4 @@
-"""What the commands on a finished run share: the folder they read, the file they write, failures as one line."""
+"""Shared parts of the commands on a finished run: input folder, output file, and failures as one line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EPILOG = "exit codes: 0 done, 2 usage, 3 bad input or output, 4 out of memory, 1
 
 
 def reuse_parser(prog: str, description: str) -> argparse.ArgumentParser:
-    """A parser with what all these commands take."""
+    """A parser with the common arguments of these commands."""
     parser = argparse.ArgumentParser(
         prog=prog, description=f"{description} For research only, not for diagnosis.", epilog=EPILOG
     )
@@ -34,14 +34,14 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_output_file(options: argparse.Namespace, inputs: Sequence[str | Path] = ()) -> None:
-    """Refuse an output that cannot be written, or must not be, before any work.
+    """Refuse an output file that cannot or must not be written, before any work.
 
     Args:
-        options: with `run`, `output` and `force`.
+        options: has `run`, `output` and `force`.
         inputs: files that are read.
 
     Raises:
-        InputError: another ending, no folder for it, a file that exists (without --force), or one that is read.
+        InputError: the ending is wrong, the folder is missing, or the file exists (without --force) or is an input.
     """
     path: Path = options.output
     if not path.name.endswith(IMAGE_ENDINGS):
@@ -66,7 +66,7 @@ def _is_of_a_run(name: str) -> bool:
 
 
 def told(prog: str, work: Callable[[], str]) -> int:
-    """Do the work and print what it says, or why it failed; returns the exit code.
+    """Do the work and print its line, or the reason of its failure; returns the exit code.
 
     Args:
         prog: the command's name.

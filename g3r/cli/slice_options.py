@@ -1,4 +1,4 @@
-"""The options of `g3r-infer` about folders of slices with poses, and what they mean."""
+"""The options of `g3r-infer` for folders of slices with poses, and their implementation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WITHOUT_STACKS = {
 
 
 def add_slice_options(parser: argparse._ActionsContainer) -> None:
-    """What may be done with given poses."""
+    """Add the options for given poses."""
     parser.add_argument(
         "--keep-poses",
         action="store_true",
@@ -36,7 +36,7 @@ def add_slice_options(parser: argparse._ActionsContainer) -> None:
 
 
 def check_slice_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """End the program with 2 where options on slices cannot go together."""
+    """End the program with 2 if options on slices cannot be combined."""
     if not options.slices:
         if options.keep_poses:
             parser.error("--keep-poses is for --slices, which is not given")
@@ -46,18 +46,18 @@ def check_slice_options(parser: argparse.ArgumentParser, options: argparse.Names
             parser.error(f"--slices excludes --{name.replace('_', '-')}: {reason}")
     if options.keep_poses and options.config:
         parser.error("--config and --keep-poses exclude each other: the file decides that")
-    options.stacks = []  # they are made of the slices
+    options.stacks = []  # they are made from the slices
 
 
 def load_slices(options: argparse.Namespace, earlier: RunRecord | None) -> SliceFolder:
-    """The folder, with thickness and profile of the run that is repeated where it is one of as many stacks.
+    """The slice folder, with thickness and profile of the repeated run if that has the same number of stacks.
 
     Args:
-        options: of g3r-infer.
-        earlier: the run that --config names.
+        options: options of g3r-infer.
+        earlier: the run of --config.
 
     Raises:
-        InputError: a folder that cannot be used.
+        InputError: the folder cannot be used.
     """
     from g3r.reuse.slice_input import load_slice_folder
 
@@ -73,7 +73,7 @@ def load_slices(options: argparse.Namespace, earlier: RunRecord | None) -> Slice
 
 
 def slice_hashes(folder: SliceFolder) -> tuple[tuple[FileHash, ...], tuple[FileHash, ...]]:
-    """One hash for each stack of the files of its slices and their places, and one of its masks.
+    """Two hashes per stack: of its slices' files with their places, and of its masks.
 
     Raises:
         InputError: a file cannot be read.

@@ -1,7 +1,7 @@
-"""What `g3r-infer` says while it runs: a line when a stage has ended, a bar with the time left, and the verdict.
+"""Terminal output of `g3r-infer` while it runs: a line per finished stage, a bar with the time left, the verdict.
 
-The bar is drawn where the error stream is a terminal; elsewhere there are the lines alone. The words are those of
-`g3r.report.stage_words`. Nothing heavy is imported here: the bar stands before torch is loaded.
+The bar is drawn if the error stream is a terminal; otherwise only the lines are printed. The words are in
+`g3r.report.stage_words`. Nothing heavy is imported here: the bar appears before torch is loaded.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PROGRAM = "g3r-infer"
 
 PLAIN, DETAIL, WARNING = "", "2", "33"
 COLOURS = {"use": "1;32", "check": "1;33", "do not use": "1;31"}
-"""Codes of terminals for kinds of lines, and for the words of the verdict."""
+"""Colour codes of terminals for kinds of lines, and for the words of the verdict."""
 
 MAX_COLUMNS = 100
 """Longer lines are hard to read."""
@@ -38,15 +38,15 @@ PER_SECOND = 4
 
 
 class Terminal(Reporter):
-    """The terminal of one run, to be entered; it hears log lines and stages, and passes all on to the log file.
+    """Shows log lines and stages of one run, and writes all of them to the log file, as a context manager.
 
     Args:
-        time_left: of the run.
-        log: keeps everything.
+        time_left: time left of the run.
+        log: log file, which gets everything.
         quiet: whether only warnings and errors are shown.
-        verbose: whether the developers' detail is shown, too.
-        compiling_s: seconds that it takes to compile programs, once; 0 where they are compiled.
-        stop_request: whether the run is to end early; None where nobody can ask for that.
+        verbose: whether debug detail is shown, too.
+        compiling_s: seconds to compile programs on the first run; 0 if they are compiled already.
+        stop_request: stop request of the run; None if there is none.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Terminal(Reporter):
         self.time_left.progress(done, total)
 
     def ended(self, stage: str, found: object, *, resumed: bool = False) -> None:
-        """See `Reporter`; says in a line what the stage found."""
+        """See `Reporter`; prints lines about the result of the stage."""
         self.time_left.ended(stage)
         if stage in WITHOUT_FACTS:
             self.tell(WITHOUT_FACTS[stage], {})
@@ -104,23 +104,23 @@ class Terminal(Reporter):
                 self.tell(name, facts, resumed=resumed)
 
     def tell(self, name: str, facts: Mapping[str, object], *, resumed: bool = False) -> None:
-        """A line about a stage.
+        """Print a line about a stage.
 
         Args:
-            name: in `stage_words.LINES`.
-            facts: what is filled in.
+            name: key of `stage_words.LINES`.
+            facts: values to fill in.
             resumed: whether the stage was taken from an earlier run.
         """
         self.say(line(name, facts, resumed=resumed))
 
     def say(self, text: str) -> None:
-        """A line for everybody but those who want quiet."""
+        """Print a line unless `quiet`, and log it."""
         self.log.say(text)
         if not self.quiet:
             self._show(text, PLAIN)
 
     def heard(self, record: logging.LogRecord) -> None:
-        """Show what was logged, where it is a warning or where detail is wanted."""
+        """Print a log record if it is a warning, or if detail is wanted."""
         if record.levelno >= logging.WARNING:
             self._show(f"{PROGRAM}: {record.getMessage()}", WARNING)
         elif record.levelno >= self._level and record.name.startswith("g3r"):
@@ -128,7 +128,7 @@ class Terminal(Reporter):
 
     @contextmanager
     def held_back(self) -> Iterator[None]:
-        """Hold lines back until the block ends well, so that a refusal is one line."""
+        """Hold lines back until the block succeeds, so that a refused input prints one line only."""
         self._held = []
         try:
             yield
@@ -139,18 +139,18 @@ class Terminal(Reporter):
             self._held = None
 
     def end_bar(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._live is not None:
             live, self._live = self._live, None
             live.stop()
 
     def conclude(self, lines: list[str], word: str, verdict: str) -> None:
-        """Say on the standard output what was written, and last the verdict.
+        """Print on the standard output what was written, and last the verdict.
 
         Args:
-            lines: to be said before it.
-            word: of the verdict, which decides its colour.
-            verdict: the whole line.
+            lines: lines before the verdict.
+            word: word of the verdict, which decides its colour.
+            verdict: the line of the verdict.
         """
         self.end_bar()
         for text in lines:
@@ -165,7 +165,7 @@ class Terminal(Reporter):
         print(_laid_out(text, colour, sys.stderr), file=sys.stderr, flush=True)
 
     def picture(self) -> RenderableType:
-        """The bar as it is now."""
+        """The bar in its present state."""
         from rich.progress_bar import ProgressBar
         from rich.table import Table
 
@@ -182,12 +182,12 @@ class Terminal(Reporter):
 
 
 def is_live(stream: TextIO) -> bool:
-    """Whether a stream is a terminal on which a line can be drawn anew."""
+    """Whether a stream is a terminal that can redraw a line."""
     return stream.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown")
 
 
 def _live(terminal: Terminal) -> Live:
-    """Draws the bar from now on, a few times a second, in a thread."""
+    """The bar, which a thread redraws a few times a second."""
     from rich.console import Console
     from rich.live import Live
 
@@ -201,7 +201,7 @@ def _live(terminal: Terminal) -> Live:
 
 
 def _laid_out(text: str, colour: str, stream: TextIO) -> str:
-    """A line broken between words and coloured where the stream is a terminal; as it is elsewhere."""
+    """A line, wrapped and coloured if the stream is a terminal; unchanged otherwise."""
     if not stream.isatty():
         return text
     indent = text[: len(text) - len(text.lstrip())] + "  "
@@ -229,22 +229,22 @@ class _Lines(logging.Handler):
         self.terminal = terminal
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show it, if it is to be shown."""
+        """Show a record if it is to be shown."""
         try:
             self.terminal.heard(record)
-        except Exception:  # as with every handler: a line that cannot be shown does not end the run
+        except Exception:  # as in every handler: a record that cannot be shown must not end the run
             self.handleError(record)
 
 
 class _Loggers:
-    """Handlers at the root of all loggers, for as long as a run takes."""
+    """Installs handlers at the root logger for the duration of a run."""
 
     def __init__(self, handlers: list[logging.Handler]) -> None:
         self.handlers = handlers
         self._levels: dict[str | None, int] = {}
 
     def install(self) -> None:
-        """Add them; g3r speaks in detail from now on, others only of what goes wrong."""
+        """Add the handlers; from now on g3r logs debug detail, and other packages only warnings."""
         for name, level in ((None, logging.WARNING), ("g3r", logging.DEBUG)):
             logger = logging.getLogger(name)
             self._levels[name] = logger.level
@@ -253,7 +253,7 @@ class _Loggers:
             logging.getLogger().addHandler(handler)
 
     def remove(self) -> None:
-        """Leave the loggers as they were."""
+        """Remove the handlers and restore the levels."""
         for handler in self.handlers:
             logging.getLogger().removeHandler(handler)
         for name, level in self._levels.items():

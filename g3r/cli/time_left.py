@@ -1,4 +1,4 @@
-"""How much of a run is done and how long the rest takes: expected seconds, corrected by those that have passed."""
+"""Progress and remaining time of a run: expected seconds of its stages, corrected by the measured ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from g3r.report.stage_words import FINDING_MASKS, LOADING, PREPARING, STARTING, 
 from g3r.run.kernel_cache import COMPILING_FIT_S
 
 BEFORE_S = {STARTING: 0.3, FINDING_MASKS: 0.5, LOADING: 0.3, PREPARING: 0.4}
-"""Seconds of three stacks on two cores, before the first stage that a run keeps."""
+"""Seconds of the steps before the first stage of the run context, for three stacks on two cores."""
 
 ROUNDS = "poses in rounds"
 
@@ -48,11 +48,12 @@ EXPECTED_S = {
         "volume": 1.5,
     },
 }
-"""The same of each preset, with all programs compiled, by stage in their order; of poses in rounds one round."""
+"""Seconds of each preset by stage, in their order, for three stacks on two cores and compiled programs; `ROUNDS` is
+one round."""
 
 POSE_ROUNDS = {"preview": (0, 0, 0), "fast": (1, 1, 0), "balanced": (1, 2, 0), "accurate": (1, 2, 1)}
-"""Rounds of poses and volume with one stack, two, and more. A test holds them equal to those of the presets, which
-load too slowly to be asked here."""
+"""Rounds of poses and volume with one stack, two, and more. A test keeps them equal to those of the presets, which are
+too slow to import here."""
 
 COMPILING_S = {
     "registration": 9.0,
@@ -61,33 +62,33 @@ COMPILING_S = {
     "fit to prior": 3.0,
     "held-out slices": 2.0,
 }
-"""What stages take longer where numba has nothing compiled yet."""
+"""Additional seconds of stages if numba has compiled nothing yet."""
 
 MASK_S = 8.0
-"""For the network to find the brain in one stack."""
+"""Seconds for the network to find the brain in one stack."""
 
 ONLY_WITH_PRIOR = ("prior share",)
 ONLY_WITH_FIT = ("prior share", "uncertainty")
 
 STEADY_S = 5.0
-"""Seconds that the expectation counts for against what was measured."""
+"""Weight of the expected pace against the measured one, in seconds."""
 
 MANY_STEPS = 10
-"""From so many steps on, they tell better than the clock how far a stage is."""
+"""With at least this many steps, the share of a stage follows from its steps alone, not from the clock."""
 
 EVEN = 0.7
-"""Share of a stage's expected seconds up to which the clock is believed."""
+"""Share of a stage's expected seconds up to which its share grows with the clock; beyond, it slows down."""
 
 NEARLY = 0.97
-"""Most that is taken for done of a stage that has not ended."""
+"""Largest share of a stage that counts as done before it has ended."""
 
 
 def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[str, float]:
     """Seconds of each stage of a run, in their order.
 
     Args:
-        options: of g3r-infer.
-        compiling: whether programs are compiled on the way.
+        options: options of g3r-infer.
+        compiling: whether programs have to be compiled.
     """
     before = dict(BEFORE_S)
     n_to_find = 0
@@ -110,7 +111,7 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
     if compiling:
         stages = {name: seconds + COMPILING_S.get(name, 0.0) for name, seconds in stages.items()}
         if ROUNDS not in stages and "fit to slices" in stages:
-            stages["fit to slices"] += COMPILING_FIT_S  # else a round has compiled it before
+            stages["fit to slices"] += COMPILING_FIT_S  # otherwise a round of poses and volume has compiled it
     if options.time_budget:
         shorter = max(options.time_budget, 1.0) / sum(stages.values())
         stages = {name: seconds * shorter for name, seconds in stages.items()}
@@ -120,11 +121,11 @@ def expected_seconds(options: argparse.Namespace, *, compiling: bool) -> dict[st
 class TimeLeft:
     """Share of a run that is done, and the seconds that are left.
 
-    A stage that no one expected takes no share. Neither figure jumps back: the share never falls.
+    An unexpected stage takes no share. The share never falls.
 
     Args:
         expected_s: seconds of each stage, in their order.
-        clock: seconds that only go forwards.
+        clock: gives monotonic seconds.
     """
 
     def __init__(self, expected_s: Mapping[str, float], clock: Callable[[], float] = time.monotonic) -> None:
@@ -143,7 +144,7 @@ class TimeLeft:
         return self.clock() - self.begun_s
 
     def begun(self, stage: str) -> None:
-        """A stage begins; all before it are over, whether they took place or not."""
+        """A stage begins; all earlier stages count as done, whether or not they took place."""
         self._stage, self._stage_begun_s, self._steps = stage, self.clock(), (0, 0)
         self._pace = self._measured_pace(self._before_s)
         if stage in self.expected_s:
@@ -151,7 +152,7 @@ class TimeLeft:
             self._before_s = sum(self.expected_s[name] for name in names[: names.index(stage)])
 
     def progress(self, done: int, total: int) -> None:
-        """Steps of the present stage are done, of so many."""
+        """Report steps of the present stage: done, and in all."""
         self._steps = (done, total)
 
     def ended(self, stage: str) -> None:
@@ -161,22 +162,22 @@ class TimeLeft:
         self._stage = ""
 
     def share(self) -> float:
-        """Of the whole run, from 0 to 1."""
+        """Done share of the whole run, from 0 to 1."""
         total_s = sum(self.expected_s.values())
         self._shown = max(self._shown, min(self._done_s() / total_s, 1.0)) if total_s > 0 else 1.0
         return self._shown
 
     def left_s(self) -> float:
-        """Seconds until the end, as far as can be told."""
+        """Estimated seconds until the end."""
         done_s = self._done_s()
         return max(0.0, self._measured_pace(done_s) * (sum(self.expected_s.values()) - done_s))
 
     def _measured_pace(self, done_s: float) -> float:
-        """Seconds that passed for each expected one."""
+        """Measured seconds per expected second."""
         return (self.passed_s + STEADY_S) / (done_s + STEADY_S)
 
     def _done_s(self) -> float:
-        """Expected seconds of what is done."""
+        """Expected seconds of the part that is done."""
         expected_s = self.expected_s.get(self._stage, 0.0)
         if not expected_s:
             return self._before_s
@@ -188,5 +189,5 @@ class TimeLeft:
 
 
 def _by_the_clock(passed: float) -> float:
-    """Share of a stage by its seconds over the expected ones: even at first, and ever slower after `EVEN`."""
+    """Share of a stage by its seconds over the expected ones: linear up to `EVEN`, ever slower after it."""
     return passed if passed < EVEN else 1 - (1 - EVEN) ** 2 / (passed + 1 - 2 * EVEN)

@@ -1,4 +1,4 @@
-"""Which series of an examination are stacks of T2-weighted slices, and why the others are not."""
+"""Choice of the series of an examination that are stacks of T2-weighted slices, with reasons against the others."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from g3r.dicom.series import SAME_PLACE_MM, UNEVEN_FROM, Series
 from g3r.errors import InputError
 
 MIN_SLICES = 8
-"""Of a stack that is chosen: a brain of 20 weeks is 40 mm high, and slices are at most 5 mm apart."""
+"""Least slices of a chosen stack: a brain of 20 weeks is 40 mm high, and slices are at most 5 mm apart."""
 
 MIN_ECHO_TIME_MS = 50.0
 """Fetal T2-weighted protocols have 80 to 180 ms; proton density and T1 are below 40 ms."""
 
 LOCALISER = re.compile(r"locali[sz]|scout|survey|\bloc\b|calib|smart ?brain|\baahead\b", re.IGNORECASE)
-"""In the description or protocol of series that plan others."""
+"""Words in the description or protocol of localisers."""
 
 ORIGINAL, PRIMARY = "ORIGINAL", "PRIMARY"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """A series, and whether it is taken.
+    """A series with the decision whether it is taken.
 
     Attributes:
-        series: that is judged.
+        series: the judged series.
         is_taken: whether it becomes a stack.
-        reason: why it is not, or that it was asked for.
-        is_broken: whether it would have been taken if its images were whole.
+        reason: why it is not taken, or that it was asked for.
+        is_broken: whether only a fault of its images keeps it from being taken, not its kind.
     """
 
     series: Series
@@ -41,14 +41,14 @@ class Judged:
 
 
 def judged(all_series: Sequence[Series], asked_for: Sequence[str] | None = None) -> list[Judged]:
-    """Every series with its verdict, in the order given.
+    """Every series with its decision, in the given order.
 
     Args:
-        all_series: of a folder.
-        asked_for: labels of those to take; by the rules where None.
+        all_series: all series of a folder.
+        asked_for: labels of the series to take; None chooses by the rules.
 
     Raises:
-        InputError: a series that is asked for is not there, or cannot be a stack.
+        InputError: a requested series does not exist, or cannot be a stack.
     """
     if asked_for is None:
         return _without_repeats([_by_rules(series) for series in all_series])
@@ -69,7 +69,7 @@ def judged(all_series: Sequence[Series], asked_for: Sequence[str] | None = None)
 
 
 def check_one_examination(taken: Sequence[Series], folder: str) -> None:
-    """Raise `InputError` where series are of several patients or examinations: one head is to be reconstructed."""
+    """Raise `InputError` if series are of several patients or examinations, because one head is reconstructed."""
     for what, values in (
         ("patients", {image.patient_id for series in taken for image in series.images}),
         ("examinations", {image.study_uid for series in taken for image in series.images}),
@@ -88,7 +88,7 @@ def _by_rules(series: Series) -> Judged:
 
 
 def _unsuited(series: Series) -> str | None:
-    """Why a series is not of the kind that is wanted; None where it is."""
+    """The reason why a series is of an unsuitable kind; None if it is suitable."""
     first = series.first
     names = re.sub(r"[_\-.]", " ", f"{first.description} {first.protocol}")
     kinds = {kind.upper() for kind in first.image_type}
@@ -112,7 +112,7 @@ def _unsuited(series: Series) -> str | None:
 
 
 def _fault(series: Series) -> str | None:
-    """Why a series cannot be a stack, whatever it shows; None where it can."""
+    """The reason why a series cannot be a stack, whatever it shows; None if it can."""
     cut = [image for image in series.images if image.is_cut]
     if any((image.n_frames or 1) > 1 for image in series.images):
         return "multi-frame images, which are not read here (convert them with dcm2niix, then pass --stacks)"
@@ -136,7 +136,7 @@ def _fault(series: Series) -> str | None:
 
 
 def _without_repeats(verdicts: list[Judged]) -> list[Judged]:
-    """Scanners may store an acquisition twice, with and without a filter: it must not count twice."""
+    """Drop repeats: scanners may store an acquisition twice, with and without a filter."""
     kept: dict[tuple[object, ...], Series] = {}
     for one in sorted((one for one in verdicts if one.is_taken), key=lambda one: "ND" in one.series.first.image_type):
         kept.setdefault(_acquisition(one.series), one.series)
@@ -152,7 +152,7 @@ def _without_repeats(verdicts: list[Judged]) -> list[Judged]:
 
 
 def _acquisition(series: Series) -> tuple[object, ...]:
-    """What only copies of one acquisition share; the series itself where its header has no times."""
+    """A key that only copies of one acquisition share; the UID of the series if its headers have no times."""
     if not all(image.acquired_at for image in series.images):
         return (series.first.series_uid,)
     places_mm = np.round(np.concatenate([[0.0], np.cumsum(series.steps_mm)]), 1)

@@ -1,4 +1,4 @@
-"""Series become NIfTI files with sidecars, by dcm2niix, one series at a time and under names that say nothing."""
+"""Conversion of series to NIfTI files with sidecars, by dcm2niix, one at a time, under names free of patient data."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from g3r.dicom.series import UNEVEN_FROM, Series
 from g3r.errors import InputError
 
 OPTIONS = ("-b", "y", "-ba", "y", "-z", "n", "-g", "i", "-c", "")
-"""Sidecars, without names and dates; no compression, so that the same images give the same bytes; no defaults of the
-user's; no comment, in place of which dcm2niix would take the image's own."""
+"""Sidecars without names and dates; no compression, so that the same images give the same bytes; no defaults of the
+user; an empty comment, because dcm2niix would otherwise copy the image's own."""
 
 KEPT_KEYS = (
     "SliceThickness",
@@ -26,15 +26,15 @@ KEPT_KEYS = (
     "PhaseEncodingAxis",
     "InPlanePhaseEncodingDirectionDICOM",
 )
-"""What is left of a sidecar. It would name institution, device and times in spite of `-ba y`; and the distance of
-slices follows from their places, so that what the header says of it does not matter."""
+"""Keys that are kept of a sidecar. The others include institution, device and times in spite of `-ba y`. The slice
+spacing follows from the places of slices, so the header's own value is not needed."""
 
 TIMEOUT_S = 600.0
-"""A series takes a tenth of a second; a network drive may hang."""
+"""Time limit of a conversion, which takes a tenth of a second; a network drive may hang."""
 
 
 def converter() -> str:
-    """The path of dcm2niix: of its Python package, or else of the system.
+    """The path of dcm2niix: from its Python package, or else from the system.
 
     Raises:
         ModuleNotFoundError: it is not installed.
@@ -68,11 +68,11 @@ def convert(series: Series, folder: Path) -> Path:
     """Write a series as `series-N.nii` with `series-N.json`; returns the path of the image.
 
     Args:
-        series: that can be a stack.
-        folder: to write into, private.
+        series: a series that can be a stack.
+        folder: private folder to write into.
 
     Raises:
-        InputError: dcm2niix fails, or makes another stack of the series than its headers describe.
+        InputError: dcm2niix fails, or its stack differs from what the headers describe.
         ModuleNotFoundError: dcm2niix is not installed.
     """
     images, target = folder / f"{series.name}-images", folder / f"{series.name}.nii"
@@ -88,7 +88,7 @@ def convert(series: Series, folder: Path) -> Path:
             "disk, or leave the series out (--series)"
         ) from None
     shutil.rmtree(images)
-    # what dcm2niix printed is not passed on: it quotes headers
+    # the output of dcm2niix is not passed on, because it quotes headers
     made = sorted(path.name for path in folder.glob(f"{series.name}*.nii") if _is_of(path.name, series.name))
     if done.returncode or made != [target.name]:
         found = f"exit code {done.returncode}" if done.returncode else f"{len(made)} images in place of one"
@@ -120,7 +120,7 @@ def _is_of(name: str, series_name: str) -> bool:
 
 
 def _link(source: Path, target: Path) -> None:
-    """A link where the system allows it, or else a copy."""
+    """Make a link if the system allows it, or else a copy."""
     try:
         os.symlink(source, target)
     except OSError:
@@ -128,7 +128,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _check_geometry(path: Path, series: Series) -> None:
-    """Raise `InputError` where slices were lost or are not as far apart as their headers say."""
+    """Raise `InputError` if slices were lost, or if their spacing differs from the headers'."""
     image, _ = open_nifti(path)
     spacing_mm = series.spacing_mm
     assert spacing_mm is not None
@@ -142,10 +142,10 @@ def _check_geometry(path: Path, series: Series) -> None:
 
 
 def _reduce_sidecar(path: Path) -> None:
-    """Keep what decides the slice profile; a thickness of zero is none.
+    """Reduce a sidecar to the keys that determine the slice profile; empty and zero values are dropped.
 
     Raises:
-        InputError: it is not JSON.
+        InputError: the sidecar is not JSON.
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8", errors="replace"), strict=False)

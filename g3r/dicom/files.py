@@ -1,4 +1,4 @@
-"""The DICOM files below a folder, told by their first bytes."""
+"""The DICOM files below a folder, recognised by their first bytes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from itertools import islice
 from pathlib import Path
 
 PREAMBLE_BYTES, MAGIC = 128, b"DICM"
-"""A DICOM file says what it is behind a preamble of this length."""
+"""A DICOM file has these magic bytes after a preamble of this length."""
 
 LOOKED_AT = 1000
-"""Files that are looked at to see what a folder holds."""
+"""Number of files that are checked to see whether a folder holds DICOM."""
 
 
 def is_dicom(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is DICOM by its first bytes; one that cannot be read is not."""
+    """Whether a file is DICOM, by its first bytes; False if it cannot be read."""
     try:
         return _begins_as_dicom(path)
     except (OSError, ValueError):
@@ -24,7 +24,7 @@ def is_dicom(path: str | os.PathLike[str]) -> bool:
 
 
 def _begins_as_dicom(path: str | os.PathLike[str]) -> bool:
-    if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+    if not stat.S_ISREG(os.stat(path).st_mode):  # reading a pipe would block
         return False
     with open(path, "rb") as stream:
         return stream.read(PREAMBLE_BYTES + len(MAGIC))[PREAMBLE_BYTES:] == MAGIC
@@ -34,8 +34,8 @@ def dicom_files(folder: str | os.PathLike[str], unreadable: list[OSError]) -> It
     """The DICOM files below a folder, in the order of their paths.
 
     Args:
-        folder: to look in.
-        unreadable: gets what the system says of each file and folder that cannot be read.
+        folder: folder to search.
+        unreadable: gets the error of each file and folder that cannot be read.
     """
     for parent, folders, names in os.walk(folder, onerror=unreadable.append):
         folders.sort()
@@ -50,6 +50,6 @@ def dicom_files(folder: str | os.PathLike[str], unreadable: list[OSError]) -> It
 
 
 def holds_dicom(folder: str | os.PathLike[str]) -> bool:
-    """Whether there is DICOM among the first files below a folder, which may be the whole disk."""
+    """Whether there is DICOM among the first `LOOKED_AT` files below a folder, which may be a whole disk."""
     paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
     return any(map(is_dicom, islice(paths, LOOKED_AT)))

@@ -1,4 +1,4 @@
-"""The headers of DICOM images below a folder, reduced to what decides whether and how a series is used."""
+"""Headers of the DICOM images below a folder, reduced to the fields that the choice and use of series need."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
 FARTHEST_MM = 1e5
-"""From the middle of the scanner."""
+"""Largest coordinate of an image position that is accepted."""
 
 TEXTS = {
     "sop_class_uid": "SOPClassUID",
@@ -38,7 +38,7 @@ TEXTS = {
     "acquired_on": "AcquisitionDate",
     "acquired_at": "AcquisitionTime",
 }
-"""Texts that are read, by our name; "" where a header has none."""
+"""Texts that are read, by our name; "" if absent from a header."""
 
 NUMBERS = {
     "number": "SeriesNumber",
@@ -50,13 +50,13 @@ NUMBERS = {
     "bits": "BitsAllocated",
     "n_frames": "NumberOfFrames",
 }
-"""Numbers that are read; None where a header has none."""
+"""Numbers that are read; None if absent from a header."""
 
 LISTS = {"image_type": "ImageType", "scanning_sequence": "ScanningSequence"}
-"""Code words that are read; () where a header has none."""
+"""Code words that are read; () if absent from a header."""
 
 MR_CLASSES = "1.2.840.10008.5.1.4.1.1.4"
-"""Their files have pixels, or they are cut off in the header."""
+"""Prefix of the UIDs of MR image classes. Such a file has pixels; without them its header is cut off."""
 
 POSITION, AXES, SPACING = "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"
 
@@ -65,13 +65,13 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHeader:
-    """One DICOM image.
+    """The header of one DICOM image.
 
     Attributes:
-        path: of its file.
-        position_mm: of the centre of its first pixel, in the patient's frame (LPS); None without.
-        axes: [2, 3] directions of a row and of a column; None without.
-        is_cut: whether the file is shorter than its pixels.
+        path: path of its file.
+        position_mm: position of the centre of its first pixel, in the patient's frame (LPS); None if absent.
+        axes: [2, 3] directions of a row and of a column; None if absent.
+        is_cut: whether the file is too short for its pixels.
         sop_class_uid, sop_uid, series_uid, study_uid, frame_uid, patient_id, description, protocol, modality,
             acquisition_type, acquired_on, acquired_at: see `TEXTS`.
         number, instance_number, echo_time_ms, thickness_mm, rows, columns, bits, n_frames: see `NUMBERS`.
@@ -108,12 +108,12 @@ class ImageHeader:
 
 @dataclass(frozen=True)
 class FoundImages:
-    """What is below a folder.
+    """The images found below a folder.
 
     Attributes:
-        images: each once.
+        images: all images, each once.
         n_damaged: DICOM files that are left out, because their headers cannot be read.
-        n_unreadable: files and folders that the system does not let be read: nobody knows what they are.
+        n_unreadable: files and folders without read permission, so that their kind is unknown.
     """
 
     images: list[ImageHeader]
@@ -122,12 +122,12 @@ class FoundImages:
 
 
 def read_images(folder: str | os.PathLike[str]) -> FoundImages:
-    """The images below a folder, and how much could not be read.
+    """The images below a folder, and the number of unreadable files.
 
     Files without pixels (DICOMDIR, reports) are left out.
 
     Raises:
-        InputError: no such folder, or no DICOM image in it.
+        InputError: the folder does not exist, or holds no DICOM image.
     """
     if not Path(folder).is_dir():
         found = "is a file" if Path(folder).exists() else "does not exist"
@@ -140,7 +140,7 @@ def read_images(folder: str | os.PathLike[str]) -> FoundImages:
             image = read_header(path)
         except ModuleNotFoundError:
             raise
-        except Exception:  # pydicom raises whatever damaged bytes make it raise
+        except Exception:  # pydicom may raise anything on damaged bytes
             n_damaged += 1
             continue
         if image.rows and image.series_uid:
@@ -163,8 +163,8 @@ def read_header(path: Path) -> ImageHeader:
     Raises:
         Exception: whatever pydicom raises for a damaged file.
     """
-    # Pixels are not read; values are parsed when they are asked for, so both happen where nothing is said about them:
-    # what pydicom says of a bad value quotes it.
+    # Pixels are not read. pydicom parses values on access, so both reading and parsing happen inside the silent block:
+    # its messages about a bad value quote that value.
     from pydicom import dcmread
 
     with quiet_pydicom(), path.open("rb") as stream:
@@ -175,7 +175,7 @@ def read_header(path: Path) -> ImageHeader:
 
 @contextmanager
 def quiet_pydicom() -> Iterator[None]:
-    """No warnings and log lines about the values of a header: they quote what they are about."""
+    """Suppress pydicom's warnings and log lines, which quote values of headers."""
     logger = logging.getLogger("pydicom")
     before, logger.disabled = logger.disabled, True
     try:
@@ -187,12 +187,12 @@ def quiet_pydicom() -> Iterator[None]:
 
 
 def _header(path: Path, header: Dataset, n_left: int) -> ImageHeader:
-    """What is kept of a header.
+    """The reduced header of an image.
 
     Args:
-        path: of the file.
-        header: as it was read.
-        n_left: bytes from the pixels on.
+        path: path of the file.
+        header: header as read by pydicom.
+        n_left: bytes of the file from the pixels on.
     """
     texts = {ours: _value(header, name, str) or "" for ours, name in TEXTS.items()}
     numbers = {ours: _value(header, name, _number) for ours, name in NUMBERS.items()}
@@ -212,7 +212,7 @@ def _header(path: Path, header: Dataset, n_left: int) -> ImageHeader:
 
 
 def _value(header: Dataset, name: str, parse: Callable[[Any], Value]) -> Value | None:
-    """A value of a header; None where it is absent, empty or not what it should be."""
+    """A value of a header; None if it is absent, empty or invalid."""
     try:
         found = header.get(name)
         return None if found is None or found == "" else parse(found)
@@ -236,16 +236,16 @@ def _vector(found: Any) -> NDArray[np.float64]:
 
 
 def _is_vector(found: NDArray[np.float64] | None, size: int, most: float) -> bool:
-    """Whether there are so many numbers, none larger than the most that makes sense."""
+    """Whether a vector has `size` numbers, none of them beyond `most`."""
     return found is not None and found.size == size and bool(np.abs(found).max() <= most)
 
 
 def _is_cut(header: Dataset, n_left: int, numbers: dict[str, float | None]) -> bool:
-    """Whether the file cannot hold its pixels; nobody knows that of compressed ones.
+    """Whether the file is too short for its pixels; False for compressed pixels, whose size is unknown.
 
     Args:
-        header: of the file.
-        n_left: bytes from the pixels on.
+        header: header of the file.
+        n_left: bytes of the file from the pixels on.
         numbers: see `NUMBERS`.
     """
     rows, columns, bits = (numbers[name] or 0 for name in ("rows", "columns", "bits"))

@@ -1,4 +1,4 @@
-"""A folder for images on their way: nobody else can read it, and it is gone at the end."""
+"""A private temporary folder for images in conversion, which is removed at the end."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PREFIX = "g3r-dicom-"
 def private_folder() -> Iterator[Path]:
     """A new folder below the system's for temporary files (TMPDIR).
 
-    It goes when the block ends, by an error or a signal, too. After `kill -9` the next run on the same machine removes
-    it.
+    Only this user can read it. It is removed when the block ends, also by an error or a signal. After `kill -9` the
+    next run on the same machine removes it.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
     _remove_leftovers(Path(tempfile.gettempdir()))
     with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{process_mark()}-", ignore_cleanup_errors=True) as folder:
@@ -29,9 +29,10 @@ def private_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove the folders of processes that ended without doing so.
+    """Remove the folders left by processes that were killed.
 
-    Other users' cannot be removed, and stay; so do those of other machines and containers, which may be running.
+    Folders of other users cannot be removed. Those of other machines and containers are kept, because they may be
+    running.
     """
     for folder in parent.glob(f"{PREFIX}*"):
         if is_left_over(folder.name.removeprefix(PREFIX)) and not folder.is_symlink():

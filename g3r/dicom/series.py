@@ -14,30 +14,31 @@ from numpy.typing import NDArray
 from g3r.dicom.headers import ImageHeader
 
 PLANES = ("sagittal", "coronal", "axial")
-"""By the axis of the patient's frame that is nearest to the normal."""
+"""Names of planes by the axis of the patient's frame that is nearest to the normal."""
 
 SAME_DIRECTION = 1e-3
 """Largest difference of direction cosines within a stack: about 0.06 degrees."""
 
 SAME_PLACE_MM = 0.01
-"""Two slices nearer than this are one slice, imaged twice."""
+"""Two images closer than this show the same slice."""
 
 MISSING_FROM, UNEVEN_FROM = 1.5, 1.02
-"""A distance this many times the usual one is a hole; one above the second is not even."""
+"""Slices are missing where a distance exceeds the first number times the usual one. The slice spacing is uneven if the
+largest distance exceeds the second number times the smallest."""
 
 SHOWN_TILT_DEGREES = 3
 
 MAX_NAMED = 10
-"""Missing slices that are named one by one."""
+"""Most missing slices that are listed one by one."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """A series.
+    """A DICOM series.
 
     Args:
-        label: by which it is asked for: its number, with a letter where several have the same.
-        images: all of them, in the order in which they were read.
+        label: name by which it is requested: its number, with a letter if several series have that number.
+        images: all images, in the order in which they were read.
     """
 
     label: str
@@ -45,27 +46,27 @@ class Series:
 
     @property
     def name(self) -> str:
-        """Of its file, and in messages and results; says nothing of the patient."""
+        """Name of its file, also in messages and results; free of patient data."""
         return f"series-{self.label}"
 
     @property
     def first(self) -> ImageHeader:
-        """The image that speaks for all in what a series has in common."""
+        """The image from which the common properties of the series are taken."""
         return self.images[0]
 
     @property
     def n_images(self) -> int:
-        """How many images there are."""
+        """Number of images."""
         return len(self.images)
 
     @property
     def is_placed(self) -> bool:
-        """Whether every image says where it is."""
+        """Whether every image has a position and an orientation."""
         return all(image.position_mm is not None and image.axes is not None for image in self.images)
 
     @cached_property
     def n_directions(self) -> int:
-        """How many directions the slices have; 0 where they do not say it."""
+        """Number of different slice orientations; 0 if any is unknown."""
         if not self.is_placed:
             return 0
         found: list[NDArray[np.float64]] = []
@@ -77,40 +78,40 @@ class Series:
 
     @cached_property
     def normal(self) -> NDArray[np.float64]:
-        """Of the first slice [3], in the patient's frame; only where it is placed."""
+        """Normal [3] of the first slice, in the patient's frame; only if `is_placed`."""
         assert self.first.axes is not None
         return np.cross(*self.first.axes)
 
     @cached_property
     def by_place(self) -> list[ImageHeader]:
-        """The images along the normal; only where they are placed."""
+        """The images in order along the normal; only if `is_placed`."""
         return sorted(self.images, key=self._height_mm)
 
     @cached_property
     def steps_mm(self) -> NDArray[np.float64]:
-        """Distances of neighbouring slices [n_images - 1]; only where they are placed."""
+        """Distances of neighbouring slices [n_images - 1]; only if `is_placed`."""
         return np.diff([self._height_mm(image) for image in self.by_place])
 
     def _height_mm(self, image: ImageHeader) -> float:
-        """The place of an image along the normal."""
+        """Position of an image along the normal."""
         assert image.position_mm is not None
         return float(self.normal @ image.position_mm)
 
     @property
     def spacing_mm(self) -> float | None:
-        """The usual distance of slices; None where there is none."""
+        """Median distance of neighbouring slices; None without one orientation or with a single slice."""
         if self.n_directions != 1 or self.n_images < 2:
             return None
         return float(np.median(self.steps_mm))
 
     @property
     def thickness_mm(self) -> float | None:
-        """Of a slice; None where the header does not say it."""
+        """Slice thickness; None if the header does not state it."""
         return self.first.thickness_mm
 
     @property
     def plane(self) -> str:
-        """In words, such as "axial" or "coronal, 12 degrees off"."""
+        """The plane in words, such as "axial" or "coronal, 12 degrees off"."""
         if self.n_directions != 1:
             return f"{self.n_directions} planes" if self.n_directions else "-"
         along = int(np.argmax(np.abs(self.normal)))
@@ -118,7 +119,7 @@ class Series:
         return PLANES[along] + (f", {tilt:.0f}° off" if tilt >= SHOWN_TILT_DEGREES else "")
 
     def missing(self) -> str | None:
-        """Which slices are missing, as far as places tell; None where none is. Missing ends cannot be seen."""
+        """Missing slices in words, by gaps between places; None if there are none. Missing ends cannot be detected."""
         usual_mm = self.spacing_mm
         if usual_mm is None or usual_mm < SAME_PLACE_MM:
             return None
@@ -137,7 +138,7 @@ class Series:
         return text
 
     def _absent_numbers(self) -> list[int]:
-        """Image numbers between the first and the last that no image has."""
+        """Missing image numbers between the first and the last."""
         found = {int(image.instance_number) for image in self.images if image.instance_number is not None}
         if not found or max(found) - min(found) > len(found) + MAX_NAMED:
             return []
@@ -149,7 +150,7 @@ def _counted(numbers: Sequence[int]) -> str:
 
 
 def grouped(images: Sequence[ImageHeader]) -> list[Series]:
-    """The series that images belong to, by number; those of one number in the order of acquisition."""
+    """Images grouped into series, in order of their numbers; those with the same number in order of acquisition."""
     by_uid: dict[str, list[ImageHeader]] = defaultdict(list)
     for image in images:
         by_uid[image.series_uid].append(image)
@@ -165,5 +166,5 @@ def grouped(images: Sequence[ImageHeader]) -> list[Series]:
 
 
 def _letters(n: int) -> str:
-    """The letters a, b, ... z, za, zb, ... by number from 0."""
+    """The suffix for an index from 0: a, b, ... y, za, zb, ... in alphabetical order."""
     return "z" * (n // 25) + ascii_lowercase[n % 25]

@@ -1,4 +1,4 @@
-"""The examination that a volume belongs to: what a series of its own has to repeat, and what it refers to."""
+"""The examination of a volume: the elements that its own series repeats, and the images that it refers to."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ PATIENT = (
     "DeidentificationMethod",
     "DeidentificationMethodCodeSequence",
 )
-"""Of the patient module: who it is, for an archive to put the series in its place. Histories and addresses are not
-needed for that, and stay behind."""
+"""Elements of the patient module that identify the patient, by which an archive files the series. Histories and
+addresses are not needed for that, and are not copied."""
 
 STUDY = (
     "StudyInstanceUID",
@@ -43,7 +43,7 @@ STUDY = (
     "PatientSize",
     "PatientWeight",
 )
-"""Of the study modules, which are the same in every series of an examination."""
+"""Elements of the study modules, which are the same in every series of an examination."""
 
 EMPTY_IF_ABSENT = (
     "PatientName",
@@ -65,7 +65,7 @@ class SourceStudy:
 
     Args:
         identity: the elements of `PATIENT` and `STUDY`, with their character set.
-        images: that the volume refers to.
+        images: images that the volume refers to.
     """
 
     identity: Dataset
@@ -73,20 +73,20 @@ class SourceStudy:
 
     @property
     def frame_uid(self) -> str | None:
-        """Of the patient's frame, where all images share one."""
+        """UID of the frame of reference, if all images share one."""
         found = {image.frame_uid for image in self.images}
         return found.pop() or None if len(found) == 1 else None
 
 
 def study_of(images: Sequence[ImageHeader], named: str | os.PathLike[str]) -> SourceStudy:
-    """The examination of images.
+    """The examination of the given images.
 
     Args:
         images: at least one.
-        named: where they are, for messages.
+        named: their folder, for messages.
 
     Raises:
-        InputError: they are of several examinations, or a file has changed since.
+        InputError: they are of several examinations, or the first file cannot be read any more.
     """
     n_studies = len({(image.study_uid, image.patient_id) for image in images})
     if n_studies > 1:
@@ -103,7 +103,7 @@ def study_of(images: Sequence[ImageHeader], named: str | os.PathLike[str]) -> So
                     identity[name] = header[name]
                 elif name in EMPTY_IF_ABSENT:
                     setattr(identity, name, "")
-    except Exception:  # pydicom raises whatever damaged bytes make it raise
+    except Exception:  # pydicom may raise anything on damaged bytes
         raise InputError(f"{named}: the header of its first image cannot be read; export the images again") from None
     return SourceStudy(identity, tuple(images))
 

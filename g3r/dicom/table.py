@@ -14,11 +14,11 @@ HIDDEN = "(descriptions are shown on a terminal only: they may name the patient)
 
 
 def table_of(verdicts: Sequence[Judged], *, descriptions: bool) -> str:
-    """Lines about every series.
+    """The text of the table, one line per series.
 
     Args:
-        verdicts: on all series of a folder.
-        descriptions: whether the words of the scanner's operator are shown.
+        verdicts: decisions on all series of a folder.
+        descriptions: whether the descriptions by the scanner's operator are shown.
     """
     rows = [HEADINGS, *(_row(one, descriptions=descriptions) for one in verdicts)]
     columns = list(zip(*rows, strict=True))
@@ -42,7 +42,7 @@ def _row(one: Judged, *, descriptions: bool) -> tuple[str, ...]:
     verdict = "yes" if one.is_taken else "no"
     return (
         series.label,
-        # what a header holds must not steer the terminal
+        # a header must not send control characters to the terminal
         "".join(c if c.isprintable() else "?" for c in series.first.description)[:MAX_DESCRIPTION]
         if descriptions
         else "",

@@ -1,4 +1,4 @@
-"""A volume as a classic MR series of the examination that it was made from: one file for each slice."""
+"""A volume as a classic MR series of its source examination: one file per slice."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ SPACES = {
     True: "In the frame of the source images",
     False: "In standard orientation, not in the frame of the source images",
 }
-"""By whether the volume is in scanner space."""
+"""Words for the space, by whether the volume is in scanner space."""
 
 FIRST_NUMBER = 9001
-"""Of the series: above what scanners count to."""
+"""Least number of the series, above the numbers that scanners use."""
 
 MAX_STORED = 2**16 - 1
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 BRIGHT_PERCENTILE = 99.9
-"""Of the positive values; the window for viewers ends there."""
+"""Percentile of the positive values at which the window for viewers ends."""
 
 
 @dataclass(frozen=True)
 class StoredValues:
-    """Whole numbers for values: value = slope * number + intercept, within half a slope.
+    """Values quantised to whole numbers: value = slope * number + intercept, within half a slope.
 
     Args:
         numbers: [I, J, K] uint16.
-        slope, intercept: as texts of at most 16 characters, which is what DICOM keeps.
+        slope, intercept: as texts of at most 16 characters, the limit of DICOM.
     """
 
     numbers: NDArray[np.uint16]
@@ -62,7 +62,7 @@ class StoredValues:
 
     @classmethod
     def of(cls, values: NDArray[np.floating]) -> StoredValues:
-        """The finest whole numbers that 16 bits allow."""
+        """The values in the finest quantisation of 16 bits."""
         from pydicom.valuerep import format_number_as_ds
 
         low, high = min(float(values.min()), 0.0), float(values.max())
@@ -73,10 +73,10 @@ class StoredValues:
 
 
 def check_new_folder(folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder that a series cannot be written to.
+    """Refuse a folder into which a series cannot be written.
 
     Raises:
-        InputError: it is not empty, is a file, or is below one.
+        InputError: it is not empty, is a file, is below a file, or cannot be created.
     """
     path = Path(folder)
     try:
@@ -103,15 +103,15 @@ def write_volume_series(
 ) -> None:
     """Write a volume as a series of its examination; the folder appears whole or not at all.
 
-    The files name the patient: they belong to the examination. Nothing else that g3r writes does.
+    The files name the patient, because they belong to the examination. No other output of g3r does.
 
     Args:
-        folder: to write, new or empty.
+        folder: folder to write, new or empty.
         volume: [I, J, K].
         affine: [4, 4] RAS+ mm from index, right-handed.
-        study: that it was made from.
+        study: examination that it was made from.
         in_scanner_space: whether it is in the frame of the study's images.
-        remark: for whoever looks at the images, behind the words that all of them carry.
+        remark: remark for viewers, after the standard image comment.
 
     Raises:
         InputError: the folder is not empty or cannot be written.
@@ -130,12 +130,12 @@ def write_volume_series(
 
 
 def _images(volume: NDArray[np.floating], affine: NDArray[np.float64], series: Dataset) -> Iterator[Dataset]:
-    """One image for each slice along the third axis, shown as radiologists expect: right on the left, front on top.
+    """One image per slice along the third axis, in radiological orientation: right on the left, front on top.
 
     Args:
         volume: [I, J, K].
         affine: [4, 4] RAS+ mm from index.
-        series: what all images have in common; what depends on the volume is added.
+        series: common elements of all images; elements that depend on the volume are added to it.
     """
     from pydicom.uid import generate_uid
 
@@ -151,7 +151,7 @@ def _images(volume: NDArray[np.floating], affine: NDArray[np.float64], series: D
 
 
 def _series(study: SourceStudy, *, in_scanner_space: bool, remark: str) -> Dataset:
-    """What all images of the series have in common, whatever they show."""
+    """Elements common to all images of the series that do not depend on the volume."""
     from pydicom.dataset import Dataset
     from pydicom.uid import MRImageStorage, generate_uid
 
@@ -181,7 +181,7 @@ def _series(study: SourceStudy, *, in_scanner_space: bool, remark: str) -> Datas
 
 
 def _set_axes(one: Dataset, lps: NDArray[np.float64]) -> None:
-    """Directions and distances of pixels and slices, from the affine [4, 4] of the patient's frame from index."""
+    """Set directions and distances of pixels and slices, from the affine [4, 4] that maps index to patient's frame."""
     spacing_mm = np.linalg.norm(lps[:3, :3], axis=0)
     one.PixelSpacing = [_decimal(spacing_mm[1]), _decimal(spacing_mm[0])]
     one.SliceThickness = one.SpacingBetweenSlices = _decimal(spacing_mm[2])
@@ -189,7 +189,7 @@ def _set_axes(one: Dataset, lps: NDArray[np.float64]) -> None:
 
 
 def _set_references(one: Dataset, images: tuple[ImageHeader, ...]) -> None:
-    """Name every image that the volume was made from, on its own and by series."""
+    """Refer to every image that the volume was made from, one by one and by series."""
     from pydicom.dataset import Dataset
 
     references: dict[str, list[Dataset]] = {}
@@ -207,7 +207,7 @@ def _set_references(one: Dataset, images: tuple[ImageHeader, ...]) -> None:
 
 
 def _set_values(one: Dataset, values: NDArray[np.floating], stored: StoredValues) -> None:
-    """How numbers become values, and which of them a viewer should show."""
+    """Set the mapping from numbers to values, and the window for viewers."""
     one.RescaleSlope, one.RescaleIntercept, one.RescaleType = stored.slope, stored.intercept, "US"
     positive = values[values > 0]
     bright = float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 1.0
@@ -219,14 +219,14 @@ def _set_values(one: Dataset, values: NDArray[np.floating], stored: StoredValues
 def _slice(
     series: Dataset, numbers: NDArray[np.uint16], position_mm: NDArray[np.float64], instance: int, uid: UID
 ) -> Dataset:
-    """One image.
+    """One image of the series.
 
     Args:
-        series: what all have in common.
+        series: common elements of all images.
         numbers: [rows, columns].
-        position_mm: of the centre of the first pixel.
+        position_mm: position of the centre of the first pixel.
         instance: number of the image.
-        uid: of the image.
+        uid: UID of the image.
     """
     from pydicom.dataset import Dataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage
@@ -244,7 +244,7 @@ def _slice(
 
 
 def _decimal(value: float) -> str:
-    """A number in the 16 characters that DICOM has for it."""
+    """A number as a DICOM decimal string of at most 16 characters."""
     from pydicom.valuerep import format_number_as_ds
 
     return format_number_as_ds(float(value))

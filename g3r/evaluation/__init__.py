@@ -1,1 +1,1 @@
-"""How good a reconstruction is, given the truth: image scores, rigid alignment, pose error."""
+"""Quality of a reconstruction against the truth or a held-out stack: image scores, rigid alignment, pose error."""

@@ -24,31 +24,31 @@ logger = logging.getLogger(__name__)
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0])
 
 START_ANGLES_DEG = (-25.0, 0.0, 25.0)
-"""Start rotations about each axis; with the reach of a coarse level (about 20 degrees) they cover 45."""
+"""Start rotations about each axis; with the reach of the coarse level (about 20 degrees) they cover 45 degrees."""
 
 GOOD_ENOUGH_NCC = 0.95
 """If the first start reaches this at the coarse level, the others are not tried."""
 
 N_NEAR = 2
-"""The first starts, without rotations: all that a volume needs whose orientation is known."""
+"""Number of first starts, without rotations, which suffice for a volume of known orientation."""
 
 COARSE_SHRINK = 4
 SAMPLED_SHARE = 0.15
 """Share of the voxels that the metric uses, on a regular lattice that ITK jitters."""
 
 SAMPLING_SEED = 1
-"""Seed of that jitter; ITK's default is the clock, and then no two runs agree."""
+"""Seed of that jitter; ITK's default is the clock, by which no two runs would agree."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A rigid motion of the reference's space onto the volume's, and how well they then correlate.
+    """A rigid motion of the reference's space onto the volume's, and the correlation that it reaches.
 
     Attributes:
         volume_from_reference: one pose; maps a world point of the reference to that of the volume.
         ncc: absolute correlation in the mask that the registration reached.
         rotation_deg: angle of the motion.
-        translation_mm: how far the middle of the mask moves.
+        translation_mm: displacement of the middle of the mask.
     """
 
     volume_from_reference: RigidPose
@@ -61,13 +61,13 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, n
     """Find the rigid motion that best correlates a volume with the reference inside its mask.
 
     Multi-start at a coarse level (centres of mass, headers as they are, then rotations about each
-    axis), two fine levels from the best start, and a last climb on all voxels. Repeatable to the bit.
+    axis), two fine levels from the best start, and a last optimisation on all voxels. Repeatable to the bit.
 
     Args:
         volume: the image to be aligned; zero or not finite where it has no data.
-        reference: the image that stays.
+        reference: the fixed image.
         mask: bool [I, J, K] on the reference's grid.
-        near: whether the volume is known to lie there within some ten degrees; then no rotations are tried.
+        near: whether the volume is known to be aligned within some ten degrees; then no rotations are tried.
 
     Raises:
         InputError: no start gave an overlap, or a header is sheared.
@@ -92,7 +92,7 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, n
             "check that both show the same brain"
         )
     _, transform = _register(fixed, moving, fixed_mask, best[1], levels=(2, 1), n_iterations=200)
-    # sampled metrics leave about a tenth of a voxel, which shows from 32 dB up: end on all voxels
+    # sampled metrics leave an error of a tenth of a voxel, visible above 32 dB, so end on all voxels
     ncc, transform = _register(fixed, moving, fixed_mask, transform, levels=(1,), n_iterations=60, step_mm=0.1)
     pose = _pose(transform)
     center = reference.grid.world(np.argwhere(mask).mean(0))
@@ -107,12 +107,12 @@ def align_rigid(volume: Volume, reference: Volume, mask: NDArray[np.bool_], *, n
 def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | None = None) -> NDArray[np.float32]:
     """A volume's values [I, J, K] at the voxels of another grid, by cubic B-splines; zero outside.
 
-    On the same grid without a motion the values are returned untouched.
+    On the same grid without a motion the values are returned unchanged.
 
     Args:
-        volume: to be read; values that are not finite count as zero.
-        grid: of the result.
-        volume_from_grid: one motion of world space, from the grid to the volume; none when None.
+        volume: volume to resample; values that are not finite count as zero.
+        grid: grid of the result.
+        volume_from_grid: one motion of world space, from the grid to the volume; None for no motion.
     """
     same = volume.data.shape == grid.shape and np.allclose(volume.affine, grid.affine, atol=1e-4)
     if volume_from_grid is None and same:
@@ -127,7 +127,7 @@ def resample(volume: Volume, grid: VolumeGrid, volume_from_grid: RigidPose | Non
 
 
 def _starts(fixed: sitk.Image, moving: sitk.Image) -> Iterator[sitk.Euler3DTransform]:
-    """Start transforms about the middle of the reference's grid, the likeliest first."""
+    """Start transforms around the middle of the reference's grid, the likeliest first."""
     index = [(n - 1) / 2 for n in fixed.GetSize()]
     middle_mm = fixed.TransformContinuousIndexToPhysicalPoint(index)
     translation_mm = _mass_translation_mm(fixed, moving)
@@ -139,7 +139,7 @@ def _starts(fixed: sitk.Image, moving: sitk.Image) -> Iterator[sitk.Euler3DTrans
 
 
 def _mass_translation_mm(fixed: sitk.Image, moving: sitk.Image) -> tuple[float, ...]:
-    """From the reference's centre of mass to the volume's; zero where a mass is not positive."""
+    """Translation from the reference's centre of mass to the volume's; zero if a mass is not positive."""
     try:
         moments = sitk.CenteredTransformInitializerFilter.MOMENTS
         return sitk.CenteredTransformInitializer(fixed, moving, sitk.Euler3DTransform(), moments).GetTranslation()
@@ -167,9 +167,9 @@ def _register(
     n_iterations: int,
     step_mm: float | None = None,
 ) -> tuple[float, sitk.Euler3DTransform]:
-    """Climb from one start; returns the correlation and the transform (fixed to moving).
+    """Optimise from one start; returns the correlation and the transform (fixed to moving).
 
-    With `step_mm`, a last climb in small steps on every voxel; otherwise on a sample in steps of 1.
+    With `step_mm`, in small steps on every voxel; otherwise in steps of 1 on a sample of the voxels.
     """
     method = sitk.ImageRegistrationMethod()
     method.SetNumberOfThreads(1)  # sums in one order: the same input gives the same result
@@ -201,7 +201,7 @@ def _pose(transform: sitk.Euler3DTransform) -> RigidPose:
 
 
 def _to_sitk(volume: Volume) -> sitk.Image:
-    """The ITK image of a RAS volume; values that are not finite become 0, as where there is no data."""
+    """The ITK image of a RAS volume; values that are not finite become 0, the value of missing data."""
     spacing = volume.grid.spacing_mm
     direction = LPS_FROM_RAS @ volume.affine[:3, :3] / spacing
     if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:

@@ -1,4 +1,4 @@
-"""A simulated subject in a folder: stacks, the true volume, the true pose of each slice."""
+"""A simulated subject in a folder: stacks, the true volume, and the true pose of each slice."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class SimulatedCase:
     """Content of a folder of `g3r-simulate` (`stack-N`, `mask-N`, `truth`, `truth-mask`, true poses).
 
     Attributes:
-        name: of the folder.
-        folder: where it is.
-        stacks: in the order of their numbers.
-        true: the pose that every slice was taken in.
-        points_mm: points of each slice by its header that errors are measured at.
+        name: name of the folder.
+        folder: path of the folder.
+        stacks: its stacks, in the order of their numbers.
+        true: the true pose of every slice.
+        points_mm: points of each slice, placed by its header, at which errors are measured.
     """
 
     name: str
@@ -46,12 +46,12 @@ class SimulatedCase:
 
     @cached_property
     def truth(self) -> Volume:
-        """The volume that was sliced."""
+        """The true volume, from which the stacks were simulated."""
         return load_volume(self.folder / "truth.nii.gz")
 
     @cached_property
     def truth_mask(self) -> NDArray[np.bool_]:
-        """Its mask."""
+        """The mask of the true volume."""
         return load_mask(self.folder / "truth-mask.nii.gz", self.truth)
 
     def header_error(self) -> PoseError:
@@ -60,7 +60,7 @@ class SimulatedCase:
         return target_registration_error(self.points_mm, self.true, PoseTable(self.true.keys, still))
 
     def pose_error(self, slices: Slices) -> PoseError:
-        """Error of the poses that slices of these stacks now have."""
+        """Error of the current poses of slices of these stacks."""
         return target_registration_error(self.points_mm, self.true, pose_table(slices))
 
 
@@ -69,7 +69,7 @@ def load_case(folder: str | os.PathLike[str], thickness_mm: float | None = None)
 
     Args:
         folder: see `SimulatedCase`.
-        thickness_mm: of the slices; None takes what `simulation.json` says, or else the slices' distance.
+        thickness_mm: slice thickness; None takes that of `simulation.json`, or else the slice spacing.
 
     Raises:
         InputError: the folder holds no stacks or no true poses, or a file cannot be used.
@@ -95,7 +95,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
     rotation (x, y, 0) + center.
 
     Raises:
-        InputError: neither file is there, or one cannot be read.
+        InputError: neither file exists, or one cannot be read.
     """
     folder = Path(folder)
     if (folder / "poses.tsv").is_file():
@@ -112,7 +112,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
         raise InputError(f"{path}: a pose cannot be read ({error}); expected rotation and center") from None
     grids = {n: load_volume(folder / f"mask-{n}.nii.gz").grid for n in {stack for stack, _ in keys}}
     frames = {n: grid.affine[:3, :3] / grid.spacing_mm for n, grid in grids.items()}
-    # frames may be left-handed; the motion between two of the same hand is proper all the same
+    # frames may be left-handed, but the motion between two frames of the same hand is still proper
     rotation = np.stack([r @ frames[key[0]].T for key, r in zip(keys, true_frame, strict=True)])
     middle = np.stack(
         [grids[n].world([(grids[n].shape[0] - 1) / 2, (grids[n].shape[1] - 1) / 2, float(k)]) for n, k in keys]
@@ -121,7 +121,7 @@ def read_true_poses(folder: str | os.PathLike[str]) -> PoseTable:
 
 
 def pose_table(slices: Slices) -> PoseTable:
-    """The poses that slices now have, as a table."""
+    """The current poses of slices, as a table."""
     keys = tuple(zip(slices.stack_id.tolist(), slices.slice_index.tolist(), strict=True))
     return PoseTable(keys, slices.world_from_header())
 

@@ -1,4 +1,4 @@
-"""From two volumes and a mask to scores: bring them on one grid, then measure."""
+"""Comparison of two volumes in a mask: resample them on one grid, then score."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores, the motion that was removed before (if any), and the volume as it was scored.
+    """Scores, the motion that was removed first (if any), and the volume as scored.
 
     Attributes:
         scores: see `Scores`.
-        alignment: None where the headers were used as they are.
+        alignment: None if the headers were used as they are.
         volume: float32 [I, J, K] on the reference's grid, intensities fitted to the reference.
     """
 
@@ -44,8 +44,8 @@ def compare(
         near: see `align_rigid`.
 
     Raises:
-        InputError: a volume without finite values, a reference that is not finite or not positive in the
-            mask, or volumes that do not overlap.
+        InputError: the volume has no finite values, the reference is not finite or not positive in the
+            mask, or the volumes do not overlap.
     """
     n_bad = int((~np.isfinite(volume.data)).sum())
     if n_bad == volume.data.size:

@@ -1,8 +1,8 @@
-"""How well a volume predicts a stack that it was not made from: what can be measured where there is no truth.
+"""Prediction of a held-out stack by a volume: a measure of quality without a truth.
 
 Every method is judged alike. Each slice is placed in the volume by a rigid pose of its own, simulated there (a
-Gaussian PSF), fitted in its intensities, and compared inside the mask, where the volume covers the PSF: so that
-cutting a volume at its mask neither helps nor hurts.
+Gaussian PSF), fitted in its intensities, and compared inside the mask where the volume covers the PSF. So cropping a
+volume to its mask neither helps nor hurts.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from g3r.registration.stack_in_volume import place_in_volume
 PSF_POINTS = (3, 3, 7)
 
 MIN_SUPPORT = 0.95
-"""Share of a pixel's PSF that must lie where the volume shows something, for the pixel to count."""
+"""Least share of a pixel's PSF in voxels that the volume shows, for the pixel to count."""
 
 MIN_PIXELS = 100
 """Slices with fewer counted pixels are left out."""
 
 ERODED_PIXELS = 1
-"""Pixels at the rim of the mask that do not count, as a default."""
+"""Default width of the mask's rim that does not count, in pixels."""
 
 DATA_RANGE_PERCENTILE = 99
 """The data range is this percentile of the stack in its mask."""
@@ -41,13 +41,13 @@ DATA_RANGE_PERCENTILE = 99
 
 @dataclass(frozen=True, kw_only=True)
 class StackPrediction:
-    """Scores of a stack that was held out.
+    """Scores of a held-out stack.
 
     Attributes:
         stack: name of its file.
-        slices: of those with enough counted pixels.
+        slices: scores of the slices with enough counted pixels.
         counted_share: counted pixels over those of the eroded masks.
-        search_correlation: how well the stack was found in the volume, before its slices were placed one by one.
+        search_correlation: correlation of the stack with the volume before its slices were placed one by one.
     """
 
     stack: str
@@ -56,7 +56,7 @@ class StackPrediction:
     search_correlation: float
 
     def _mean(self, name: str) -> float:
-        """A score of the slices, weighted by pixels."""
+        """Mean of a score over the slices, weighted by pixels."""
         return float(np.average([getattr(s, name) for s in self.slices], weights=[s.n_pixels for s in self.slices]))
 
     def figures(self) -> dict[str, float]:
@@ -73,17 +73,17 @@ class StackPrediction:
         }
 
     def record(self) -> dict[str, object]:
-        """Everything, for JSON."""
+        """All scores, for JSON."""
         return {"stack": self.stack, **self.figures(), "slices": [asdict(one) for one in self.slices]}
 
 
 @dataclass(frozen=True, kw_only=True)
 class PredictedPixels:
-    """A stack in the poses that were found for it in a volume, and its slices as the volume predicts them.
+    """A stack in its estimated poses in a volume, and its slices as predicted by the volume.
 
     Attributes:
         slices: K slices in their poses.
-        value: [P] pixels as the volume predicts them, in its own intensities.
+        value: [P] pixels as predicted by the volume, in its intensities.
         seen: [P] share of each pixel's PSF that lies where the volume counts.
         search_correlation: see `StackPrediction`.
     """
@@ -107,18 +107,18 @@ def predict_stack(
     eroded_pixels: int = ERODED_PIXELS,
     seed: int = 0,
 ) -> StackPrediction:
-    """Compare a stack with what a volume predicts of it.
+    """Compare a stack with its prediction by a volume.
 
     Args:
-        volume: made without the stack, in any orientation.
-        stack: with its mask.
-        support: [I, J, K] voxels that count, of those that are not zero; all of these when None. Give two volumes the
-            same one to compare them.
-        eroded_pixels: at the rim of the mask that do not count.
-        seed: of the search.
+        volume: volume made without the stack, in any orientation.
+        stack: the stack, with its mask.
+        support: [I, J, K] voxels that count, among those that are not zero; None counts all of these. Use the same
+            support to compare two volumes.
+        eroded_pixels: width of the mask's rim that does not count.
+        seed: seed of the search.
 
     Raises:
-        InputError: a volume or a stack that cannot be used, or a stack that is not found in the volume.
+        InputError: the volume or the stack cannot be used, or the stack is not found in the volume.
     """
     found = predicted_pixels(volume, stack, support=support, seed=seed)
     return score_prediction(found, stack.name, volume.name, eroded_pixels)
@@ -130,7 +130,7 @@ def predicted_pixels(
     """Find the slices of a stack in a volume, and simulate them there; for arguments see `predict_stack`.
 
     Raises:
-        InputError: a volume or a stack that cannot be used.
+        InputError: the volume or the stack cannot be used.
     """
     data = np.nan_to_num(volume.data, posinf=0.0, neginf=0.0)
     shown = data != 0 if support is None else support & (data != 0)
@@ -138,7 +138,7 @@ def predicted_pixels(
     if not scale > 0:
         raise InputError(f"{volume.name}: shows nothing; expected a volume that is not zero where the head is")
     slices, _ = normalised_slices([stack])
-    # the whole volume: slices do not fit one that was cut
+    # the whole volume, because slices do not fit a cropped one
     slices, found = place_in_volume(slices, data / np.float32(scale), volume.grid, np.random.default_rng(seed))
     predicted, seen = (_simulated(one, slices, volume) for one in (data, shown.astype(np.float32)))
     return PredictedPixels(slices=slices, value=predicted, seen=seen, search_correlation=found)
@@ -151,7 +151,7 @@ def score_prediction(found: PredictedPixels, stack: str, volume: str, eroded_pix
         found: the prediction.
         stack: its name.
         volume: name of the volume.
-        eroded_pixels: at the rim of the mask that do not count.
+        eroded_pixels: width of the mask's rim that does not count.
 
     Raises:
         InputError: the stack is not found in the volume.
@@ -188,7 +188,7 @@ def score_prediction(found: PredictedPixels, stack: str, volume: str, eroded_pix
 
 
 def _simulated(data: NDArray[np.float32], slices: Slices, volume: Volume) -> NDArray[np.float32]:
-    """Pixels [P] of slices through a volume."""
+    """Pixels [P] of slices, simulated from a volume."""
     return VoxelOperator(slices.planes, volume.grid, None, PSF_POINTS).forward(data).astype(np.float32)
 
 

@@ -1,7 +1,7 @@
 """LPIPS: the distance of two images in the features of AlexNet (Zhang et al., CVPR 2018), version 0.1.
 
-Neither torchvision nor the lpips package is needed. The network has no weights of its own here: the features are those
-that torchvision trained on ImageNet, the linear heads those of the authors. Nothing else bears the name LPIPS.
+Neither torchvision nor the lpips package is needed. The weights are not part of g3r: the features are those that
+torchvision trained on ImageNet, the linear heads those of the authors. Distances by other weights are not LPIPS.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ FEATURES_NAME = "alexnet*.pth"
 HEADS_NAME = "alex.pth"
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of the three channels, whose values are from -1 to 1."""
+"""Normalisation of the three channels, whose values are from -1 to 1."""
 
 LEAST_PIXELS = 64
-"""Smaller images are filled with zeros: three poolings leave nothing of them."""
+"""Smaller images are padded with black, because a stride of 4 and two poolings would leave nothing of them."""
 
 SLICE_STEP = 3
-"""Every third slice of a volume: neighbours are nearly alike."""
+"""Only every third slice of a volume is compared, because neighbours are nearly alike."""
 
 LEAST_SHARE = 0.1
-"""Slices with a smaller share of the mask than this share of the fullest slice show hardly any brain."""
+"""Slices with a smaller area of the mask, relative to the fullest slice, are left out: they show hardly any brain."""
 
 HOW_TO = "give a folder with alexnet*.pth and alex.pth, or the file alexnet-owt-7be5be79.pth, by --lpips-weights"
 
 
 class Lpips(nn.Module):
-    """The metric.
+    """The LPIPS metric with AlexNet.
 
     Args:
         features: state of AlexNet, with torchvision's names (`features.0.weight` or `0.weight`).
         heads: state of the linear heads (`lin0.model.1.weight`, [1, C, 1, 1], to `lin4`).
 
     Raises:
-        InputError: states of something else.
+        InputError: the states are not those of AlexNet and of its heads.
     """
 
     def __init__(self, features: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
@@ -80,11 +80,11 @@ class Lpips(nn.Module):
         """The metric with the weights of files.
 
         Args:
-            path: a folder with both files, or a file with the features; torch's cache when None. Heads that do not lie
-                beside the features are taken from torchmetrics, where that is installed.
+            path: a folder with both files, or a file with the features; None takes torch's cache. Heads that are not
+                beside the features are taken from torchmetrics, if that is installed.
 
         Raises:
-            InputError: no weights, or a file that holds something else.
+            InputError: there are no weights, or a file holds something else.
         """
         where = Path(torch.hub.get_dir()) / "checkpoints" if path is None else Path(path)
         found = sorted(where.glob(FEATURES_NAME)) if where.is_dir() else [where] if where.is_file() else []
@@ -134,7 +134,7 @@ def _state(path: Path) -> Mapping[str, Tensor]:
 
 
 def _heads_beside(features: Path) -> Path:
-    """The file of the heads: beside the features, or of torchmetrics, which is not imported."""
+    """The file of the heads: beside the features, or in torchmetrics, which is not imported."""
     beside = features.with_name(HEADS_NAME)
     if beside.is_file():
         return beside
@@ -160,7 +160,7 @@ def _slices(volume: NDArray[np.float32], mask: NDArray[np.bool_], axis: int) -> 
 
 
 def _grey(images: Tensor) -> Tensor:
-    """Grey images [B, H, W] as [B, 3, H, W], filled with black up to the least size."""
+    """Grey images [B, H, W] as [B, 3, H, W], padded with black to the least size."""
     height, width = (max(0, LEAST_PIXELS - n) for n in images.shape[1:])
     filled = functional.pad(images, (0, width, 0, height), value=-1.0)
     return filled[:, None].expand(-1, 3, -1, -1)

@@ -11,10 +11,10 @@ from skimage.metrics import structural_similarity
 from g3r.geometry.grid import bounding_box
 
 PSNR_CAP_DB = 100.0
-"""Reported where the volumes agree to float32 rounding; keeps infinity out of tables and JSON."""
+"""PSNR reported if the volumes agree to float32 rounding; it keeps infinity out of tables and JSON."""
 
 RANGE_PERCENTILE = 99.9
-"""The data range is this percentile of the reference in the mask: a few bright voxels do not set it."""
+"""The data range is this percentile of the reference in the mask, so that a few bright voxels do not set it."""
 
 SSIM_WINDOW_VOXELS = 7
 
@@ -26,10 +26,10 @@ class Scores:
     Attributes:
         psnr_db: peak signal-to-noise ratio, at most `PSNR_CAP_DB`.
         ssim: structural similarity, mean of its local map over the mask.
-        ncc: correlation coefficient; 0 where one of the two is constant.
+        ncc: correlation coefficient; 0 if one of the two is constant.
         rmse: root mean squared error as a fraction of the data range.
         gain: factor that was applied to the volume, in reference units per volume unit.
-        offset: what was added after it, in reference units.
+        offset: constant that was added afterwards, in reference units.
         data_range: reference intensity that counts as 1.
         n_voxels: voxels in the mask.
     """
@@ -126,7 +126,7 @@ def mean_ssim(volume: NDArray[np.float64], truth: NDArray[np.float64], mask: NDA
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Correlation coefficient of two samples, 0 where one of them is constant."""
+    """Correlation coefficient of two samples; 0 if one of them is constant."""
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum()) / norm if norm > 0 else 0.0

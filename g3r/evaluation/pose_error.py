@@ -1,4 +1,4 @@
-"""Error of estimated slice poses: target registration error after one common motion is removed."""
+"""Error of estimated slice poses: target registration error (TRE) after one common motion is removed."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from g3r.geometry.rigid import fit_rigid_robust
 POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 MIN_PIXELS = 30
-"""Slices with fewer mask pixels are not scored: no method can place them, and they show no anatomy."""
+"""Slices with fewer mask pixels are not scored, because they show no anatomy by which a method could place them."""
 
 POINTS_PER_SLICE = 64
 
 ROBUST_SCALE_MM = 2.0
-"""Cauchy scale of the common motion's fit: a few gross slices must not tilt it."""
+"""Cauchy scale of the fit of the common motion, which a few gross errors must not tilt."""
 
 SliceKey = tuple[int, int]
 """Stack number and slice index along the third axis of the stack's file."""
@@ -73,7 +73,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
     """Read a table of slice poses (`slices.tsv`, `poses.tsv`): stack slice rx ry rz tx ty tz (rad, mm).
 
     Raises:
-        InputError: no such file, a column is missing, a value is not a number, or a slice is listed twice.
+        InputError: the file does not exist, a column is missing, a value is not a number, or a slice is listed twice.
     """
     path = Path(path)
     if not path.is_file():
@@ -98,7 +98,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseTable:
 
 
 def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey, NDArray[np.float64]]:
-    """Brain points by the headers: up to about 128 points [n, 3] (mm) of each slice with enough mask."""
+    """Brain points, placed by the headers: up to about 128 points [n, 3] (mm) of each slice with enough mask."""
     points: dict[SliceKey, NDArray[np.float64]] = {}
     for stack, path in enumerate(mask_paths):
         mask = load_volume(path)
@@ -113,7 +113,7 @@ def slice_points(mask_paths: Iterable[str | os.PathLike[str]]) -> dict[SliceKey,
 def target_registration_error(
     points_mm: Mapping[SliceKey, NDArray[np.float64]], true: PoseTable, estimated: PoseTable
 ) -> PoseError:
-    """Distance between the true and the estimated places of slices, up to one common rigid motion.
+    """Distance between the true and the estimated positions of slices, up to one common rigid motion.
 
     Args:
         points_mm: points of each slice by the header, as `slice_points` gives them; slices without an entry

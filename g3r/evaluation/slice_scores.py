@@ -1,4 +1,4 @@
-"""Scores of one slice against its prediction: error, correlation with and without what is smooth, similarity."""
+"""Scores of one slice against its prediction: error, correlation before and after a high-pass filter, similarity."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.acquisition.psf import FWHM_PER_SIGMA
 from g3r.evaluation.metrics import correlation, fit_intensity, mean_ssim
 
 HIGH_PASS_FWHM_MM = 3.75
-"""A slice less its blur by a Gaussian of this width holds edges and texture, which a blurred volume lacks."""
+"""Width of the Gaussian blur that is subtracted: edges and texture remain, which a blurred volume lacks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class SliceScore:
         n_pixels: counted pixels.
         mse: mean squared error as a share of the squared data range.
         ncc: correlation coefficient.
-        high_pass_ncc: the same for slice and prediction, each less its own blur.
+        high_pass_ncc: correlation coefficient of slice and prediction, each minus its own blur.
         ssim: structural similarity, mean of its local map.
     """
 
@@ -51,7 +51,7 @@ def score_slice(
         predicted: [H, W].
         observed: [H, W].
         counted: [H, W] pixels to compare; at least one.
-        spacing_mm: [2] of the pixels.
+        spacing_mm: [2] pixel spacing.
         data_range: intensity of the slice that counts as 1.
         slice_index: number of the slice, passed through.
     """
@@ -73,6 +73,6 @@ def score_slice(
 def _less_its_blur(
     image: NDArray[np.float64], counted: NDArray[np.bool_], sigma: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """An image less its blur, which counts the pixels of a mask alone."""
+    """An image minus its blur, which uses only the pixels of a mask."""
     weight = gaussian_filter(counted.astype(np.float64), sigma)
     return image - gaussian_filter(np.where(counted, image, 0.0), sigma) / np.maximum(weight, 1e-6)

@@ -1,4 +1,4 @@
-"""What brightness alone says of a stack: how much detail a part of it shows, and the stack with even brightness."""
+"""Brightness of a stack: the detail inside a part of it, and the stack with its brightness evened out."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ Image = NDArray[np.float32]
 Array = NDArray[np.floating]
 
 NOISE_MM, COARSE_MM = 2.0, 6.0
-"""Standard deviations in the plane: detail is what lies between noise, and shading and large parts."""
+"""Standard deviations of in-plane smoothing: detail lies between noise, and shading and large structures."""
 SKIN_MM = 5.0
-"""Outermost part of a section that does not count: its edge is no detail."""
+"""Outermost part of a section that is ignored, because its edge is not detail."""
 MIN_INNER_MM2 = 200.0
-"""Sections of which less is left are not judged."""
+"""Sections with less area inside the skin are not judged."""
 MIN_SECTIONS = 3
-"""Fewer do not tell."""
+"""With fewer sections the detail is unknown."""
 EVEN_MM = 25.0
-"""Standard deviation of the smoothing in the plane that evens brightness: less than a head, more than its parts."""
+"""Standard deviation of the in-plane smoothing that evens out brightness: less than a head, more than its parts."""
 DARKEST_SHARE = 0.1
-"""Of the brightest region; what is darker is not made brighter, or noise in air would look like something."""
+"""Share of the brightest region; darker regions are not brightened fully, or noise in air would become structure."""
 
 
 def detail_inside(image: Image, mask: NDArray[np.bool_], spacing_mm: Array) -> float:
-    """How much detail most sections of a mask show: standard deviation of what is neither noise nor coarse.
+    """Detail in most sections of a mask: standard deviation of the image between noise and coarse structure.
 
     Args:
         image: [I, J, K] stack in any units, slices along the last axis.
-        mask: [I, J, K] where to look; its outermost millimetres do not count.
+        mask: [I, J, K] region to measure; its outermost millimetres are ignored.
         spacing_mm: [3].
 
     Returns:
-        Median over the sections, as a share of the brightness about each pixel; NaN where too few are large enough.
+        Median over the sections, relative to the local brightness; NaN if too few sections are large enough.
     """
     if not mask.any():
         return float("nan")
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     box = bounding_box(mask)
-    # a margin of one pixel that is no mask, also where the field of view ends
+    # a margin of one unmasked pixel, also at the edge of the field of view
     within = np.pad(mask[box], [(1, 1), (1, 1), (0, 0)])
     values = np.pad(image[box], [(1, 1), (1, 1), (0, 0)]) * within
     fine, coarse = (_mean_within(values, within, mm, spacing) for mm in (NOISE_MM, COARSE_MM))
@@ -54,10 +54,10 @@ def detail_inside(image: Image, mask: NDArray[np.bool_], spacing_mm: Array) -> f
 
 
 def evened(image: Image, spacing_mm: Array) -> Image:
-    """A stack whose regions are about equally bright: shading, and what folded over a part of it, count less.
+    """A stack with regions of about equal brightness, so that shading and signal folded over it count less.
 
     Args:
-        image: [I, J, K], not negative; slices along the last axis.
+        image: [I, J, K], non-negative; slices along the last axis.
         spacing_mm: [3].
     """
     sigma = [EVEN_MM / spacing_mm[0], EVEN_MM / spacing_mm[1], 0]
@@ -67,7 +67,7 @@ def evened(image: Image, spacing_mm: Array) -> Image:
 
 
 def _mean_within(values: Image, within: NDArray[np.bool_], sigma_mm: float, spacing: Array) -> Image:
-    """Gaussian mean in the plane over the pixels of a mask alone; `values` are zero elsewhere."""
+    """In-plane Gaussian mean over the pixels of a mask alone; `values` are zero elsewhere."""
     sigma = [sigma_mm / spacing[0], sigma_mm / spacing[1], 0]
     weight = gaussian_filter(within.astype(np.float32), sigma)
     return gaussian_filter(values, sigma) / np.maximum(weight, 1e-6)

@@ -1,11 +1,11 @@
-"""The arguments of the mask network, as its constructor, its training and its file have them."""
+"""The arguments of the mask network, shared by its constructor, its training and its file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 MAX_CHANNELS, MAX_LEVELS = 1024, 6
-"""Beyond these a network takes minutes to build."""
+"""Limits beyond which a network takes minutes to build."""
 MAX_SPACING_MM = 100.0
 
 
@@ -14,9 +14,9 @@ class MaskNetworkConfig:
     """Arguments of `MaskNetwork`.
 
     Args:
-        wide_mm: pixel size at which a head is looked for in the whole stack.
-        pixel_mm: pixel size at which it is outlined; slices stay as they are in both.
-        channels: of the levels, at 2, 4, 8, ... times the pixel size.
+        wide_mm: pixel size at which a head is searched for in the whole stack.
+        pixel_mm: pixel size at which it is outlined; slices are resampled in the plane only, in both steps.
+        channels: feature channels of the levels, at 2, 4, 8, ... times the pixel size.
 
     Raises:
         ValueError: a value out of range.

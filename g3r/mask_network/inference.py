@@ -1,4 +1,4 @@
-"""From a stack to the mask of the fetal brain, with a trained mask network."""
+"""The mask of the fetal brain in a stack, from a trained mask network."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ Array = NDArray[np.floating]
 Image = NDArray[np.float32]
 
 MIN_VOLUME_ML = 10.0
-"""What is smaller is no head; at 19 weeks a brain has 20 ml, and a stack may show half of it."""
+"""Least volume of a head: at 19 weeks a brain has 20 ml, and a stack may show half of it."""
 MIN_PRESENCE = 0.85
-"""Mean probability of a mask that is taken for a brain."""
+"""Least mean probability of a mask that counts as a brain."""
 MIN_DETAIL = 0.03
-"""Of `detail_inside`: smooth balls in a shell have 0.020 and 0.024, the flattest of 63 simulated heads 0.038."""
+"""Least `detail_inside` of a head: smooth balls in a shell have 0.020 and 0.024, the flattest of 63 simulated heads
+0.038."""
 LEAST_PROBABILITY = 0.35
-"""Of a pixel of the brain: a lost piece of brain is worse than a piece of what is beside it."""
+"""Least probability of a brain pixel: losing a piece of brain is worse than including a piece beside it."""
 CROP_MM = 150.0
 """Smallest edge of the crop in which the brain is outlined."""
 AROUND_MM = 20.0
-"""In the plane on each side of what was found."""
+"""In-plane margin of the crop on each side of the found mask."""
 BESIDE_MM = 14.0
-"""Further slices on each side of what was found."""
+"""Margin across slices on each side of the found mask."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +50,12 @@ class BrainMask:
     """The fetal brain in a stack.
 
     Args:
-        mask: [I, J, K] with the rim of `as_people_draw`; empty where no head was found.
+        mask: [I, J, K] with the rim of `as_people_draw`; empty if no head was found.
         probability: [I, J, K] float32 of brain; zero outside the crop.
-        presence: 0 to 1, mean probability in the mask without its rim; 0 without.
-        centre_mm: [3] of the mask along the stack's axes, from the middle of its first voxel; NaN without.
-        volume_ml: of the mask.
-        reason: why there is none; empty where a head was found.
+        presence: mean probability in the mask without its rim, 0 to 1; 0 if no head was found.
+        centre_mm: [3] centre of the mask along the stack's axes, from its first voxel's middle; NaN if there is none.
+        volume_ml: volume of the mask.
+        reason: why no head was found; empty if one was.
     """
 
     mask: NDArray[np.bool_]
@@ -75,7 +76,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
 
     Args:
         image: [I, J, K] stack in any units, slices along the last axis.
-        spacing_mm: [3] of its voxels.
+        spacing_mm: [3] voxel size.
         model: trained mask network.
     """
     image = np.asarray(image, dtype=np.float32)
@@ -88,7 +89,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
     if not tried:
         return _nothing(image.shape, "no head found: nothing in the image looks like a brain")
     best = next((mask for mask in tried if not _is_even(image, mask, spacing)), tried[0])
-    # again about what was outlined: the place was a rough one
+    # again around the outlined mask, because the first place was rough
     again, _ = _mask_in(network, image, spacing, *_ends(best, spacing))
     probability = _outlined(network, image, spacing, *_ends(again if again.any() else best, spacing), FLIPS)
     mask = without_outgrowths(cleaned(probability > LEAST_PROBABILITY, spacing), probability, spacing)
@@ -114,7 +115,7 @@ def find_brain(image: NDArray[np.floating], spacing_mm: Sequence[float], model: 
 
 
 def _refusal(image: Image, spacing: Array) -> str:
-    """Why an image cannot be looked at; empty where it can."""
+    """Why an image cannot be processed; empty if it can."""
     if image.ndim != 3 or min(image.shape) < 1:
         return f"shape {image.shape}; expected a stack [I, J, K]"
     if spacing.shape != (3,) or not (np.isfinite(spacing).all() and (spacing > 0).all()):
@@ -138,20 +139,20 @@ def _nothing(shape: tuple[int, ...], reason: str) -> BrainMask:
 
 
 def _candidates(network: MaskNetwork, image: Image, spacing: Array) -> list[NDArray[np.bool_]]:
-    """Masks [I, J, K] of what may be a head, the most likely one first."""
-    for even in (False, True):  # where a head is dark beside something bright, only the second look shows it
+    """Candidate masks [I, J, K] of a head, the most likely one first."""
+    for even in (False, True):  # a head that is dark beside something bright shows only with even brightness
         coarse, boxes = look_from_afar(network, image, spacing, even)
         tried = [one for low, high in boxes if (one := _mask_in(network, image, spacing, low, high))[0].any()]
         if tried:
             break
-    # from near and from afar it should look like a brain: what does not from afar counts against it
+    # a brain is likely at both pixel sizes: pixels that are unlikely at the large size count against a candidate
     tried.sort(key=lambda one: -float((one[1] * (2 * coarse - 1))[one[0]].sum()))
     return [mask for mask, _ in tried]
 
 
 def _is_even(image: Image, mask: NDArray[np.bool_], spacing: Array) -> bool:
-    """Whether a mask is large enough to show folds and shows none."""
-    return detail_inside(image, mask, spacing) < MIN_DETAIL  # not so where that is NaN
+    """Whether a mask is large enough to show folds but shows none."""
+    return detail_inside(image, mask, spacing) < MIN_DETAIL  # False for NaN
 
 
 def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
@@ -163,7 +164,7 @@ def _ends(mask: NDArray[np.bool_], spacing: Array) -> tuple[Array, Array]:
 def _mask_in(
     network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array
 ) -> tuple[NDArray[np.bool_], Image]:
-    """The mask outlined about a box, and the probability of brain; see `_outlined`."""
+    """The mask outlined around a box, and the probability of brain; see `_outlined`."""
     probability = _outlined(network, image, spacing, low, high, FLIPS[:1])
     return cleaned(probability > 0.5, spacing), probability
 
@@ -171,15 +172,15 @@ def _mask_in(
 def _outlined(
     network: MaskNetwork, image: Image, spacing: Array, low: Array, high: Array, flips: Sequence[Flip]
 ) -> Image:
-    """Probability of brain on the stack's own grid, in a crop about a box.
+    """Probability of brain on the stack's own grid, in a crop around a box.
 
     Args:
-        network: trained.
+        network: trained mask network.
         image: [I, J, K] stack.
-        spacing: [3] of it (mm).
+        spacing: [3] voxel size of the stack (mm).
         low: [3] where the box begins along each axis (mm from the first voxel).
         high: [3] where it ends.
-        flips: mirror images whose mean counts.
+        flips: flips of the image over which the probability is averaged.
     """
     pixel = network.config.pixel_mm
     crop = []

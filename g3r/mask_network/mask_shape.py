@@ -1,4 +1,4 @@
-"""From the pixels that a network calls brain to the outline that a person would draw."""
+"""Shape of a mask: from the brain pixels of a network to the outline that a person would draw."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform
 from g3r.geometry.grid import bounding_box
 
 JOIN_MM = 6.0
-"""Parts of a mask no further from each other belong together: a head moves between slices."""
+"""Parts of a mask at most this far apart belong together, because a head moves between slices."""
 LEAST_END_PROBABILITY = 0.6
-"""Mean over a section at either end: 0.77 and more in the real stacks where it shows brain, 0.46 to 0.52 where not."""
+"""Least mean over a section at either end: 0.77 and more in real stacks where it shows brain, else 0.46 to 0.52."""
 
 LARGEST_RADIUS = 1.2
-"""In radii of the ellipsoid that has the moments of what was found: a brain is no further from its middle."""
+"""Largest distance of brain from its middle, in radii of the ellipsoid with the moments of the mask."""
 MIN_VOXELS = 50
-"""Fewer do not tell an ellipsoid."""
+"""Least voxels from which an ellipsoid is estimated."""
 CLEFT_MM = 10.0
-"""Half the width of clefts in a section that are filled: people bridge the gap between the lobes, and so do the heads
-that the network learns from."""
+"""Half the width of clefts in a section that are filled: people bridge the gap between the lobes, and so do the masks
+of the training data."""
 RIM_MM = 3.5
-"""How far outside the brain the outline is drawn, as people draw it, beyond the skull."""
+"""Distance outside the brain at which the outline is drawn: people draw it beyond the skull."""
 
 
 def cleaned(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """The largest part of a mask with its holes filled; parts that nearly touch, also in the next slice, are one.
+    """The largest part of a mask with its holes filled; parts that nearly touch, also in adjacent slices, are joined.
 
     Args:
         mask: [I, J, K].
@@ -41,7 +41,7 @@ def cleaned(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) -> NDArra
 
 
 def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The largest part of a mask that is not empty, see `cleaned`.
+    """The largest part of a non-empty mask, see `cleaned`.
 
     Args:
         mask: [I, J, K].
@@ -59,7 +59,7 @@ def _joined(mask: NDArray[np.bool_], reach: NDArray[np.int64]) -> NDArray[np.boo
 def without_outgrowths(
     mask: NDArray[np.bool_], probability: NDArray[np.floating], spacing_mm: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
-    """A mask without what sticks out of an ellipsoid: a brain is nearly one, face and neck lie beyond its end.
+    """A mask without parts that stick out of an ellipsoid: a brain is nearly one, and face and neck lie beyond it.
 
     Args:
         mask: [I, J, K].
@@ -69,12 +69,12 @@ def without_outgrowths(
     index = np.argwhere(mask)
     position_mm, weight = index * spacing_mm, probability[mask]
     kept = np.ones(len(index), dtype=bool)
-    for _ in range(4):  # each round without what the one before left out
+    for _ in range(4):  # each round fits the voxels that the one before kept
         if kept.sum() < MIN_VOXELS:
             return mask
         offset = position_mm - np.average(position_mm[kept], axis=0, weights=weight[kept])
         covariance = np.cov(offset[kept].T, aweights=weight[kept], ddof=0)
-        if np.linalg.matrix_rank(covariance) < 3:  # of a single slice
+        if np.linalg.matrix_rank(covariance) < 3:  # a single slice
             return mask
         # a solid ellipsoid's variance along an axis is a fifth of its radius squared
         radius = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance), offset) / 5)
@@ -85,7 +85,7 @@ def without_outgrowths(
 
 
 def without_doubtful_ends(mask: NDArray[np.bool_], probability: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """A mask without the sections at both ends that are hardly likely: neck or face beside the last of the brain.
+    """A mask without improbable sections at both ends, such as neck or face beyond the brain.
 
     Args:
         mask: [I, J, K].
@@ -110,7 +110,7 @@ def without_clefts(mask: NDArray[np.bool_], spacing_mm: NDArray[np.floating]) ->
     room = np.ceil(CLEFT_MM / spacing_mm[:2]).astype(int) + 1
     for k in np.flatnonzero(mask.any((0, 1))):
         box = bounding_box(mask[:, :, k])
-        # the disc needs its room beyond the field of view, too: what is not seen there is no border
+        # room for the disc beyond the field of view, too, whose edge is no border of the brain
         section = np.pad(mask[:, :, k][box], [(n, n) for n in room])
         wide = distance_transform_edt(~section, sampling=spacing_mm[:2]) <= CLEFT_MM
         closed = distance_transform_edt(wide, sampling=spacing_mm[:2]) > CLEFT_MM

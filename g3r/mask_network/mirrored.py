@@ -1,4 +1,4 @@
-"""What the mask network says of an image and of its mirror images."""
+"""Test-time augmentation of the mask network over flips of the image."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Flip = tuple[int, ...]
-"""Axes of a tensor [1, 1, I, J, K] along which an image is mirrored; none for the image itself."""
+"""Axes of a tensor [1, 1, I, J, K] along which an image is flipped; empty for the image itself."""
 
 FLIPS: tuple[Flip, ...] = ((), (2, 3))
-"""The image as it is, and turned by 180 degrees in the plane."""
+"""The image itself, and the image rotated by 180 degrees in the plane."""
 FURTHER_FLIPS: tuple[Flip, ...] = ((2,), (3,))
-"""Mirrored once in the plane."""
+"""The image flipped along one axis of the plane."""
 
 
 def brain_probability(
     logits_of: Callable[[Tensor], Tensor], image: NDArray[np.float32], flips: Sequence[Flip]
 ) -> list[NDArray[np.float32]]:
-    """Probability [I, J, K] of brain as each mirror image shows it, turned back.
+    """Probability [I, J, K] of brain from each flip of the image, flipped back.
 
     Args:
         logits_of: the network.
         image: [I, J, K].
-        flips: mirror images to look at.
+        flips: flips of the image to evaluate.
     """
     tensor = torch.from_numpy(np.ascontiguousarray(image))[None, None]
     with torch.inference_mode():

@@ -15,7 +15,7 @@ from g3r.mask_network.network import MaskNetwork
 
 @dataclass(frozen=True, kw_only=True)
 class MaskModel(TrainedModel):
-    """The mask network as it is used. See `TrainedModel` for `load`, `save` and `record`.
+    """A trained mask network. See `TrainedModel` for `load`, `save` and `record`.
 
     Its weights are stored as float16, which changes hardly a pixel.
     """
@@ -28,19 +28,19 @@ class MaskModel(TrainedModel):
 
     @classmethod
     def own_facts(cls, description: Mapping[str, Any]) -> dict[str, Any]:
-        """Nothing apart from the weights."""
+        """No facts apart from the weights."""
         return {}
 
     def own_description(self) -> dict[str, Any]:
-        """Nothing apart from the weights."""
+        """No facts apart from the weights."""
         return {}
 
     def in_words(self) -> str:
-        """Both resolutions."""
+        """Both pixel sizes, in words."""
         config = self.network.config
         return f"brain masks, found at {config.wide_mm:g} mm, outlined at {config.pixel_mm:g} mm"
 
     @staticmethod
     def stored(name: str, value: Tensor) -> Tensor:
-        """Half the bytes."""
+        """As float16, half the bytes."""
         return value.half()

@@ -1,4 +1,4 @@
-"""A U-Net made of MONAI's blocks that says which pixels of a stack are brain, at either of two pixel sizes."""
+"""A U-Net of MONAI's blocks that segments brain in a stack, at either of two pixel sizes."""
 
 from collections.abc import Sequence
 
@@ -11,17 +11,17 @@ from g3r.checkpoints.device import is_bfloat16_fast
 from g3r.mask_network.config import MaskNetworkConfig
 
 BRIGHT_SHARE = 0.99
-"""Quantile of an image that is its unit of intensity."""
+"""Quantile of an image that serves as its unit of intensity."""
 N_FLAT_LEVELS = 2
-"""Levels that look at each slice alone; the deeper ones see neighbouring slices, too."""
+"""Levels with kernels within a slice; the deeper ones also see neighbouring slices."""
 _NORM = ("INSTANCE", {"affine": True})  # intensities and contrasts differ from scan to scan
 
 
 class MaskNetwork(nn.Module):
-    """The network that finds the fetal brain in a whole stack of large pixels, and outlines it in a crop of small ones.
+    """Network that finds the fetal brain in a whole stack with large pixels, and outlines it in a crop with small ones.
 
-    One set of weights for both: heads of 38 weeks are twice as large as those of 19, so that the network knows all
-    sizes anyway, and what it learns of the surroundings of heads serves both.
+    Both use one set of weights: heads of 38 weeks are twice as large as those of 19, so the network has to know all
+    sizes anyway, and what it learns about the surroundings of heads serves both.
 
     Args:
         config: see `MaskNetworkConfig`.
@@ -38,12 +38,12 @@ class MaskNetwork(nn.Module):
 
 
 class SubpixelUNet(nn.Module):
-    """A U-Net that leaves the full resolution at once, where a CPU spends its time: pixels become channels.
+    """A U-Net that turns pixels into channels first, because a CPU spends most of its time at full resolution.
 
     Args:
-        channels: of the levels.
+        channels: feature channels of the levels.
         factor: pixels per axis that become channels; also the stride from a level to the next.
-        n_flat: first levels whose kernels stay within a slice.
+        n_flat: number of first levels with kernels within a slice.
     """
 
     def __init__(self, channels: Sequence[int], factor: tuple[int, int, int], n_flat: int) -> None:
@@ -64,7 +64,7 @@ class SubpixelUNet(nn.Module):
         self.out = UnetOutBlock(3, channels[0], n_pixels)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return logits [B, 1, I, J, K] of images of that shape; any size works, it is padded with zeros inside."""
+        """Return logits [B, 1, I, J, K] of images of that shape; any size works, because it pads with zeros."""
         size = image.shape[2:]
         strides = [f**self.n_levels for f in self.factor]
         far_end = [
@@ -72,7 +72,7 @@ class SubpixelUNet(nn.Module):
             for extent, stride in zip(size[::-1], strides[::-1], strict=True)
             for padding in (0, -extent % stride)
         ]
-        # bfloat16 halves the time of a training step; what is inferred is computed in float32
+        # bfloat16 halves the time of a training step; inference computes in float32
         short = self.training and is_bfloat16_fast(image.device.type)
         with torch.autocast(image.device.type, torch.bfloat16, enabled=short):
             features = to_channels(functional.pad(image, far_end), self.factor)
@@ -89,10 +89,10 @@ class SubpixelUNet(nn.Module):
 
 
 def normalised(image: Tensor) -> Tensor:
-    """Images [B, 1, I, J, K] in units of their bright quantile: between 0 and about 1, a little more where brighter."""
+    """Images [B, 1, I, J, K] in units of their bright quantile: from 0 to about 1, and at most 2."""
     flat = image.flatten(1).float()
     rank = max(1, int(BRIGHT_SHARE * flat.shape[1]))
-    # images come in any units; a black one stays black
+    # no division by zero: a black image stays black
     bright = flat.kthvalue(rank, dim=1).values.clamp_min(torch.finfo(torch.float32).tiny)
     scaled = image.float() / bright[:, None, None, None, None]
     return scaled.clamp(0.0, 2.0)

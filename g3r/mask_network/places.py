@@ -1,4 +1,4 @@
-"""Where in a whole stack a head may be: the mask network's look from afar."""
+"""Search for places in a whole stack where a head may be, by the mask network with large pixels."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ Array = NDArray[np.floating]
 Image = NDArray[np.float32]
 
 N_PLACES = 3
-"""Places at which a brain is outlined; the one that looks most like it from near is taken."""
+"""Places at which a brain is outlined; the one that looks most like a brain with small pixels is taken."""
 SMOOTHING_MM = 12.0
-"""Standard deviation of the smoothing before the most likely places are looked for."""
+"""Standard deviation of the smoothing before the search for the most likely places."""
 APART_MM = 45.0
-"""Distance of places from each other, and how far from a place slices are looked at."""
+"""Least distance between places, and distance from a place up to which slices are outlined."""
 MIN_PROBABILITY = 0.02
-"""Smoothed, below which a place is not looked at."""
+"""Least smoothed probability of a place."""
 MIN_AGREED_PROBABILITY = 0.3
-"""Smoothed, below which mirror images that agree on a place may be wrong alike."""
+"""Smoothed probability below which flips that agree on a place may all be wrong."""
 RIVAL_SHARE = 0.5
-"""A place with less of the probability of the likeliest one is not looked at."""
+"""Places with a smaller share of the probability of the likeliest one are ignored."""
 
 
 class Place(NamedTuple):
-    """Where a brain may be.
+    """A place where a brain may be.
 
     Attributes:
-        voxel: [3] numbers of the voxel.
-        probability: 0 to 1, smoothed, of brain about it.
+        voxel: [3] index of the voxel.
+        probability: smoothed probability of brain around it, 0 to 1.
     """
 
     voxel: NDArray[np.int64]
@@ -50,14 +50,14 @@ def look_from_afar(
 ) -> tuple[Image, list[tuple[Array, Array]]]:
     """Probability of brain on the stack's grid, and boxes where a head may be: two positions [3] (mm), likeliest first.
 
-    Where the image and the image turned do not agree on the likeliest place, two further mirror images are looked at,
-    too: few pixels cost little, and a wrong place costs everything.
+    If the image and the image rotated by 180 degrees disagree on the likeliest place, two further flips are evaluated:
+    few pixels cost little, and a wrong place loses the brain.
 
     Args:
-        network: trained.
+        network: trained mask network.
         image: [I, J, K] stack.
-        spacing: [3] of it (mm).
-        even: whether brightness is made even first.
+        spacing: [3] voxel size of the stack (mm).
+        even: whether to even out the brightness first.
     """
     step = network.config.wide_mm
     at = [
@@ -87,11 +87,11 @@ def look_from_afar(
 
 
 def likely_places(probability: Image, spacing_mm: Array) -> list[Place]:
-    """Where a brain may be, about which there is most probability, the likeliest place first.
+    """Places with the most probability of brain around them, the likeliest first.
 
     Args:
         probability: [A, B, C] of brain.
-        spacing_mm: [3] of its voxels.
+        spacing_mm: [3] voxel size.
     """
     left = gaussian_filter(probability, SMOOTHING_MM / np.asarray(spacing_mm), mode="constant")
     position = np.indices(left.shape) * np.reshape(spacing_mm, (3, 1, 1, 1))
@@ -108,12 +108,12 @@ def likely_places(probability: Image, spacing_mm: Array) -> list[Place]:
 
 
 def is_agreed(places: Sequence[Place], seen: Sequence[Image], spacing_mm: Array) -> bool:
-    """Whether the likeliest place is the likeliest one of each mirror image, too.
+    """Whether each flip has the same likeliest place as their mean.
 
     Args:
-        places: from the mean of the mirror images.
-        seen: probability of each mirror image [A, B, C].
-        spacing_mm: [3] of their voxels.
+        places: places from the mean of the flips.
+        seen: probability [A, B, C] from each flip.
+        spacing_mm: [3] voxel size.
     """
     if not places or places[0].probability < MIN_AGREED_PROBABILITY:
         return False
@@ -125,5 +125,5 @@ def is_agreed(places: Sequence[Place], seen: Sequence[Image], spacing_mm: Array)
 
 
 def without_outsiders(places: Sequence[Place]) -> list[Place]:
-    """The places that have at least a share of the probability of the likeliest one, which comes first."""
+    """The places with at least `RIVAL_SHARE` of the probability of the likeliest one, which comes first."""
     return [place for place in places if place.probability >= RIVAL_SHARE * places[0].probability]

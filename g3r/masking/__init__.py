@@ -1,1 +1,1 @@
-"""Masking: brain masks for stacks that come without one, by the network or by a command of the user's."""
+"""Brain masks for stacks that come without one, by the mask network or by a command of the user."""

@@ -19,7 +19,7 @@ class AutomaticMask:
     """The mask network as a masker.
 
     Args:
-        model: trained networks.
+        model: trained mask network.
     """
 
     model: MaskModel
@@ -28,8 +28,8 @@ class AutomaticMask:
         """The brain in a stack, or why none was found.
 
         Args:
-            path: of the stack; not used.
-            volume: that was read from it.
+            path: path of the stack; not used.
+            volume: image read from it.
         """
         axes = FileAxes.of(volume.grid)
         spacing_mm = settled(axes.grid_from_file(volume.grid)).spacing_mm

@@ -1,4 +1,4 @@
-"""A user's own masker: a command that is run once for each stack, and whose mask is checked as a user's is."""
+"""A masker of the user: a command that is run once per stack, and whose mask is checked like a given one."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from g3r.acquisition.images import Volume, load_mask
 from g3r.errors import InputError
 
 STACK, MASK = "{stack}", "{mask}"
-"""Stand for the file of the stack and for the file that the command has to write."""
+"""Placeholders for the file of the stack and for the file that the command has to write."""
 
 PLACE = re.compile("|".join(map(re.escape, (STACK, MASK))))
 
 FOLDERS = re.compile(r"[^=:,;]*[/\\]")
-"""In a word of a command line, all before the name of a file: alone, behind an option's = or in a list."""
+"""Folders in a word of a command line, before a file name: at its beginning, after an option's = or in a list."""
 
 TIMEOUT_S = 900.0
-"""A masker that takes longer hangs: published networks take up to two minutes for a stack without a GPU."""
+"""Time limit of a masker for one stack: published networks take up to two minutes for a stack without a GPU."""
 
 MAX_SAID = 300
-"""Letters of what a command said that go into a message."""
+"""Most characters of a command's output that are quoted in a message."""
 
 
 @dataclass(frozen=True)
 class MaskCommand:
-    """A command line with `{stack}` and `{mask}` in it; no shell reads it.
+    """A command line with `{stack}` and `{mask}` in it, run without a shell.
 
     Args:
         line: the command line.
-        timeout_s: after which it is ended.
+        timeout_s: seconds after which it is ended.
 
     Raises:
-        InputError: it cannot be split into words, or lacks one of the two places.
+        InputError: it cannot be split into words, or lacks one of the two placeholders.
     """
 
     line: str
@@ -62,8 +62,8 @@ class MaskCommand:
         """The mask that the command makes of a stack.
 
         Args:
-            path: of the stack.
-            volume: that was read from it.
+            path: path of the stack.
+            volume: image read from it.
 
         Raises:
             InputError: the command cannot be started, fails or takes too long, or it writes no mask of this stack.
@@ -82,7 +82,7 @@ class MaskCommand:
         return FoundMask(inside=inside, source="command", detail=self.told())
 
     def told(self) -> str:
-        """The command line without folders, for records: they may name patients."""
+        """The command line for records, without folders, because they may name patients."""
         return " ".join(FOLDERS.sub("", word) for word in shlex.split(self.line))
 
     def _run(self, words: list[str], name: str) -> None:
@@ -92,7 +92,7 @@ class MaskCommand:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                start_new_session=True,  # what it starts ends with it
+                start_new_session=True,  # so that its children can be ended with it
             )
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
@@ -117,7 +117,7 @@ class MaskCommand:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and whatever it started."""
+    """End a process and its children."""
     with suppress(OSError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)
@@ -130,7 +130,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _last_words(*outputs: bytes) -> str:
-    """The last line of the first output that has one. What a program prints may arrive after it has complained."""
+    """The last line of the first output that has one. Pass stderr first: a program may print more after its error."""
     for output in outputs:
         lines = [line for line in output.decode(errors="replace").splitlines() if line.strip()]
         if lines:

@@ -1,4 +1,4 @@
-"""The mask of every stack: what the user gives is taken, the rest is found, and stacks without a brain are left out."""
+"""The masks of all stacks: given ones are used, the others are found, and stacks without a brain are left out."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from g3r.errors import InputError
 logger = logging.getLogger(__name__)
 
 Masker = Callable[[str | os.PathLike[str], Volume], FoundMask | str]
-"""Finds the mask of a stack, from its file and what was read from it; or says why there is no brain in it."""
+"""Finds the mask of a stack from its path and its image; returns a reason if there is no brain in it."""
 
 ODD_SIZE = 2.0
-"""A found mask that is this many times larger or smaller than the median of all is not of the same brain."""
+"""A found mask this many times larger or smaller than the median of all is not of the same brain."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MaskedStacks:
-    """Which stacks are used, and their masks.
+    """The stacks that are used, and their masks.
 
     Attributes:
         kept: numbers of the stacks that are used, from 0.
-        masks: of each of them: the user's file, or what was found.
+        masks: mask of each used stack: the user's file, or a found mask.
         left_out: a sentence for each stack that is not used.
     """
 
@@ -46,16 +46,16 @@ def find_masks(
     An image that shows nothing but brain needs no masker.
 
     Args:
-        paths: of the stacks.
-        given: one file for each stack, and None where the mask is to be found; None for all.
-        masker: finds it.
+        paths: paths of the stacks.
+        given: one file per stack, or None where the mask is to be found; None finds all.
+        masker: finds a mask.
 
     Raises:
-        InputError: a stack that cannot be read, what the masker raises, or no stack with a brain in it.
+        InputError: a stack cannot be read, the masker raises it, or no stack shows a brain.
     """
     files = given or [None] * len(paths)
     masks: dict[int, str | os.PathLike[str] | FoundMask] = {n: own for n, own in enumerate(files) if own is not None}
-    # all are read before the first mask is made, which may take minutes
+    # read all stacks first, because making a mask may take minutes
     told = names_of(paths)
     volumes = {n: replace(load_volume(path), name=told[n]) for n, path in enumerate(paths) if n not in masks}
     found_ml: dict[int, float] = {}
@@ -81,9 +81,9 @@ def find_masks(
 
 
 def _odd_ones(masks: dict[int, str | os.PathLike[str] | FoundMask], found_ml: dict[int, float]) -> list[int]:
-    """Stacks whose found masks are far larger or smaller than most, where there are three or more.
+    """Stacks with found masks far larger or smaller than the median, if there are three or more.
 
-    A stack whose field of view ends within the head is smaller by right.
+    A small mask is accepted if it reaches the edge of the image, which then cuts the head.
     """
     if len(found_ml) < 3:
         return []

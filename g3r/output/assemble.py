@@ -1,4 +1,4 @@
-"""From the stages of a run to its result: the volume, its maps and the record, of a whole run or a partial one."""
+"""The result of a run from its stages: the volume, its maps and the record, of a whole run or a partial one."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ UNFITTED_NOTE = "no fit was made: no uncertainty and no share of the prior were 
 
 
 def assemble(found: StageResults, plan: Plan, run: RunContext) -> ReconstructionResult:
-    """The result of a run; the best volume so far, without its maps, where the run was stopped.
+    """The result of a run; if the run was stopped, the best volume so far without its maps.
 
     Args:
-        found: what the stages gave.
-        plan: settings as they were used.
-        run: clock, notes and warnings; says whether the run was stopped.
+        found: results of the stages.
+        plan: settings as used.
+        run: clock, notes and warnings; knows whether the run was stopped.
 
     Raises:
         NumericalError: the volume is not finite.
@@ -110,7 +110,7 @@ def assemble(found: StageResults, plan: Plan, run: RunContext) -> Reconstruction
 
 
 def _unseen_part(written: WrittenVolume, found: StageResults, settings: ReconstructionSettings) -> UnseenPart:
-    """How much of the brain no slice saw, and what is shown there."""
+    """The unseen part of the brain, with the words for what is shown there."""
     return UnseenPart.of(
         written.unseen,
         written.mask,
@@ -123,16 +123,16 @@ def _unseen_part(written: WrittenVolume, found: StageResults, settings: Reconstr
 
 
 def _shown_unseen(prior: PriorVolume, settings: ReconstructionSettings) -> str:
-    """What the volume shows where no slice looked, in words."""
+    """Words for the content of unseen voxels."""
     if not settings.fill_unseen:
         return "blank"
     return "estimate from other brains" if prior.has_template else "smooth continuation"
 
 
 def _share_by_areas(found: StageResults, settings: ReconstructionSettings) -> float | None:
-    """What a single stack that is cut lacks of the head, by the areas of its slices; None where there is none.
+    """The missing share of the head, by the areas of slices; None unless there is a single stack and it is cut.
 
-    Of another object the part in the masks is meant, wherever it ends.
+    None also for other anatomies, whose object is the part in the masks, wherever it ends.
     """
     profiles = found.registration.profiles
     if settings.anatomy != FETAL_BRAIN or len(profiles) != 1:

@@ -17,7 +17,7 @@ REPORT_NAME = "report.html"
 """The page to look at first; written by the command, see `g3r.report`."""
 
 MASK_NAMES = (MASK_PICTURE, *(f"brain-mask-{n}.nii.gz" for n in range(32)))
-"""Of masks that were found, by the number of the stack in slices.tsv; not written for the user's own."""
+"""Masks that were found, by the number of the stack in slices.tsv; not written for the user's own masks."""
 
 OUTPUT_NAMES = (
     "volume.nii.gz",
@@ -41,21 +41,21 @@ OUTPUT_NAMES = (
 SLICE_COLUMNS = ("stack", "slice", "rx", "ry", "rz", "tx", "ty", "tz", "gain", "weight", "ncc", "reason")
 
 FULL_WEIGHT = 0.99
-"""Slices of a smaller weight get a reason in slices.tsv."""
+"""Slices with a smaller weight get a reason in slices.tsv."""
 
 LOST_SIGNAL_GAIN, SMALL_SHARE, POOR_NCC = 0.6, 0.3, 0.8
-"""A down-weighted slice with a gain below the first, over that of its stack, has lost signal; one with less than the
-second of its stack's median number of pixels is small; one that correlates less than the third with the volume does
-not fit."""
+"""A down-weighted slice has lost signal if its gain is below the first number times the median gain of its stack. It is
+small if it has less than the second times its stack's median number of pixels. It does not fit if its correlation with
+the volume is below the third."""
 
 
 def slice_table(
     slices: Slices, gain: NDArray[np.float64], weight: NDArray[np.float64], ncc: NDArray[np.float64]
 ) -> str:
-    """slices.tsv: a point at x by the file's header is taken to be at R x + t (rotation vector in rad, mm).
+    """Text of slices.tsv: a point at x by the file's header lies at R x + t (rotation vector in rad, mm).
 
     Args:
-        slices: K slices in their last poses.
+        slices: K slices in their final poses.
         gain: [K] intensity factors.
         weight: [K] slice weights.
         ncc: [K] correlation with the volume.

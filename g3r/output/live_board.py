@@ -1,4 +1,4 @@
-"""A run as it goes on, for TensorBoard: losses, poses, gains and sections at the steps of its fit."""
+"""Live view of a run in TensorBoard: losses, poses, gains and sections at the steps of its fits."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from g3r.run.reporter import Reporter
 logger = logging.getLogger(__name__)
 
 SLICES_EVERY = 5
-"""Steps of a fit between two looks at its slices."""
+"""Steps of a fit between two records of its slices."""
 
 SECTION_EVERY = 10
-"""Steps between two sections of its volume, at least."""
+"""Least number of steps between two sections of its volume."""
 
 SECTION_SHARE = 0.005
-"""Sections take no more than this share of the fit's time: after a dear one the next is further away."""
+"""Largest share of the fit's time that sections may take; after a slow section the next one waits longer."""
 
 FLUSH_S = 0.5
-"""What a run that is killed may lose."""
+"""Seconds between writes to the disk, which a killed run may lose."""
 
 SECTION_MM = 1.0
-"""Pixels of these sections."""
+"""Pixel size of these sections."""
 
 NAMES = ("sagittal", "coronal", "axial")
 
 
 class LiveBoard(Reporter):
-    """Writes figures of a run while it runs, to be entered; they are on the disk within `FLUSH_S`.
+    """Writes figures of a run while it runs, as a context manager; they are on the disk within `FLUSH_S`.
 
-    It is a reporter of stages, and the observer of both fits.
+    It is a reporter of stages and the observer of both fits.
 
     Args:
-        folder: of the event file.
+        folder: folder of the event file.
 
     Raises:
         OSError: it cannot be written.
@@ -86,7 +86,7 @@ class LiveBoard(Reporter):
         self.stage, self.stage_begun_s, self.sections_s = str(stage), time.monotonic(), 0.0
 
     def ended(self, stage: str, found: object, *, resumed: bool = False) -> None:
-        """See `Reporter`; writes the seconds of the stage, and what it found."""
+        """See `Reporter`; writes the seconds of the stage, and its result."""
         self.stage = str(stage)
         now = time.monotonic()
         with self._as_long_as_it_works():
@@ -104,7 +104,7 @@ class LiveBoard(Reporter):
 
     @contextmanager
     def _as_long_as_it_works(self) -> Iterator[None]:
-        """Where the disk is full, the run goes on without TensorBoard."""
+        """If the disk is full, the run goes on without TensorBoard."""
         try:
             yield
         except OSError as error:
@@ -129,7 +129,7 @@ class LiveBoard(Reporter):
 
     @singledispatchmethod
     def _write(self, found: object) -> None:
-        """What a stage found, if there is anything to show."""
+        """Write the result of a stage, if there is anything to show."""
 
     @_write.register
     def _(self, found: Registration) -> None:
@@ -165,7 +165,7 @@ class LiveBoard(Reporter):
         self._volume(found.volume, found.mask, "volume")
 
     def _scalars(self, where: str, figures: Mapping[str, float], step: int) -> None:
-        """All figures of a step as one event, which is several times faster than one each."""
+        """Write all figures of a step as one event, several times faster than one event each."""
         values = [self._value(tag=f"{where}/{name}", simple_value=float(value)) for name, value in figures.items()]
         self.writer._get_file_writer().add_summary(self._summary(value=values), step)
 
@@ -215,7 +215,7 @@ def middle_planes(grid: VolumeGrid, mask: NDArray[np.bool_]) -> Planes:
 
 
 def _of_slices(slices: SliceMoment, origin_mm: NDArray[np.float64]) -> dict[str, float]:
-    """How far slices have moved since the fit began, and their gains."""
+    """Motion of slices since the fit began, and their gains and weights."""
     moved_mm, turned_deg = slices.moved(origin_mm)
     gain = slices.state.gain
     return {

@@ -1,6 +1,6 @@
-"""The colours of maps: "inferno" by Nathaniel Smith and Stefan van der Walt (CC0), as matplotlib has it.
+"""The colours of maps: "inferno" by Nathaniel Smith and Stefan van der Walt (CC0), as in matplotlib.
 
-Kept here because matplotlib takes half a second to import, and nothing else of it is needed for a picture.
+Kept here because importing matplotlib takes half a second, and a picture needs nothing else of it.
 """
 
 from __future__ import annotations

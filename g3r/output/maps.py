@@ -1,4 +1,4 @@
-"""The maps beside a volume: how far each voxel rests on other brains, and its expected error."""
+"""The maps beside a volume: prior share and expected error of each voxel."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from g3r.uncertainty.prior_share import estimate_prior_share
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeMaps:
-    """Maps of a volume, on its grid; None where they were not estimated.
+    """Maps of a volume, on its grid; None if they were not estimated.
 
     Attributes:
         uncertainty: float32 [I, J, K], expected error in units of the stacks.
-        prior_share: float32 [I, J, K], from 0 to 1; None without a prior, too.
-        record: for run.json.
+        prior_share: float32 [I, J, K], from 0 to 1; also None without a prior.
+        record: entries for run.json.
     """
 
     uncertainty: NDArray[np.float32] | None = None
@@ -49,11 +49,11 @@ def estimate_maps(
 
     Args:
         written: the volume.
-        fit: that it was made of.
-        found: what the stages gave.
-        settings: as they were used.
+        fit: the fit that the volume was made from.
+        found: results of the stages.
+        settings: as used.
         run: times both stages.
-        reliable: whether the registration can be relied on; None where nothing tells.
+        reliable: whether the registration is reliable; None if unknown.
     """
     prior_share = None
     if settings.use_prior:
@@ -63,7 +63,7 @@ def estimate_maps(
     with run.timed(Stage.UNCERTAINTY):
         estimated = estimate_uncertainty(
             UncertaintyInputs(
-                volume=written.mixed,  # errors are calibrated on it; the correction takes a little of them away
+                volume=written.mixed,  # errors are calibrated on it; the correction lowers them a little
                 mask=written.mask,
                 grid=written.grid,
                 fit=fit,
@@ -88,7 +88,7 @@ def estimate_maps(
 def _mixed_share(
     written: WrittenVolume, fit: SliceFit, found: StageResults, settings: ReconstructionSettings
 ) -> NDArray[np.float32]:
-    """The prior's share of the mixed volume: through the Gaussians, and as it is mixed in."""
+    """The prior's share of the mixed volume: through the Gaussians, and through its own weight in the mixture."""
     volumes = found.prior.volumes
     share = estimate_prior_share(
         fit,

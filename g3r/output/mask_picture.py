@@ -1,4 +1,4 @@
-"""A picture of masks: slices of each stack, through its brain, with the outline of what is taken for brain."""
+"""A picture of masks: slices of each stack through its brain, with the outline of the mask."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ N_PANELS = 8
 PANEL_INCHES = 1.5
 DOTS_PER_INCH = 130
 MARGIN_MM = 25.0
-"""Shown around the brain, so that what a mask misses is seen."""
+"""Margin shown around the brain, so that parts missed by a mask are visible."""
 
 
 def save_mask_picture(path: str | os.PathLike[str], stacks: Sequence[Stack]) -> None:
@@ -35,7 +35,7 @@ def save_mask_picture(path: str | os.PathLike[str], stacks: Sequence[Stack]) -> 
 
     Args:
         path: the file; it appears whole or not at all.
-        stacks: with their masks.
+        stacks: stacks with their masks.
 
     Raises:
         InputError: the file cannot be written.
@@ -90,7 +90,7 @@ def _draw_slice(
 
 
 def _write(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all; raises `InputError` where it cannot be written."""
+    """Write a figure as PNG, whole or not at all; raises `InputError` if it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     try:

@@ -15,30 +15,30 @@ from g3r.geometry.grid import on_grid
 from g3r.uncertainty.unseen import UnseenPart
 
 LEAST_WEIGHT = 0.01
-"""Weight of the prior in the written volume below which it is left out: from a density of 1.15 on."""
+"""Below this weight the prior is left out of the written volume: from a density of 1.15 on."""
 
 INSIDE = 0.5
-"""A region of one grid holds a point of another where its interpolated share is at least this."""
+"""A point of another grid is in a region if the region's interpolated share there is at least this."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """What makes the written volume: V = e [V_G + w (V_prior - V_G) + D].
+    """Mixture of Gaussians, prior and correction that makes the written volume: V = e [V_G + w (V_prior - V_G) + D].
 
-    e is 1 in the brain and fades to 0 at its edge. V_G are the Gaussians, rendered. The weight w of V_prior is 1 where
-    no slice looked and outside the support of the Gaussians, and falls with the density to its least value. D is what
-    the slices say beyond both (`fitting.voxel_correction`). All intensities are those of the fit.
+    e is 1 in the brain and fades to 0 at its edge. V_G are the rendered Gaussians. The weight w of V_prior is 1 where
+    no slice looked and outside the support of the Gaussians, and falls with the density to its least value. D is the
+    correction by the slices of both (`fitting.voxel_correction`). All intensities are those of the fit.
 
     Attributes:
-        grid: of `support`: that of the run's volume.
+        grid: grid of `support` and `edge`: that of the run's volume.
         support: [I, J, K] where Gaussians were fitted.
         prior: V_prior [I, J, K] on `prior_grid`.
         density: M_rho [I, J, K] on `prior_grid`.
-        prior_grid: of these two and the correction.
-        least_weight: of V_prior, where slices are dense.
+        prior_grid: grid of `prior`, `density` and `correction`.
+        least_weight: least weight of V_prior, where slices are dense.
         edge: e [I, J, K] on `grid`, how much of the volume is shown.
         cutoff_sigma: where a Gaussian ends.
-        correction: D [I, J, K] on `prior_grid`; None where there is none.
+        correction: D [I, J, K] on `prior_grid`; None without one.
     """
 
     grid: VolumeGrid
@@ -58,13 +58,13 @@ class Mixture:
     def left_to_prior(self, grid: VolumeGrid) -> NDArray[np.float32]:
         """Weight [I, J, K] of the prior by the density alone: 1 where no slice looked, the least where it is dense.
 
-        Nothing holds Gaussians that no slice sees but what they have to explain elsewhere.
+        Gaussians that no slice sees are determined only by what they have to explain elsewhere.
         """
         weight = np.exp(-UNSEEN_POWER * self.density_on(grid))
         return np.where(weight < LEAST_WEIGHT, 0, weight).clip(self.least_weight, 1).astype(np.float32)
 
     def seen(self, grid: VolumeGrid) -> NDArray[np.bool_]:
-        """Where [I, J, K] slices looked."""
+        """Mask [I, J, K] of the voxels that slices saw."""
         return self.density_on(grid) >= UNSEEN_BELOW
 
     def volume(self, cloud: GaussianCloud, grid: VolumeGrid) -> NDArray[np.float32]:
@@ -75,7 +75,7 @@ class Mixture:
 
         Args:
             cloud: the Gaussians.
-            grid: with orthogonal axes.
+            grid: grid with orthogonal axes.
 
         Raises:
             ValueError: a grid with sheared axes.
@@ -95,12 +95,12 @@ class Mixture:
         return mixed + on_grid(self.correction, self.prior_grid, grid, outside=0.0) * self._shown(grid)
 
     def reach(self) -> NDArray[np.float32]:
-        """Share [I, J, K] on `prior_grid` of a correction that counts: 0 where there are no Gaussians or no slices."""
+        """Share [I, J, K] on `prior_grid` of a correction that is applied: 0 without Gaussians or without slices."""
         left = np.exp(-UNSEEN_POWER * self.density)
         return (self._region(self.support, self.prior_grid) * (1 - left)).astype(np.float32)
 
     def _shown(self, grid: VolumeGrid) -> NDArray[np.float32]:
-        """How much [I, J, K] of the volume is shown on a grid."""
+        """The edge [I, J, K] on a grid: how much of the volume is shown."""
         return on_grid(self.edge, self.grid, grid, outside=0.0)
 
     def _region(self, inside: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.bool_]:
@@ -110,7 +110,7 @@ class Mixture:
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedVolume:
-    """The volume [I, J, K] in intensities of the fit, the brain's mask on the same grid, and what no slice saw."""
+    """The volume [I, J, K] in intensities of the fit, the brain's mask on the same grid, and the unseen part."""
 
     volume: NDArray[np.float32]
     mask: NDArray[np.bool_]

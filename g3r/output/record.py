@@ -1,4 +1,4 @@
-"""run.json as a record: what is needed to assess a result and to run it again; file names only, no paths."""
+"""run.json as a record: all that is needed to assess a result and to run it again; file names only, no paths."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ MAX_RECORD_BYTES = 50_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationRecord:
-    """How the poses were found.
+    """Record of the registration.
 
     Attributes:
-        reliable: whether all stacks are registered; None where nothing checks them (a single stack).
+        reliable: whether all stacks are registered; None for a single stack, which nothing checks.
         summary: one line on all stacks.
         initialisation: where the search started.
-        held_out_correlation: of each initialisation, stack by stack.
+        held_out_correlation: held-out correlation of each stack, by initialisation.
         space: "standard" or "scanner".
-        correlation_with_template: of the head with the atlas template; None in scanner space.
-        correlation_of_rival: the same in the best of all other orientations; None where none comes near, in scanner
+        correlation_with_template: correlation of the head with the atlas template; None in scanner space.
+        correlation_of_rival: the same for the best of all other orientations; None if none comes near, in scanner
             space, and with several stacks.
-        orientation_doubtful: whether that is about as high (`MIN_RIVAL_MARGIN` in `registration/thresholds.py`).
-        standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points; every slice moved by itself, so it is their
-            robust mean, and near the stacks that agree with each other. None in scanner space.
+        orientation_doubtful: whether the rival is about as high (`MIN_RIVAL_MARGIN` in `registration/thresholds.py`).
+        standard_from_scanner: [4, 4] rigid motion (RAS, mm) of points. Each slice has a motion of its own, so this is
+            their robust mean, close to the stacks that agree with each other. None in scanner space.
         rounds: figures of each round.
         crossing_deg: the largest angle between slices of two stacks in the head; None for a single stack.
     """
@@ -74,9 +74,9 @@ class RegistrationRecord:
         """The record of a registration.
 
         Args:
-            registration: of all stacks.
+            registration: registration of all stacks.
             qualities: one per stack.
-            slices: in their last poses.
+            slices: slices in their final poses.
         """
         orientation = registration.orientation
         return cls(
@@ -116,12 +116,12 @@ class CommandRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """The files that a result is made of.
+    """The input files of a result.
 
     Attributes:
         stacks: one per stack.
-        masks: one per stack: the file, or who made it and the hash of its voxels.
-        prior, pose_network, mask_network: None where not used.
+        masks: one per stack: the file, or the source of the mask and the hash of its voxels.
+        prior, pose_network, mask_network: files of the networks; None if not used.
     """
 
     stacks: tuple[FileHash, ...]
@@ -131,14 +131,14 @@ class Inputs:
     mask_network: FileHash | None = None
 
     def named(self) -> dict[str, FileHash]:
-        """All of them, by what they are."""
+        """All files, by their role."""
         files = {f"stack {n + 1}": file for n, file in enumerate(self.stacks)}
         files |= {f"mask {n + 1}": file for n, file in enumerate(self.masks)}
         networks = {"prior": self.prior, "pose network": self.pose_network, "mask network": self.mask_network}
         return files | {name: file for name, file in networks.items() if file}
 
     def differences(self, now: Inputs) -> list[str]:
-        """A sentence for each file of `now` that is not the same bytes, or is not used any more."""
+        """A sentence for each file of `now` with other bytes, and for each file that is not used any more."""
         then, found = self.named(), now.named()
         lines = [
             f"{name} ({file.name}) is not the file that the configuration's result was made of"
@@ -149,7 +149,7 @@ class Inputs:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide the numbers."""
+    """Versions of Python and of the packages that determine the numbers."""
     return {"python": platform.python_version()} | {name: version(name) for name in ("torch", "numpy", "numba")}
 
 
@@ -158,26 +158,26 @@ class RunRecord:
     """run.json.
 
     Attributes:
-        settings: as they were used.
-        inputs, command, memory, header_text: what the command adds; None from Python.
-        prior, pose_network: the networks' own records; None where one was not used.
-        registration: None where the file is only a configuration.
-        stack_fields: coefficients of each stack's bias field that was divided out before; empty for one or two stacks.
-        bias_field: those that the fit added; empty where it was not estimated.
-        common_bias_rms: of the logarithm of the bias field that stacks share, over the brain; 0 without estimate.
-        pose_rounds: what rounds of poses and volume did; None where there was none.
-        held_out: what held-out slices chose; None where they were not asked.
+        settings: as used.
+        inputs, command, memory, header_text: added by the command; None from Python.
+        prior, pose_network: the networks' own records; None if not used.
+        registration: None if the file is only a configuration.
+        stack_fields: coefficients of each stack's bias field, divided out before the fit; empty for one or two stacks.
+        bias_field: coefficients that the fit added; empty if not estimated.
+        common_bias_rms: RMS over the brain of the logarithm of the common bias field; 0 without estimate.
+        pose_rounds: record of the rounds of poses and volume; None without rounds.
+        held_out: choices made by held-out slices; None if there were none.
         prior_weight: least weight of V_prior in the volume.
         volume_check: how well volume, V_prior and V_coarse explain the slices; None without V_prior.
-        voxel_correction: of the volume after that; None where there was none.
-        edge_by_image: whether slices that are black beside the brain told where the volume ends, not their masks alone.
-        gaussian_spacing_mm: of the lattice of Gaussians; None where the run was interrupted before them.
-        n_rollbacks: times that a fit went back to its best state.
-        loss: by stage, figures of each step.
+        voxel_correction: record of the correction on voxels; None without one.
+        edge_by_image: whether the volume ends where slices become black beside the brain, not by their masks alone.
+        gaussian_spacing_mm: spacing of the lattice of Gaussians; None if the run was interrupted before them.
+        n_rollbacks: times that the fit to the slices went back to its best state.
+        loss: figures of each step, by stage.
         unseen: the part of the brain that no slice saw.
-        uncertainty: what `uncertainty.nii.gz` means; None where the run was interrupted.
-        verdict, reasons: of the report: whether the volume may be used, and why; None where nobody has judged it.
-        resumed: stages that were taken from an earlier run.
+        uncertainty: what `uncertainty.nii.gz` means; None if the run was interrupted.
+        verdict, reasons: of the report: whether the volume may be used, and why; None without a report.
+        resumed: stages taken from an earlier run.
         partial: whether the run was interrupted, at `stopped_at`.
     """
 
@@ -221,7 +221,7 @@ class RunRecord:
     header_text: list[dict[str, Any]] | None = None
 
     def differences(self, inputs: Inputs) -> list[str]:
-        """A sentence for each input that is not the same file's bytes, and for another version of g3r."""
+        """A sentence for each input with other bytes, and for another version of g3r."""
         lines = self.inputs.differences(inputs) if self.inputs else []
         if self.g3r != __version__:
             lines.append(f"g3r is {__version__}, the configuration is of {self.g3r}")
@@ -236,7 +236,7 @@ class RunRecord:
         """The record in the text of a run.json.
 
         Raises:
-            ValueError: it is no JSON, or not the record of this version.
+            ValueError: it is not JSON, or not a record of this version.
         """
         try:
             return from_plain(cls, json.loads(text), "run")
@@ -248,7 +248,7 @@ class RunRecord:
         """Read a run.json.
 
         Raises:
-            InputError: it is no such file, or of a version with other settings.
+            InputError: it is not such a file, or of a version with other settings.
         """
         path = Path(path)
         try:
@@ -266,11 +266,11 @@ class RunRecord:
 
 
 def inactive_terms(slices: Slices, settings: ReconstructionSettings) -> list[InactiveTerm]:
-    """Which terms of the model are absent, each with the reason: what the data cannot determine.
+    """The inactive terms of the model, each with its reason: undetermined by the data, or switched off.
 
     Args:
-        slices: that were fitted.
-        settings: as they were used for these slices.
+        slices: the fitted slices.
+        settings: as used for these slices.
     """
     stage, found = settings.slice_stage, []
     single = len(np.unique(slices.stack_id)) == 1

@@ -31,12 +31,12 @@ CAPTIONS = {
     "prior share": "0: measured, 1: by the prior alone",
     "uncertainty": "expected error, in the volume's units",
 }
-"""Rows of sections.png that are maps, and how to read them."""
+"""Rows of sections.png that are maps, and how to read their values."""
 
 RANGES = {"prior share": (0.0, 1.0)}
 
 PICTURE_BYTES = 3_000_000
-"""More than the picture, the tables and the record ever took."""
+"""Upper limit of the picture, the tables and the record together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,17 +49,17 @@ class ReconstructionResult:
         support: [I, J, K] on `grid`, where Gaussians were fitted.
         edge: [I, J, K] on `grid`, how much of the volume is shown (`Mixture`).
         prior, coarse, density: [I, J, K] on `prior_grid`; prior is V_sharp where no network was used.
-        correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None where there is none.
+        correction: D [I, J, K] on `prior_grid`, in normalised intensities (`Mixture`); None without one.
         cloud: the Gaussians, in normalised intensities (times `intensity_scale` gives the stacks').
-        slices: in their last poses.
+        slices: slices in their final poses.
         gain, weight, ncc: [K] intensity factor, weight and correlation with the volume of each slice.
         uncertainty: [I, J, K] on `grid`, expected absolute error of the volume; zero outside the mask. None,
-            and not written, where the run was interrupted (`record.partial`).
+            and not written, if the run was interrupted (`record.partial`).
         prior_share: [I, J, K] on `grid`, 0 (measured) to 1 (the prior alone); None, and not written, where no
             prior was used.
         record: settings, versions, seconds, memory, warnings: run.json.
-        stacks: that it was made of; masks that were found for them are written, too.
-        header_text: text for the headers of the files; nothing when None.
+        stacks: its input stacks; their masks are written, too, unless they are the user's files.
+        header_text: text for the headers of the files; None for no text.
     """
 
     volume: NDArray[np.float32]
@@ -103,10 +103,10 @@ class ReconstructionResult:
         """Write every output into a folder; it appears whole or not at all.
 
         Args:
-            folder: to write.
+            folder: folder to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
-            run: holds this folder already; one for this call alone when None.
-            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, in which the others are.
+            run: holds this folder already; None takes it for this call alone.
+            also: writes more files of `OUTPUT_NAMES`; called with the folder in which the others are.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
@@ -128,7 +128,7 @@ class ReconstructionResult:
             raise cannot_be_written(folder, error, self._max_bytes()) from None
 
     def _max_bytes(self) -> int:
-        """Size of the uncompressed files together, without the picture and tables."""
+        """Size of all files together when uncompressed, without picture and tables."""
         arrays = [getattr(self, one.name) for one in fields(self)]
         arrays += [np.asarray(tensor) for tensor in self.cloud.parameters]
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
@@ -165,7 +165,7 @@ class ReconstructionResult:
         rows, ranges = {"volume": self.volume}, dict(RANGES)
         if self.uncertainty is not None:
             rows["uncertainty"] = self.uncertainty
-            # the rim is far more uncertain than the rest; it may saturate, so that the rest is seen
+            # the rim is far more uncertain than the rest; let it saturate, so that the rest is visible
             bright = float(np.percentile(self.uncertainty[self.mask], 97)) if self.mask.any() else 1.0
             ranges["uncertainty"] = (0.0, bright or 1.0)
         if self.prior_share is not None:
@@ -189,7 +189,7 @@ class ReconstructionResult:
             save_mask_picture(folder / MASK_PICTURE, [stack for _, stack in found])
 
     def reuse_record(self) -> ReuseRecord:
-        """What other commands need of this result beside its other files."""
+        """The record of what other commands need of this result beside its other files."""
         return ReuseRecord(
             grid=self.grid,
             support=self.support,
@@ -208,7 +208,7 @@ class ReconstructionResult:
         return [(n, stack) for n, stack in enumerate(self.stacks) if stack.mask_source != "file"]
 
     def _title(self) -> str:
-        """Warnings that belong on the picture."""
+        """Warnings to print on the picture."""
         lines = []
         if self.record.stopped_at:
             lines.append(f"PARTIAL: {self.record.stopped_at}")

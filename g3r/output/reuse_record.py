@@ -1,4 +1,4 @@
-"""reuse.npz: the numbers of a finished run that its images and tables hold only rounded, or not at all."""
+"""reuse.npz: numbers of a finished run that its images and tables hold only rounded, or not at all."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class StackGrid:
     """The voxels of a stack.
 
     Attributes:
-        grid: with the slices along the third axis.
-        axes: how the file's arrays become those on the grid.
+        grid: grid with the slices along the third axis.
+        axes: how arrays of the file become arrays on the grid.
     """
 
     grid: VolumeGrid
@@ -38,7 +38,7 @@ class StackGrid:
 
     @classmethod
     def of(cls, stack: Stack) -> StackGrid:
-        """Those of a stack that was read."""
+        """The voxels of a stack that was read."""
         return cls(stack.header_grid, stack.axes)
 
     def in_file(self) -> VolumeGrid:
@@ -48,17 +48,17 @@ class StackGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class ReuseRecord:
-    """Geometry of a result to the last digit, and the correction of its volume; without pixels.
+    """Exact geometry of a result, and the correction of its volume; without pixels.
 
     Attributes:
-        grid: of the volume.
-        support: [I, J, K] on it, where Gaussians were fitted.
-        edge: [I, J, K] on it, how much of the volume is shown, see `Mixture`.
-        prior_grid: of V_prior, density and correction.
-        correction: [I, J, K] on `prior_grid`, see `Mixture`; None where there is none.
-        intensity_scale: what an intensity of 1 in the fit is in the stacks.
+        grid: grid of the volume.
+        support: [I, J, K] on `grid`, where Gaussians were fitted.
+        edge: [I, J, K] on `grid`, how much of the volume is shown, see `Mixture`.
+        prior_grid: grid of V_prior, density and correction.
+        correction: [I, J, K] on `prior_grid`, see `Mixture`; None without one.
+        intensity_scale: intensity in the stacks of a 1 in the fit.
         stacks: one per stack.
-        slices: [K] in their last poses, with their masks and the PSF of the fit; all values are zero.
+        slices: [K] in their final poses, with their masks and the PSF of the fit; all values are zero.
         gain, weight: [K] intensity factor and weight of each slice.
     """
 
@@ -74,7 +74,7 @@ class ReuseRecord:
     weight: NDArray[np.float64]
 
     def first_pixel(self) -> NDArray[np.int64]:
-        """Index [K, 2] in its stack of each slice's first pixel: slices are cut to their masks."""
+        """Index [K, 2] of each slice's first pixel in its stack, because slices are cropped to their masks."""
         header, half = self.slices.header_pose.translation_mm, (self.slices.planes.shape - 1) / 2
         middle = [self.stacks[s].grid.index(header[k])[:2] for k, s in enumerate(self.slices.stack_id)]
         return np.rint(np.reshape(middle, (-1, 2)) - half).astype(np.int64)
@@ -120,7 +120,7 @@ class ReuseRecord:
         """Read what `save` wrote.
 
         Raises:
-            InputError: not such a file.
+            InputError: it is not such a file.
         """
         try:
             with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as data:
@@ -174,7 +174,7 @@ def _grid(shape: NDArray[Any], affine: NDArray[Any]) -> VolumeGrid:
 
 
 def _bits(packed: NDArray[Any], count: int) -> NDArray[np.bool_]:
-    """`count` booleans of bits that fit them.
+    """Unpack `count` booleans from bits.
 
     Raises:
         ValueError: another number of bits.

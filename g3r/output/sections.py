@@ -23,10 +23,10 @@ BACKGROUND = "#000000"
 INK = "#c8c8c8"
 FAINT_INK = "#8a8a8a"
 MARK = "#35c4e8"
-"""Outlines what no slice saw."""
+"""Colour of the outline around unseen parts."""
 
 MARGIN_MM = 6.0
-"""Shown around the mask."""
+"""Margin shown around the mask."""
 
 SCALE_BAR_MM = 20.0
 ROW_PIXELS = 325
@@ -40,7 +40,7 @@ TITLE_LINE, TITLE_LETTER = 25, 11
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One plane through the volume: which world axes run right and up, and the letters at its four sides.
+    """One plane through the volume: the world axes that run right and up, and the letters at its four sides.
 
     Radiological convention: the patient's right is on the left of axial and coronal sections; sagittal
     sections face left.
@@ -87,7 +87,7 @@ def save_sections(
 
     Each intensity volume has one grey window for its three sections, from 0 (or its lowest value in the
     mask) to the 99.5th percentile in the mask. The volumes named in `maps` are shown in colour with a
-    bar, since their values are read and not only looked at.
+    bar, because their values are meant to be read.
 
     Args:
         path: the file; it appears whole or not at all.
@@ -176,7 +176,7 @@ def _draw(
     for row, one in enumerate(volumes):
         y = top + row * (ROW_PIXELS + BETWEEN)
         low, high = one.range or _window(one.data, inside, is_map=one.is_map)
-        # what a mask has cut away is black, also where a volume goes below zero
+        # voxels outside the mask are black, also in a volume with negative values
         data = one.data if one.is_map else np.where(inside | (one.data != 0), one.data, low)
         x = left
         for view, wide in zip(VIEWS, widths, strict=True):
@@ -216,7 +216,7 @@ def _panel(
 
 
 def _outline(part: NDArray[np.bool_], size: tuple[int, int]) -> Image.Image:
-    """A line of a pixel or so along the border of a part [up, across], where it lies in the panel."""
+    """A line about one pixel wide along the border of a part [up, across], inside the panel."""
     inside = Image.fromarray(part[::-1].astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
     filled = Image.fromarray((np.pad(np.asarray(inside) > 127, 1)).astype(np.uint8) * 255)
     line = np.asarray(filled) > np.asarray(filled.filter(ImageFilter.MinFilter(3)))
@@ -260,7 +260,7 @@ def _window(data: NDArray[np.float32], inside: NDArray[np.bool_], *, is_map: boo
 
 
 def _letter(pen: ImageDraw.ImageDraw, letters: str, box: tuple[int, int, int, int]) -> None:
-    """Write the anatomical directions at the four sides, outlined: there may be image below them."""
+    """Write the anatomical directions at the four sides, outlined because there may be image below them."""
     x, y, width, height = box
     places = ((x + 4, y + height / 2), (x + width - 4, y + height / 2), (x + width / 2, y + 4))
     for letter, place, anchor in zip(letters, (*places, (x + width / 2, y + height - 4)), _ANCHORS, strict=True):

@@ -1,4 +1,4 @@
-"""The part of run.json that each stack has."""
+"""The part of run.json about each stack."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class StackRecord:
     """One stack: its geometry, its PSF, and how its slices were registered.
 
     Attributes:
-        name: of its file.
-        thickness_mm, thickness_from: thickness of a slice, and who gave it: the option, the sidecar, or nobody, so
-            that it is the distance of slices ("spacing").
-        in_plane_fwhm_pixels: of the PSF along the two axes of a slice.
-        phase_resolution, phase_axis: what the in-plane width follows from; None where the scanner does not say it.
-        spacing_mm: of pixels and slices.
-        mask_from, mask_detail: who made the mask, and with what.
-        mask_ml: what is marked.
-        left_out_share: of what the image shows, see `acquisition.mask_extent`.
-        remarks: what is doubtful in its files.
-        quality, interleave, n_segments: None where the stack had no slices.
+        name: name of its file.
+        thickness_mm, thickness_from: slice thickness and its source: the option, the sidecar, or, if unknown, assumed
+            equal to the slice spacing ("spacing").
+        in_plane_fwhm_pixels: width of the PSF along the two axes of a slice.
+        phase_resolution, phase_axis: they determine the in-plane width; None if the scanner does not state them.
+        spacing_mm: distances of pixels and of slices.
+        mask_from, mask_detail: source of the mask, and details of how it was made.
+        mask_ml: volume of the mask.
+        left_out_share: share of what the image shows that lies outside the mask, see `acquisition.mask_extent`.
+        remarks: doubts about its files.
+        quality, interleave, n_segments: None if the stack had no slices.
         standard_from_scanner: [4, 4] robust mean motion (RAS, mm) of its slices, from where its header puts them; None
-            in scanner space, and where the stack had no slices.
+            in scanner space, and if the stack had no slices.
     """
 
     name: str
@@ -60,10 +60,10 @@ class StackRecord:
     standard_from_scanner: list[list[float]] | None = None
 
     def profile(self) -> SliceProfile:
-        """The PSF, to take the same one again.
+        """The PSF, for use in another run.
 
         Raises:
-            InputError: the record was changed and has not two in-plane widths.
+            InputError: the record was edited and does not have two in-plane widths.
         """
         if len(self.in_plane_fwhm_pixels) != 2:
             raise InputError(f"{self.name}: has {len(self.in_plane_fwhm_pixels)} in-plane widths; expected 2")
@@ -78,7 +78,7 @@ class StackRecord:
 
 
 def mean_motion(slices: Slices) -> list[list[float]]:
-    """The rigid motion [4, 4] (RAS, mm) that takes points by the headers to where slices are, on robust average."""
+    """Robust mean of the rigid motions [4, 4] (RAS, mm) that take points from where headers put them to the poses."""
     matrix, motion = np.eye(4), motion_to_headers(slices).inverse()
     matrix[:3, :3], matrix[:3, 3] = motion.rotation[0], motion.translation_mm[0]
     return [[round(float(x), 9) for x in row] for row in matrix]
@@ -91,14 +91,14 @@ def stack_records(
     weight: np.ndarray,
     slices: Slices,
 ) -> list[StackRecord]:
-    """One record for each stack that was given.
+    """One record per given stack.
 
     Args:
-        stacks: in the order of their numbers in the slices.
-        registration: has an entry for each stack that has slices, which not every given one need have.
+        stacks: stacks, in the order of their numbers in the slices.
+        registration: has an entry for each stack with slices; a given stack may have none.
         qualities: one per stack.
         weight: [K] slice weights at the end of the fit.
-        slices: [K] in their last poses.
+        slices: [K] in their final poses.
     """
     stack_id = registration.slices.stack_id
     moved = registration.orientation is not None

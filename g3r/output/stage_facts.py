@@ -1,4 +1,4 @@
-"""What there is to tell of a finished stage: names of lines (`g3r.report.stage_words`) and the facts in them."""
+"""Facts to report of a finished stage: names of lines (`g3r.report.stage_words`), and the values in them."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 from g3r.uncertainty.unseen import MENTIONED_ABOVE
 
 Told = tuple[str, dict[str, Any]]
-"""Name of a line, and what is filled in."""
+"""Name of a line, and the values to fill in."""
 
 AS_STATED = 0.03
-"""Widths of the slice profiles that are nearer to the stated one are as stated."""
+"""A slice profile counts as stated if its relative width differs from 1 by less than this."""
 
 BETTER = 0.005
-"""Rise of the correlation between stacks that is worth telling."""
+"""Rise of the correlation between stacks that is worth reporting."""
 
 
 @singledispatch
 def told_of(found: object) -> Iterator[Told]:
-    """What is told of the result of a stage; nothing of what is not known here."""
+    """Lines to report of the result of a stage; none for other types than those below."""
     yield from ()
 
 

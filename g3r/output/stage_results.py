@@ -1,4 +1,4 @@
-"""What the stages of a run hand to its result."""
+"""Results of the stages of a run, from which its result is assembled."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class StageResults:
     """Results of the stages of a run.
 
     Attributes:
-        stacks: as they were given.
-        registration: poses of their slices, intensities as they were matched.
-        stack_fields: coefficients of the fields that matching divided out.
-        prior: the prior volume and what it was made of.
-        intensity: intensity of 1 in the fit.
-        rounds: what rounds of poses and volume did; None where there was none.
-        held_out: what held-out slices chose; None where they were not asked.
-        cloud: of the fit to the prior; None where the run was stopped before its end: its Gaussians show the prior
-            volume less well than that volume does.
-        fit: of the fit to the slices; None before it.
-        prior_record, pose_record: the networks' own; None where one is not used.
+        stacks: as given.
+        registration: poses of their slices, with matched intensities.
+        stack_fields: coefficients of the bias fields that intensity matching divided out.
+        prior: the prior volume and the volumes it was made from.
+        intensity: intensity in the stacks of a 1 in the fit.
+        rounds: record of the rounds of poses and volume; None without rounds.
+        held_out: choices made by held-out slices; None if there were none.
+        cloud: result of the fit to the prior; None if the run was stopped before its end, because its Gaussians then
+            show the prior volume less well than that volume itself does.
+        fit: result of the fit to the slices; None before it.
+        prior_record, pose_record: the networks' own records; None if not used.
     """
 
     stacks: Sequence[Stack]
@@ -47,7 +47,7 @@ class StageResults:
     pose_record: dict[str, Any] | None
 
     def no_fit(self) -> SliceFit:
-        """The slices as registration left them, and no Gaussians."""
+        """A stand-in for a fit: the slices as registration left them, and no Gaussians."""
         cloud = GaussianCloud.empty()
         slices, gain, weight = self.prior.volumes.slices, self.prior.gain, self.registration.weight
         return SliceFit(cloud=cloud, slices=slices, gain=gain, weight=weight, history=[], bias_field=[])

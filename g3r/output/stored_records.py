@@ -1,4 +1,4 @@
-"""Classes of what the stages of a run give, which the files of a stage store may hold."""
+"""Classes of stage results, which the files of a stage store may hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether TensorBoard can be written; `live_board` writes it. Nothing heavy is imported here."""
+"""Check that TensorBoard can be written; `live_board` writes it. Nothing heavy is imported here."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from g3r.run.output_folder import SUFFIX
 
 
 def check_tensorboard(folder: Path, output: Path) -> None:
-    """Raise `InputError` where nothing could be written: before the work, not after it.
+    """Raise `InputError` if TensorBoard could not be written, before the work begins.
 
     Args:
-        folder: to write into.
-        output: folder of the result, which must not hold it: it is put in place as a whole.
+        folder: folder to write into.
+        output: folder of the result, which must not contain it, because the result is put in place as a whole.
     """
     if find_spec("tensorboard") is None:
         raise InputError("--tensorboard: tensorboard is not installed; pip install tensorboard")

@@ -1,4 +1,4 @@
-"""How the written volume comes about: masks, the weight of V_prior, the check by the slices, the correction by them."""
+"""The steps to the written volume: masks, weight of V_prior, check and correction by the slices."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from g3r.run.context import RunContext
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenVolume:
-    """The volume as it is written, in intensities of the fit, and how it came about.
+    """The volume as written, in intensities of the fit, with its masks and intermediate results.
 
     Attributes:
         volume: float32 [I, J, K].
         mixed: float32 [I, J, K], the same before the correction by the slices.
-        mask: bool [I, J, K] of the brain.
-        support: bool [I, J, K] of what is shown.
-        edge: float16 [I, J, K], how the support fades.
-        edge_by_image: whether slices that are black beside the brain told that, and not their masks alone.
-        seen: bool [I, J, K], where slices looked.
-        unseen: bool [I, J, K], brain where none did.
-        grid: of all these.
-        mixture: of Gaussians, V_prior and the correction.
-        check: the volume beside those before the fit; None without a prior.
-        correction: by the slices; None where there is none.
+        mask: bool [I, J, K], brain mask.
+        support: bool [I, J, K], where the volume is shown.
+        edge: float16 [I, J, K], factor by which the support fades.
+        edge_by_image: whether the edge follows from slices that are black beside the brain, not from masks alone.
+        seen: bool [I, J, K], voxels that slices saw.
+        unseen: bool [I, J, K], brain voxels that no slice saw.
+        grid: grid of all these.
+        mixture: mixture of Gaussians, V_prior and the correction.
+        check: the volume compared with those before the fit; None without a prior.
+        correction: correction by the slices; None without one.
     """
 
     volume: NDArray[np.float32]
@@ -67,9 +67,9 @@ def written_volume(
 
     Args:
         cloud: mean of the fit's lattices.
-        fit: to the slices, or what stands for it where there was none.
-        found: what the stages gave.
-        settings: as they were used.
+        fit: fit to the slices, or its stand-in if there was none.
+        found: results of the stages.
+        settings: as used.
         run: takes notes.
 
     Raises:
@@ -124,11 +124,11 @@ def written_volume(
 def masks_on(
     grid: VolumeGrid, prior: PriorVolume, fit: SliceFit
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float16]]:
-    """Brain mask, support and edge on the output grid; on another than the prior's as the fit left the slices."""
+    """Brain mask, support and edge on the output grid; from the slices of the fit if it is not the prior's grid."""
     if grid is prior.volumes.grid:
         return prior.mask, prior.support, prior.volumes.foreground.edge(prior.support, prior.mask, prior.brain)
     if not len(fit.cloud):
-        # as registration left the slices: what they say on the prior's grid holds on this one
+        # the slices are as registration left them, so the masks on the prior's grid hold on this one
         mask, support = (
             on_grid(one.astype(np.float32), prior.volumes.grid, grid, outside=0.0) >= INSIDE
             for one in (prior.mask, prior.support)
@@ -146,9 +146,9 @@ def masks_on(
 def shown_by_slices(
     volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit
 ) -> NDArray[np.float32] | None:
-    """How much of the volume slices show that are black beside the brain; None where they are not, or without a fit.
+    """Share of the volume that is shown, by slices that are black beside the brain; None for others or without a fit.
 
-    A single stack is not asked: its slices may lie a millimetre off. What no slice saw is left as it is.
+    None for a single stack, whose slices may lie a millimetre off. Unseen voxels are left as they are.
     """
     if found.fit is None or fit.slices.n_stacks == 1:
         return None
@@ -158,7 +158,7 @@ def shown_by_slices(
 
 
 def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettings, run: RunContext) -> float:
-    """Least weight of V_prior in the volume; 0 without a prior, 1 where the fit had no time."""
+    """Least weight of V_prior in the volume; 0 without a prior, 1 if the fit had no time."""
     if not settings.use_prior:
         return 0.0
     if settings.prior_weight > 0 and ended_early(n_steps := len(fit.history), settings.slice_stage.n_steps):
@@ -168,7 +168,7 @@ def least_weight(fit: SliceFit, brain_mm3: float, settings: ReconstructionSettin
 
 
 def checked(volume: NDArray[np.float32], mixture: Mixture, found: StageResults, fit: SliceFit) -> VolumeCheck:
-    """The volume beside those before the fit."""
+    """The volume compared with V_prior and V_coarse, the volumes before the fit."""
     before, grid, none = found.prior.volumes, mixture.grid, found.no_fit().cloud
     return check_volume(
         volume,
@@ -190,7 +190,7 @@ def corrected(
     settings: ReconstructionSettings,
     run: RunContext,
 ) -> VoxelCorrection | None:
-    """The correction of a volume with Gaussians; None where none is asked or can be made, or the run was stopped."""
+    """The correction of a volume with Gaussians; None if not asked for or impossible, or if the run was stopped."""
     fit, prior = found.fit, found.prior
     asked = adapted(settings, prior.volumes.slices.n_stacks).voxel_correction
     if asked is None or fit is None or run.stopped_at is not None or mixture.least_weight == 1:

@@ -1,1 +1,1 @@
-"""The pose network: a set transformer that puts slices into the atlas frame."""
+"""The pose network: a set transformer that predicts slice poses in the atlas frame."""

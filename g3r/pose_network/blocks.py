@@ -1,4 +1,4 @@
-"""The two parts that each step of the pose network has: slice image to token, tokens to votes."""
+"""The two parts of each step of the pose network: encoder of slice images, transformer from tokens to votes."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from g3r.checkpoints.device import is_bfloat16_fast
 
 
 class Encoder(nn.Module):
-    """Slice image to token: MONAI's residual units, and a linear layer that keeps what is where in the image.
+    """Slice image to token: MONAI's residual units, and a linear layer that keeps positions in the image.
 
     Args:
-        channels: of the three halvings of the image.
-        width: of the token.
+        channels: feature channels after each of three halvings of the image.
+        width: width of the token.
         image_size: pixels per edge, a multiple of 8.
         extra_channels: further channels at half the image's resolution.
     """
@@ -51,7 +51,7 @@ class SetTransformer(nn.Module):
     """Tokens of slices to votes: attention in turn among the slices of a stack and among those of a head.
 
     Args:
-        width: of a token.
+        width: width of a token.
         n_codes: numbers that describe a slice in addition to its image.
         n_blocks: transformer blocks; the even ones see one stack, the odd ones all stacks of the head.
         n_heads: attention heads.
@@ -73,7 +73,7 @@ class SetTransformer(nn.Module):
 
         Args:
             token: [S, width] of the slices' images.
-            code: [S, n_codes] what else is known of the slices.
+            code: [S, n_codes] further facts about the slices.
             same_stack: [S, S] whether two slices are of one stack.
             same_set: [S, S] whether two slices are of one head.
 

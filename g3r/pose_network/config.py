@@ -1,4 +1,4 @@
-"""The arguments of the pose network, as its constructor, its training and its file have them."""
+"""The arguments of the pose network, shared by its constructor, its training and its file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from g3r.geometry import VolumeGrid
 
 MAX_SHAPE, MAX_SPACING_MM = 1024, 100.0
 MAX_CHANNELS, MAX_WIDTH, MAX_BLOCKS, MAX_REFINEMENTS = 4096, 8192, 64, 16
-"""Beyond these a network takes minutes to build."""
+"""Limits beyond which a network takes minutes to build."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,16 +17,16 @@ class PoseNetworkConfig:
     """Arguments of `PoseNetwork`.
 
     Args:
-        template_shape: [A, I, J, K] of the atlas template: A ages on one grid. A training replaces it by its data's.
+        template_shape: [A, I, J, K] of the atlas template: A ages on one grid. Training replaces it by its data's.
         template_spacing_mm: the template's voxel size.
         image_size: N, pixels per edge of a slice image; a multiple of 8.
-        pixel_mm: edge of these pixels.
-        channels: of the encoder, at 1/2, 1/4 and 1/8 resolution.
-        width: of a token; a multiple of `n_heads`.
+        pixel_mm: pixel size of the slice image.
+        channels: feature channels of the encoder, at 1/2, 1/4 and 1/8 resolution.
+        width: width of a token; a multiple of `n_heads`.
         n_blocks: transformer blocks per step.
         n_heads: attention heads.
-        n_refinements: refinements, all with the same weights, where a call does not say how many. Training draws them,
-            and `poses_of` makes `N_REFINEMENTS`.
+        n_refinements: default number of refinements, which share their weights. Training draws the number, and
+            `poses_of` makes `N_REFINEMENTS`.
 
     Raises:
         ValueError: a value out of range.

@@ -8,7 +8,7 @@ from torch import Tensor
 from g3r.geometry.quaternion import rotation_from_unit_quaternion
 
 MIN_SINGULAR_SUM = 0.05
-"""Below it (two singular values cancel: the rotation is not determined) gradients are held back."""
+"""Least sum of two singular values in gradients. Below it they cancel, and the rotation is not determined."""
 
 
 class _NearestRotation(torch.autograd.Function):
@@ -139,10 +139,10 @@ def scattered(
     """Weighted sums and weights of points in cubes of voxels centred on the origin, [G, I, J, K, 2].
 
     Args:
-        points_mm: [S, P, 3]; each is shared among the eight voxels around it, outside it is lost.
+        points_mm: [S, P, 3]; each is shared among the eight voxels around it; outside points are dropped.
         value: [S, P].
         weight: [S, P]; points of zero weight are skipped.
-        group: [S] volume that a block of points goes to.
+        group: [S] volume to which each block of points is added.
         n_groups: G.
         shape: voxels per edge.
         spacing_mm: voxel size.
@@ -176,7 +176,7 @@ def smoothed(volume: Tensor) -> Tensor:
 
 
 def best_age(heads: Tensor, value: Tensor, group: Tensor, n_groups: int) -> Tensor:
-    """The age of the atlas template that correlates best with the slices of each set, [G].
+    """Index [G] of the template's age that correlates best with the slices of each set.
 
     Args:
         heads: [S, P, A] the template's heads at the pixels.

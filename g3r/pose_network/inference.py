@@ -1,4 +1,4 @@
-"""From slices to poses in the atlas frame with a trained pose network."""
+"""Slice poses in the atlas frame from a trained pose network."""
 
 from collections.abc import Sequence
 
@@ -13,12 +13,12 @@ from g3r.pose_network.network import PoseNetwork, SliceBatch
 
 N_REFINEMENTS = 2
 VIEWS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))
-"""Rotations by 180 degrees, as diagonals: the four ways to describe a slice by its own axes, the pixels kept.
+"""Rotations by 180 degrees, as diagonals: the four choices of a slice's own axes that keep its pixels.
 
 The network sees all four and the results are averaged, which takes a fifth off the error.
 """
 VIEW_SCALE_MM = 3.0
-"""Views further than this from the mean count less in it, in proportion."""
+"""Views further than this from the mean are down-weighted in inverse proportion to their distance."""
 ROTATION_ARM_MM = 25.0
 """Distance from a slice's centre at which a rotation is measured in mm."""
 ROBUST_STEPS = 12
@@ -41,7 +41,7 @@ def poses_of(network: PoseNetwork, batch: SliceBatch) -> RigidPose:
 
 
 def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]) -> RigidPose:
-    """The pose [K] that several estimates [V, K, 3, 3], [V, K, 3] agree on; far ones count little."""
+    """The robust mean pose [K] of several estimates [V, K, 3, 3], [V, K, 3]; distant ones count little."""
     weight = np.ones(rotation.shape[:2])
     for _ in range(ROBUST_STEPS):
         share = (weight / weight.sum(0))[..., None]
@@ -54,7 +54,7 @@ def mean_pose(rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
 
 
 def slice_batch(sets: Sequence[SliceImages]) -> SliceBatch:
-    """The slices of several heads as one dict of tensors; stacks are numbered through all of them."""
+    """The slices of several heads as one dict of tensors; stacks are numbered across all heads."""
     n_stacks = [int(one.stack_id.max()) + 1 for one in sets]
     first = np.cumsum([0, *n_stacks])
     batch = {
@@ -69,5 +69,5 @@ def slice_batch(sets: Sequence[SliceImages]) -> SliceBatch:
 
 
 def as_pose(rotation: torch.Tensor, translation_mm: torch.Tensor) -> RigidPose:
-    """A network's float32 motions as exact ones."""
+    """Rigid poses in float64 from a network's float32 motions."""
     return RigidPose(orthonormal(rotation.double().cpu().numpy()), translation_mm.double().cpu().numpy())

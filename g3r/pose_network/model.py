@@ -24,7 +24,7 @@ from g3r.pose_network.network import PoseNetwork
 
 @dataclass(frozen=True, kw_only=True)
 class PoseModel(TrainedModel):
-    """A pose network with what has to be known to use it. See `TrainedModel` for `load`, `save` and `record`.
+    """A trained pose network with the ages of its template. See `TrainedModel` for `load`, `save` and `record`.
 
     Its weights are stored as float16, which changes poses by less than 0.1 mm.
 
@@ -32,7 +32,7 @@ class PoseModel(TrainedModel):
         weeks: gestational age of each head of the network's template.
 
     Raises:
-        ValueError: another number of ages than the template has.
+        ValueError: the number of ages differs from the template's.
     """
 
     network: PoseNetwork
@@ -56,13 +56,13 @@ class PoseModel(TrainedModel):
         return {"weeks": [float(week) for week in self.weeks]}
 
     def in_words(self) -> str:
-        """Pixel size and ages."""
+        """Pixel size and ages, in words."""
         weeks = ", ".join(f"{week:g}" for week in self.weeks)
         return f"poses from pixels of {self.network.config.pixel_mm:g} mm, atlas template of {weeks} weeks"
 
     @staticmethod
     def stored(name: str, value: Tensor) -> Tensor:
-        """Half the bytes. Counters of training batches have no use any more: zero."""
+        """As float16, half the bytes; counters of training batches are not needed any more and become zero."""
         return torch.zeros((), dtype=torch.int64) if name.endswith("num_batches_tracked") else value.half()
 
     @cached_property
@@ -75,7 +75,7 @@ class PoseModel(TrainedModel):
         """Pose of each slice's own frame (as `slices.planes.pose`) in the atlas frame.
 
         Args:
-            slices: of all stacks; only their header poses are used.
+            slices: slices of all stacks; of their poses only those of the headers are used.
 
         Returns:
             K poses. They do not change if all headers are moved by one rigid motion, and permuting slices or

@@ -40,11 +40,11 @@ and `g3r.pose_network.inference.slice_batch`."""
 
 
 Disturbance = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Takes rotations [S, 3, 3] and translations [S, 3] (mm) to others."""
+"""Maps rotations [S, 3, 3] and translations [S, 3] (mm) to disturbed ones."""
 
 
 class PoseStep(NamedTuple):
-    """Output of one step of the network: poses atlas frame from image frame, and the votes behind them.
+    """Output of one step of the network: poses (atlas frame from image frame), and the votes behind them.
 
     Attributes:
         rotation: [S, 3, 3].
@@ -58,13 +58,13 @@ class PoseStep(NamedTuple):
 
 
 class PoseNetwork(nn.Module):
-    """Poses of slices in the atlas frame, by a first guess and refinements.
+    """Network that predicts slice poses in the atlas frame, by a first guess and refinements.
 
-    Only rotations between stacks are taken from the headers, so rotating all of them together changes nothing,
-    and neither does the order of slices or stacks. In each step every slice votes for a rotation and a
-    translation of its stack. Votes of a stack are summed; those of other stacks are added through the header's
+    Only rotations between stacks are taken from the headers, so rotating all headers together changes nothing, and
+    neither does reordering slices or stacks. In each step every slice votes for a rotation and a translation of its
+    stack. Votes of a stack are averaged; those of other stacks are added through the header's
     rotations between stacks (first step) or as they are (refinements); the sum is made a rotation. Then every
-    slice moves a little on its own. Refinements see, at the current poses, the atlas template of the best age
+    slice adds a small motion of its own. Refinements see, at the current poses, the atlas template of the best age
     and a coarse volume of the *other* stacks (the feedback of SVoRT, Xu et al., MICCAI 2022).
 
     Args:
@@ -77,7 +77,7 @@ class PoseNetwork(nn.Module):
         super().__init__()
         self.config = config
         ages, *shape = config.template_shape
-        # [I, J, K, A]: all ages of a voxel next to each other, as sampling wants them
+        # [I, J, K, A]: all ages of a voxel are adjacent in memory, for sampling
         self.register_buffer("template", torch.zeros(*shape, ages))
         self.encoder = Encoder(config.channels, config.width, config.image_size)
         self.transformer = SetTransformer(config.width, N_CODES, config.n_blocks, config.n_heads)
@@ -89,21 +89,21 @@ class PoseNetwork(nn.Module):
         self.log_share = nn.Parameter(torch.zeros(2))
 
     def set_template(self, volume: Tensor) -> None:
-        """Take over an atlas template [A, I, J, K] on a grid about the origin; no weight depends on its shape."""
+        """Set the atlas template [A, I, J, K], on a grid centred on the origin; no weight depends on its shape."""
         self.config = replace(self.config, template_shape=tuple(volume.shape))
         self.template = volume.permute(1, 2, 3, 0).contiguous().to(self.template)
 
     def forward(
         self, batch: SliceBatch, n_refinements: int | None = None, disturb: Disturbance | None = None
     ) -> list[PoseStep]:
-        """The first guess and what each refinement makes of it.
+        """The first guess and the result of each refinement.
 
         Args:
             batch: slices of one or more heads.
-            n_refinements: None takes that of `config`.
-            disturb: changes the poses that a refinement starts from, in training.
+            n_refinements: number of refinements; None takes that of `config`.
+            disturb: changes the poses from which a refinement starts, in training.
         """
-        # mixed precision is the encoder's own affair: around it, poses and points keep float32
+        # only the encoder uses mixed precision; poses and points stay in float32
         with torch.autocast(batch["image"].device.type, enabled=False):
             return self._steps(batch, n_refinements, disturb)
 
@@ -119,7 +119,7 @@ class PoseNetwork(nn.Module):
         vote = self.transformer(self.encoder(batch["image"]), code, same_stack, same_set)
         votes = vote[:, :9].reshape(-1, 3, 3)
         matrix = group_mean(votes, stack, n_stacks)
-        # each stack's vote, carried over to the others of its head by the headers
+        # each stack's vote, transferred to the other stacks of its head by the headers
         carried = group_mean(matrix @ header.transpose(1, 2), set_of_stack, n_sets)[set_of_stack] @ header
         rotation = nearest_rotation(matrix + self.log_share[0].exp() * carried)[stack]
         shift = group_mean(vote[:, 9:12], stack, n_stacks)[stack] * TRANSLATION_SCALE_MM
@@ -134,7 +134,7 @@ class PoseNetwork(nn.Module):
             pose_code = torch.cat([rotation.flatten(1), translation / 50.0], 1)
             token = self.refining_encoder(batch["image"], seen)
             vote = self.refining_transformer(token, torch.cat([code, pose_code], 1), same_stack, same_set)
-            # the pose that a refinement starts from has a vote of its own
+            # the identity is a vote for the pose from which the refinement starts
             votes = torch.eye(3, dtype=code.dtype, device=code.device) + vote[:, :9].reshape(-1, 3, 3)
             matrix = group_mean(votes, stack, n_stacks)
             shared = group_mean(matrix, set_of_stack, n_sets)[set_of_stack]
@@ -146,10 +146,11 @@ class PoseNetwork(nn.Module):
 
     @torch.no_grad()
     def _seen_at(self, rotation: Tensor, translation_mm: Tensor, batch: SliceBatch) -> Tensor:
-        """What the template and the other stacks show at the slices' poses, [S, N_SEEN, N / 2, N / 2].
+        """Template and other stacks, sampled at the slices' poses, [S, N_SEEN, N / 2, N / 2].
 
-        The atlas template of the age that correlates best with a set's slices, in the slice's plane and on both
-        sides of it, and a coarse volume of the other stacks; both also as differences from the slice.
+        The atlas template of the age that correlates best with a set's slices is sampled in the slice's plane and on
+        both sides of it. A coarse volume of the other stacks is sampled in the plane. Both also give differences from
+        the slice.
         """
         half, spacing_mm = self.config.image_size // 2, self.config.template_spacing_mm
         value = nn.functional.avg_pool2d(batch["image"], 2).flatten(1)
@@ -189,10 +190,10 @@ class PoseNetwork(nn.Module):
 
 
 def slice_codes(batch: SliceBatch) -> Tensor:
-    """What is known of a slice apart from its image [S, N_CODES]: position, thickness, area, rank in time.
+    """Codes [S, N_CODES] of the facts about a slice apart from its image: position, thickness, area, rank in time.
 
-    The rank is known in trainings only: image files do not say in which order slices were acquired, so that
-    reconstructions always give "unknown" (NaN), which the weights were trained with too.
+    The rank is known in training only: image files do not state the order of acquisition, so reconstruction always
+    passes "unknown" (NaN), which training includes, too.
     """
     image = batch["image"]
     position, thickness, area, rank = (
@@ -205,6 +206,6 @@ def slice_codes(batch: SliceBatch) -> Tensor:
 
 
 def _with_residual(rotation: Tensor, translation_mm: Tensor, vote: Tensor) -> tuple[Tensor, Tensor]:
-    """A stack's pose of each slice, followed by the slice's own rotation and translation in its own frame."""
+    """The stack's pose of each slice, followed by the slice's own rotation and translation in its own frame."""
     shift = (rotation @ (vote[:, 3:] * RESIDUAL_SCALE_MM)[..., None])[..., 0]
     return rotation @ rotation_from_vector(vote[:, :3] * RESIDUAL_SCALE_RAD), translation_mm + shift

@@ -13,10 +13,10 @@ from g3r.pose_network.config import PoseNetworkConfig
 
 
 def stored_template(pose: StoredModel[Any]) -> AtlasTemplate:
-    """The template; of weights that ship with the package, or that have been loaded, and so are known to be right.
+    """The template, from weights that ship with the package or have been loaded, and are therefore known to be valid.
 
     Args:
-        pose: file of a pose network.
+        pose: a stored pose network.
     """
     description = pose.file.description
     config = config_from_plain(PoseNetworkConfig, description["network_arguments"])

@@ -1,4 +1,4 @@
-"""The arguments of the prior network, as its constructor, its training and its file have them."""
+"""The arguments of the prior network, shared by its constructor, its training and its file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from g3r.geometry import VolumeGrid
 MAX_LEVELS = 16
 MAX_CHANNELS = 4096
 MAX_UNITS = 64
-"""Beyond these a network takes minutes to build."""
+"""Limits beyond which a network takes minutes to build."""
 
 MAX_TEMPLATE_EDGE = 512
 MAX_SPACING_MM = 100.0
@@ -31,8 +31,8 @@ class PriorNetworkConfig:
         use_density: False hides the densities from F (an ablation); gate and base still use the coverage.
         use_sharp: True shows V_sharp to F, in addition to V_coarse; False is Eq. 7 as printed.
         sharp_base: True adds the residual to V_sharp instead of V_coarse (an ablation).
-        use_template: True shows the fitted template to F, and puts it under the residual where no slice looked.
-        template_shape: [A, I, J, K] of the atlas template: A ages on one grid. A training replaces it by its data's.
+        use_template: True shows the fitted template to F, and uses it as the base where no slice looked.
+        template_shape: [A, I, J, K] of the atlas template: A ages on one grid. Training replaces it by its data's.
         template_spacing_mm: the template's voxel size.
 
     Raises:
@@ -68,7 +68,7 @@ class PriorNetworkConfig:
 
     @property
     def n_inputs(self) -> int:
-        """Volumes that F sees: V_coarse, and as chosen two confidences, V_sharp and the template."""
+        """Number of volumes that F sees: V_coarse, and optionally two confidences, V_sharp and the template."""
         return 1 + 2 * self.use_density + self.use_sharp + self.use_template
 
     @property

@@ -13,21 +13,21 @@ from g3r.prior.network import ResidualRefiner
 
 
 class PriorOutput(NamedTuple):
-    """V_prior, and the logit of each voxel being brain; [B, 1, I, J, K] both."""
+    """V_prior, and the logit of each voxel being brain; both [B, 1, I, J, K]."""
 
     volume: Tensor
     brain_logit: Tensor
 
 
 class DensityGatedPriorNetwork(nn.Module):
-    """The structural prior: V_prior = base + G(c) F, Eq. 7 with a base that reaches into what no slice saw.
+    """The structural prior: V_prior = base + G(c) F, Eq. 7 with a base that extends into unseen voxels.
 
-    The paper's base is V_coarse, which is zero where nothing was measured. Here it is V_coarse where slices looked and
-    an atlas template, fitted to what they saw, where none did (`PriorInputs.base`). `use_sharp=False,
-    use_template=False` is Eq. 7 as printed, but for the bound: |F| < 1, so that alpha is the
-    most by which the network may change a densely measured voxel, in units of the brightest tissue.
+    The paper's base is V_coarse, which is zero where nothing was measured. Here it is V_coarse where slices looked, and
+    where none did an atlas template fitted to what they saw (`PriorInputs.base`). `use_sharp=False,
+    use_template=False` is Eq. 7 as printed, except for the bound |F| < 1: alpha is the largest change of a densely
+    measured voxel by the network, in units of the brightest tissue.
 
-    The network carries the atlas template that its training used; fitting it is the caller's work
+    The network holds the atlas template of its training; the caller fits it
     (`g3r.acquisition.template_fit`).
 
     Args:
@@ -44,14 +44,14 @@ class DensityGatedPriorNetwork(nn.Module):
         self.config = config
         self.gate = DensityGate(config.alpha, config.beta)
         self.refiner = ResidualRefiner(config)
-        # only for speed: convolutions on a CPU take half the time with channels innermost
+        # for speed only: convolutions on a CPU take half the time with channels innermost
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         self.register_buffer("template", torch.zeros(*config.template_shape))
 
     def set_template(self, volume: Tensor) -> None:
-        """Take over an atlas template [A, I, J, K] on a grid about the origin; no weight depends on its shape."""
+        """Set the atlas template [A, I, J, K], on a grid centred on the origin; no weight depends on its shape."""
         self.config = replace(self.config, template_shape=tuple(volume.shape))
-        # as it is stored, so that a training sees what its users will
+        # rounded to float16 as in the file, so that training sees what inference sees
         self.template = volume.half().to(self.template)
 
     def forward(self, given: PriorInputs) -> PriorOutput:

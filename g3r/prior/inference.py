@@ -12,7 +12,7 @@ from g3r.prior.inputs import PriorInputs
 from g3r.prior.maps import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling
 
 VIEWS = ((), (0, 1), (1, 2), (0, 2), (0,), (1,), (2,), (0, 1, 2))
-"""Axes that are mirrored: half turns first, which show the network a head and not a mirror image."""
+"""Mirrored axes of each view: half turns first, which show the network a head rather than its mirror image."""
 
 
 def estimate_prior(
@@ -20,14 +20,14 @@ def estimate_prior(
 ) -> EstimatedPrior:
     """Return V_prior for a whole volume (Eq. 7).
 
-    The network was trained on heads lying in any of the 48 symmetric ways, and its errors differ between
-    them: the mean over some is better than any one ("geometric self-ensemble", Lim et al., CVPRW 2017).
+    The network was trained on heads in all 48 symmetric orientations, and its errors differ between them, so the
+    mean over some is better than any single one ("geometric self-ensemble", Lim et al., CVPRW 2017).
 
     Args:
-        network: on any device; its mode is left as it is.
+        network: the network, on any device; its mode is not changed.
         maps: intensities already divided by `g3r.acquisition.coarse_volume.normalisation_scale`.
         n_views: number of mirror images and half turns to average over, 1 to 8.
-        tiling: how large volumes are cut.
+        tiling: how large volumes are cut into tiles.
 
     Returns:
         V_prior in the units of V_coarse, and the brain's probability.
@@ -46,7 +46,7 @@ def estimate_prior(
     stride = network.config.stride
     shape_given = maps.coarse.shape
     whole = maps.coarse.size <= tiling.max_whole_voxels
-    # only with whole strides does a mirrored tile fall on the same sub-sampled grid as the mirrored volume
+    # with whole strides only, a mirrored tile is on the same sub-sampled grid as the mirrored volume
     far_end = [(0, -extent % stride) for extent in shape_given]
     volumes = {
         name: np.pad(np.asarray(volume, np.float32), far_end)
@@ -82,7 +82,7 @@ def estimate_prior(
 
 
 def _view(network: DensityGatedPriorNetwork, inputs: PriorInputs, axes: tuple[int, ...]) -> PriorOutput:
-    """The prior as the network sees it with some axes mirrored, mirrored back."""
+    """The network's output for inputs with some axes mirrored, mirrored back."""
     dims = [2 + axis for axis in axes]
     found = network(inputs.flip(dims))
     return PriorOutput(found.volume.flip(dims), found.brain_logit.flip(dims))
@@ -99,13 +99,13 @@ def _round_up(value: int, multiple: int) -> int:
 
 def _tiles(shape: tuple[int, ...], edge: int, halo: int) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
     """Yield (voxels a tile writes, voxels it sees); the first parts cover the volume once."""
-    # an axis that a tile sees the whole of is not cut
+    # an axis that one tile sees as a whole is not cut
     edges = [extent if edge + 2 * halo >= extent else edge for extent in shape]
     for corner in np.ndindex(*[-(-extent // edge) for extent, edge in zip(shape, edges, strict=True)]):
         start = [index * edge for index, edge in zip(corner, edges, strict=True)]
         stop = [min(begin + edge, extent) for begin, edge, extent in zip(start, edges, shape, strict=True)]
         core = tuple(slice(begin, end) for begin, end in zip(start, stop, strict=True))
-        # all of one shape, those at an end reaching further inwards: torch keeps memory for each shape
+        # one shape for all, reaching further inwards at an end, because torch caches memory for each shape
         seen_edge = [min(edge + 2 * halo, extent) for edge, extent in zip(edges, shape, strict=True)]
         first = [
             min(max(begin - halo, 0), extent - wide)

@@ -1,4 +1,4 @@
-"""What the prior network sees of a subject, and what it starts from: the base of Eq. 7."""
+"""Inputs of the prior network for one subject, and the base of Eq. 7, to which it adds its residual."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from g3r.prior.config import PriorNetworkConfig
 from g3r.prior.gate import confidence_from_density
 
 CERTAIN_LOGIT = 3.0
-"""Logit of a voxel inside the masks or the template before the network has its say: a probability of 0.95."""
+"""Logit of a voxel inside the masks or the template before the network's correction: a probability of 0.95."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,12 +22,12 @@ class PriorInputs:
     Attributes:
         coarse: V_coarse.
         density: M_rho >= 0, dimensionless, over whole slices.
-        share: of the density whose masks say brain, 0 to 1; None takes all of it as brain.
+        share: share of the density whose masks say brain, 0 to 1; None takes all of it as brain.
         sharp: V_sharp; needed with `use_sharp`.
         template: the template as fitted to the seen voxels, zero outside its brain; needed with `use_template`.
         outline: share of brain in the fitted template, 0 to 1; needed with `use_template`.
-        gating: what gate and F take for M_rho, to compare definitions of it; None takes `density`, which the base
-            is made with in any case.
+        gating: density that gate and F use instead of M_rho, to compare definitions of it; None takes `density`, from
+            which the base is made in any case.
         gating_share: share of `gating` whose masks say brain; None takes all of it as brain.
     """
 
@@ -42,7 +42,7 @@ class PriorInputs:
 
     @property
     def read_density(self) -> Tensor:
-        """What gate and F take for M_rho."""
+        """The density that gate and F use as M_rho."""
         return self.density if self.gating is None else self.gating
 
     def shown(self, config: PriorNetworkConfig) -> list[Tensor]:
@@ -67,7 +67,7 @@ class PriorInputs:
         return [one for one in given if one is not None]
 
     def base(self, config: PriorNetworkConfig) -> Tensor:
-        """What the residual is added to: the measured volume where slices looked, the template where none did."""
+        """The base of the residual: the measured volume where slices looked, the template where none did."""
         measured = self.sharp if config.sharp_base else self.coarse
         assert measured is not None
         if not config.use_template:
@@ -76,7 +76,7 @@ class PriorInputs:
         return torch.lerp(measured, self.template, self._unseen())
 
     def base_logit(self, config: PriorNetworkConfig) -> Tensor:
-        """What the network adds its brain logit to: the masks where slices looked, the template's outline elsewhere."""
+        """The base of the brain logit: the masks where slices looked, the template's outline elsewhere."""
         share = torch.ones_like(self.density) if self.share is None else self.share
         if config.use_template:
             assert self.outline is not None

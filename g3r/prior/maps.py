@@ -1,4 +1,4 @@
-"""What goes into the estimation of a prior and what comes out, without the network and its libraries."""
+"""Inputs and outputs of the estimation of a prior, without the network and its libraries."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Tiling:
-    """How a large volume is cut for the network, which needs about 0.12 GB of memory per million voxels.
+    """How a large volume is cut into tiles for the network, which needs about 0.12 GB of memory per million voxels.
 
     Args:
         max_whole_voxels: larger volumes are cut into tiles.

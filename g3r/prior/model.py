@@ -1,4 +1,4 @@
-"""A trained prior: the network, the voxels and conventions that it was trained under, and its file."""
+"""A trained prior: the network, its voxel size and conventions, and its file."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from g3r.prior.maps import DEFAULT_TILING, EstimatedPrior, PriorMaps, Tiling
 
 VOXEL_MM_RANGE = (0.1, 10.0)
 VOXEL_MM_TOLERANCE = 1e-3
-"""Voxel sizes that differ by less are the same."""
+"""Voxel sizes that differ by less count as equal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prior(TrainedModel):
-    """A prior network with what has to be known to use it. See `TrainedModel` for `load`, `save` and `record`.
+    """A trained prior network with its voxel size and template ages; see `TrainedModel` for `load`, `save`, `record`.
 
     Attributes:
         voxel_mm: isotropic voxel size that it was trained at, and is used at.
         weeks: gestational age of each head of the network's template.
 
     Raises:
-        ValueError: a voxel size out of range, or another number of ages than the template has.
+        ValueError: the voxel size is out of range, or the number of ages differs from the template's.
     """
 
     network: DensityGatedPriorNetwork
@@ -69,7 +69,7 @@ class Prior(TrainedModel):
 
     @staticmethod
     def stored(name: str, value: Tensor) -> Tensor:
-        """Half the bytes for the template, whose intensities need no more digits."""
+        """The template as float16, which is enough for its intensities."""
         return value.half() if name == "template" else value
 
     @cached_property
@@ -79,7 +79,7 @@ class Prior(TrainedModel):
         return AtlasTemplate(self.network.template.cpu().numpy(), config.template_grid.affine, np.array(self.weeks))
 
     def in_words(self) -> str:
-        """Voxel size and gate."""
+        """Voxel size and gate, in words."""
         return f"voxels of {self.voxel_mm:g} mm, alpha {self.network.config.alpha:g}"
 
     def estimate(self, maps: PriorMaps, *, n_views: int = 1, tiling: Tiling = DEFAULT_TILING) -> EstimatedPrior:
@@ -88,7 +88,7 @@ class Prior(TrainedModel):
         Args:
             maps: intensities divided by their `normalisation_scale`.
             n_views: mirror images over which the prior is averaged, 1 to 8.
-            tiling: how large volumes are cut.
+            tiling: how large volumes are cut into tiles.
 
         Raises:
             ValueError: a volume that the network needs is missing, or another number of views.

@@ -23,25 +23,25 @@ _BLOCK: dict[str, Any] = {
 
 
 SLAB_ROWS = 16
-"""Rows at half resolution of which the layers at full resolution are computed at a time."""
+"""Rows at half resolution in a slab, for which the layers at full resolution are computed at a time."""
 
 
 class ResidualRefiner(nn.Module):
-    """A 3D residual network F that is cheap on a CPU; a second output says how likely a voxel is brain.
+    """A 3D residual network F that is cheap on a CPU; its second output is the logit of a voxel being brain.
 
-    The full-resolution grid is where a CPU spends its time, so it is left at once: 2x2x2 voxels become
-    channels (space to depth), a U-shape of residual units works at 1/2, 1/4, 1/8 ... resolution, a
-    sub-pixel step comes back, and two light convolutions at full resolution see the input again.
+    A CPU spends most of its time at full resolution, so the network leaves it first: 2x2x2 voxels become channels
+    (space to depth), and a U-shape of residual units works at 1/2, 1/4, 1/8 ... resolution. Then a sub-pixel step
+    returns to full resolution, where two light convolutions see the input again.
 
     Densities enter as c = 1 - exp(-M) rather than as M: M is unbounded (hundreds under an output grid
-    much finer than the slices), c is in [0, 1], has slope 1 at 0, and is what the gate uses. There are two: the
-    coverage, and the part of it whose masks say brain.
+    much finer than the slices), while c is in [0, 1], has slope 1 at 0, and is what the gate uses. There are two
+    densities: the coverage, and the part of it whose masks say brain.
 
-    F is bounded by tanh: with the gate, alpha is the most by which the network may change a densely measured
+    F is bounded by tanh. With the gate, alpha is therefore the largest change by the network of a densely measured
     voxel, in units of the brightest tissue. The last convolution starts at zero, so training starts from the base.
 
     Args:
-        config: of the whole prior network; F takes what concerns it.
+        config: configuration of the whole prior network, of which F uses a part.
     """
 
     def __init__(self, config: PriorNetworkConfig) -> None:
@@ -86,10 +86,10 @@ class ResidualRefiner(nn.Module):
     def forward(self, given: PriorInputs) -> tuple[Tensor, Tensor]:
         """Return the ungated residual F in (-1, 1), and the logit of a voxel being brain.
 
-        Any size works, it is padded with zeros at the far end inside.
+        Any size works, because volumes are padded with zeros at the far end.
 
         Args:
-            given: the volumes; those that the configuration leaves out are ignored.
+            given: the volumes; those that the configuration does not use are ignored.
 
         Returns:
             Two of [B, 1, I, J, K].
@@ -120,17 +120,17 @@ class ResidualRefiner(nn.Module):
         return self.head(self.tail(_channels_last(features)))
 
     def _in_slabs(self, features: Tensor, inputs: Tensor) -> Tensor:
-        """`_at_full_resolution`, where no gradient is wanted a slab after the other.
+        """`_at_full_resolution`, slab by slab if no gradient is needed.
 
-        These layers hold most of the memory. A slab sees the two voxels beyond it that its layers reach, so
-        that the result is that of the whole, up to rounding.
+        These layers hold most of the memory. A slab includes the two voxels beyond it that its layers reach, so that
+        the result equals that of the whole volume, up to rounding.
         """
         n_rows = features.shape[2]
         if torch.is_grad_enabled() or n_rows <= SLAB_ROWS + 2:
             return self._at_full_resolution(features, inputs)
         out = torch.empty_like(inputs[:, :2])
         for begin in range(0, n_rows, SLAB_ROWS):
-            # all slabs but have one shape, the last overlapping: kernels are set up, and kept, for each shape
+            # all slabs have one shape, the last one overlapping, because kernels are set up and kept for each shape
             low = min(max(begin - 1, 0), n_rows - SLAB_ROWS - 2)
             high = low + SLAB_ROWS + 2
             seen = self._at_full_resolution(features[:, :, low:high], inputs[:, :, 2 * low : 2 * high])
@@ -148,7 +148,7 @@ def _residual_units(width: int, count: int) -> nn.Sequential:
 def _subpixel_upsample(in_channels: int, out_channels: int) -> SubpixelUpsample:
     """Return a doubling of the resolution: 1x1x1 convolution to 8 times the channels, then rearrangement.
 
-    The neighbourhood is looked at by the convolutions before and after; a 3x3x3 kernel here would hold
+    The convolutions before and after see the neighbourhood; a 3x3x3 kernel here would hold
     half of all the weights. No averaging afterwards (MONAI's `apply_pad_pool`): it shifts by half a voxel.
     """
     to_subpixels = nn.Conv3d(in_channels, 8 * out_channels, kernel_size=1)

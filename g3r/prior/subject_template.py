@@ -1,4 +1,4 @@
-"""The prior's atlas template for one subject: placed where registration found the head, then fitted to it."""
+"""The prior's atlas template for one subject: placed by the registration of the head, then fitted to the slices."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PlacedTemplate:
 
     Attributes:
         volume: [I, J, K] float32, zero outside the brain.
-        grid: of the volume, enlarged to the subject's size.
+        grid: grid of the volume, enlarged to the subject's size.
     """
 
     volume: NDArray[np.float32]
@@ -29,9 +29,9 @@ class PlacedTemplate:
         """The head nearest in age, enlarged about its centre.
 
         Args:
-            template: in the frame of the slices, which is the atlas frame.
-            weeks: the subject's age as registration found it.
-            scale: by which a template of that age has to be enlarged.
+            template: atlas template in the frame of the slices, which is the atlas frame.
+            weeks: the subject's age, as found by registration.
+            scale: factor by which a template of that age has to be enlarged.
         """
         volume = template.volume[int(np.abs(template.weeks - weeks).argmin())]
         center_mm = template.grid.world(np.argwhere(volume > 0)).mean(0)
@@ -48,12 +48,12 @@ class PlacedTemplate:
     def fitted(
         self, head: NDArray[np.float32], share: NDArray[np.float32], density: NDArray[np.float32], grid: VolumeGrid
     ) -> TemplateFit:
-        """The template fitted to what slices saw of a head.
+        """The template fitted to the seen voxels of a head.
 
         Args:
             head: [I, J, K] V_sharp.
-            share: [I, J, K] of the density whose masks say brain.
+            share: [I, J, K] share of the density whose masks say brain.
             density: [I, J, K] M_rho.
-            grid: of all three.
+            grid: grid of all three.
         """
         return fit_template(self.volume, self.grid, head, share, np.minimum(density, 1), grid)

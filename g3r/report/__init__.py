@@ -1,1 +1,1 @@
-"""What a person is told of a result: the verdict in words, and report.html."""
+"""What users are shown of a result: the verdict in words, and report.html."""

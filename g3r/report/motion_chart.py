@@ -1,4 +1,4 @@
-"""Motion over the slices in the order of their acquisition, as lines for an SVG drawing."""
+"""Chart of the motion over the slices in order of acquisition, as lines for an SVG drawing."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 860.0, 150.0
 LEFT, TOP = 44.0, 8.0
-"""Of the drawing, and the margins of its plot, in units of the drawing."""
+"""Margins of the plot in the drawing, in the same units as its width and height."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One axis of the motion in one stack: its name, points as SVG takes them."""
+    """One axis of the motion in one stack: its name, and its points in SVG's notation."""
 
     name: str
     points: str
@@ -27,11 +27,11 @@ class Chart:
     """A drawing of one kind of motion.
 
     Attributes:
-        title: with the unit.
-        lines: of all stacks and axes.
-        ticks: position and text of the lines across.
+        title: title with the unit.
+        lines: one per stack and axis.
+        ticks: position and text of the horizontal grid lines.
         stacks: left end, width and name of each stack's part.
-        faint: positions [x, y] of slices that count less than half.
+        faint: positions [x, y] of down-weighted slices.
     """
 
     title: str
@@ -55,12 +55,12 @@ def motion_chart(
     """Lay out three lines for each stack.
 
     Args:
-        title: with the unit.
+        title: title with the unit.
         axes: names of the three columns.
         values: [K, 3] in the order of acquisition, stack after stack.
         stack: [K] number of the stack.
-        counts_less: [K] slices that are hardly used; they are marked, and do not set the range.
-        names: of all stacks.
+        counts_less: [K] down-weighted slices; they are marked, and do not set the range.
+        names: names of all stacks.
     """
     counted = values[~counts_less] if (~counts_less).any() else values
     limit = _nice(float(np.abs(counted).max(initial=0)))

@@ -1,4 +1,4 @@
-"""report.html: one file that holds everything it shows and asks nobody for anything."""
+"""report.html: one self-contained file that loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from g3r.run.atomic_file import write_text
 from g3r.run.json_record import to_plain
 
 SCRIPTS = ("niivue.umd.js", "nifti.js", "plain_viewer.js", "webgl_viewer.js", "viewer.js")
-"""In the order in which the page runs them."""
+"""The page's scripts, in the order in which it runs them."""
 
 SHIFT_AXES = ("right", "anterior", "superior")
 TURN_AXES = ("pitch (about right)", "roll (about anterior)", "yaw (about superior)")
@@ -41,12 +41,12 @@ def write_report(folder: Path, slices: Slices | None = None, output: Path | None
     """Write the page of an output folder, whole or not at all.
 
     Args:
-        folder: of a finished run.
-        slices: of it, in their last poses and with their pixels; None leaves their pictures out.
+        folder: folder of a finished run.
+        slices: slices of the run in their final poses, with their pixels; None leaves their pictures out.
         output: file to write; report.html in the folder by default.
 
     Raises:
-        InputError: files of the folder are missing or damaged, the slices are others, or the page cannot be written.
+        InputError: files of the folder are missing or damaged, slices are not its own, or the page cannot be written.
     """
     path = folder / REPORT_NAME if output is None else output
     text = report_html(folder, slices)
@@ -106,7 +106,7 @@ def _template() -> jinja2.Template:
 
 
 def _security_policy(scripts: list[str]) -> str:
-    """Only the scripts of the page, by their hashes; no address but what the page itself holds."""
+    """Content security policy: only the page's own scripts, by their hashes, and no external address."""
     hashes = " ".join(
         f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'" for text in scripts
     )
@@ -117,17 +117,17 @@ def _security_policy(scripts: list[str]) -> str:
 
 
 def _json(value: Any) -> str:
-    """JSON that may stand in a script element."""
+    """JSON that is safe inside a script element."""
     return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _colors() -> str:
-    """The colours of maps, 256 of three bytes, as base64."""
+    """The colour map, 256 colours of three bytes each, as base64."""
     return base64.b64encode(INFERNO.tobytes()).decode("ascii")
 
 
 def _sections(images: ViewerImages) -> list[tuple[str, str]]:
-    """Central sections of the volume for those without scripts, and for print; the patient's right is on the left."""
+    """Central sections of the volume for print and without scripts; the patient's right is on the left."""
     volume, (low, high) = images.data["volume"], images.window["volume"]
     i, j, k = np.rint(images.grid.index(images.mask_center_mm)).astype(int).tolist()
     found = (("axial", volume[::-1, :, k]), ("coronal", volume[::-1, j, :]), ("sagittal", volume[i, ::-1, :]))

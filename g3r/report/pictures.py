@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 DIFFERENCE_SHARE = 0.3
-"""Share of the bright end at which a difference has its full colour."""
+"""Share of the white level at which a difference has its full colour."""
 
 SMALLEST_PIXELS = 96
-"""Width that pictures of few pixels are enlarged to."""
+"""Least width; smaller pictures are enlarged."""
 
 
 def grey(section: NDArray[np.float32], low: float, high: float) -> str:
-    """A section [up, across], first row at the bottom, between black and white."""
+    """A section [up, across] in grey, first row at the bottom; `low` is black and `high` is white."""
     return _png(_bytes((section - low) / (high - low)))
 
 
@@ -26,7 +26,7 @@ def difference(section: NDArray[np.float32], high: float) -> str:
 
     Args:
         section: measured minus predicted, first row at the bottom.
-        high: intensity of the bright end of the pictures beside it.
+        high: intensity shown as white in the pictures beside it.
     """
     share = np.clip(section / (DIFFERENCE_SHARE * high), -1, 1)[..., None]
     orange, blue = np.array([1.0, 0.62, 0.22]), np.array([0.3, 0.62, 1.0])

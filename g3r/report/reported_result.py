@@ -1,4 +1,4 @@
-"""What `GaussianReconstructor` returns: the result, and what is to be said of it."""
+"""What `GaussianReconstructor` returns: the result together with its verdict."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from g3r.run.output_folder import OutputFolder
 logger = logging.getLogger(__name__)
 
 BRIGHT_PERCENTILE = 99.5
-"""Of the volume in the brain: what the pictures show as white."""
+"""Percentile of the volume in the brain that the pictures show as white."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """The verdict on a volume, as text in a terminal, and with its central sections in a notebook.
+    """The verdict on a volume: text in a terminal, with its central sections in a notebook.
 
     Attributes:
         verdict: the word ("use", "check" or "do not use") and its reasons.
@@ -47,7 +47,7 @@ class Report:
         return str(self)
 
     def _repr_html_(self) -> str:
-        """For notebooks; names of files are escaped."""
+        """HTML for notebooks; file names are escaped."""
         reasons = "".join(
             f"<li>{escape(one.sentence)} <i>{escape(one.advice)}</i></li>" for one in self.verdict.reasons
         )
@@ -60,11 +60,11 @@ class Report:
 
 
 class ReportedResult(ReconstructionResult):
-    """A `ReconstructionResult` that can be judged; its attributes are those of that class."""
+    """A `ReconstructionResult` with a verdict; it has the attributes of that class."""
 
     @classmethod
     def of(cls, result: ReconstructionResult) -> ReportedResult:
-        """The same result."""
+        """The same result as a `ReportedResult`."""
         return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
 
     def save(
@@ -78,10 +78,10 @@ class ReportedResult(ReconstructionResult):
         """Write every output and report.html into a folder; it appears whole or not at all.
 
         Args:
-            folder: to write.
+            folder: folder to write.
             replace: whether an earlier result in it may be replaced; other files there are kept.
-            run: holds this folder already; one for this call alone when None.
-            also: writes more files of `OUTPUT_NAMES` into the folder that it is given, in which all others are.
+            run: holds this folder already; None takes it for this call alone.
+            also: writes more files of `OUTPUT_NAMES`; called with the folder in which all others are.
 
         Raises:
             InputError: the folder holds files already (without `replace`), or cannot be written.
@@ -95,12 +95,12 @@ class ReportedResult(ReconstructionResult):
         super(ReportedResult, self._judged()).save(folder, replace=replace, run=run, also=more)
 
     def _judged(self) -> ReportedResult:
-        """The same with the verdict in its record."""
+        """The same result with the verdict in its record."""
         verdict = verdict_of(self.record)
         return changed(self, record=changed(self.record, verdict=verdict.word, reasons=verdict.deciding))
 
     def _add_page(self, folder: Path) -> None:
-        """Write the page; without it the volume is no worse, so its failure is told and no more."""
+        """Write the page; a failure is only logged, because the volume is valid without it."""
         from g3r.report.page import write_report
 
         try:
@@ -128,14 +128,14 @@ class ReportedResult(ReconstructionResult):
             raise InputError(f"{path}: exists already; pass replace=True to replace it, or choose another file")
         from g3r.report.page import write_report
 
-        # the page is made of the files, as everyone else has them
+        # the page is made from saved files, as for g3r-infer
         with tempfile.TemporaryDirectory(prefix="g3r-report-") as folder:
             saved = Path(folder) / "result"
             super(ReportedResult, self._judged()).save(saved)
             write_report(saved, self.slices, path)
 
     def _sections(self) -> tuple[tuple[str, str], ...]:
-        """The patient's right is on the left, as in the page."""
+        """Central sections; the patient's right is on the left, as in the page."""
         if not self.mask.any():
             return ()
         high = float(np.percentile(self.volume[self.mask], BRIGHT_PERCENTILE)) or 1.0

@@ -1,4 +1,4 @@
-"""Slices as they were measured, as the volume predicts them, and the difference: the worst first."""
+"""Pictures of measured slices, of their prediction from the volume, and of the difference: the worst first."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MAX_SHOWN = 12
 
 @dataclass(frozen=True, kw_only=True)
 class SlicePicture:
-    """One slice.
+    """The pictures of one slice.
 
     Attributes:
         stack: name of its file.
-        number: in the stack, counted from 0 as in slices.tsv.
-        weight, ncc: in the volume, and correlation with it.
-        reason: why it counts less.
+        number: number in the stack, counted from 0 as in slices.tsv.
+        weight, ncc: weight in the volume and correlation with it.
+        reason: why it is down-weighted.
         measured, predicted, difference: PNG pictures as base64.
     """
 
@@ -40,20 +40,20 @@ class SlicePicture:
 
 
 def worst_first(rows: SliceRows, n: int = MAX_SHOWN) -> NDArray[np.int64]:
-    """Numbers of the `n` slices to look at: low weight, then low correlation; small ones after the others."""
+    """Indices of the `n` slices to look at: lowest weight, then lowest correlation; small slices after the others."""
     small = np.array(["small" in reason for reason in rows.reason], dtype=bool)
     kind = np.where(rows.weight >= FULL_WEIGHT, 2, small)
     return np.lexsort((rows.ncc, np.round(rows.weight, 2), kind))[:n]
 
 
 def slice_pictures(slices: Slices, rows: SliceRows, names: list[str], volume: Volume) -> list[SlicePicture]:
-    """Pictures of the slices to look at; those that differ little after one gain have little colour.
+    """Pictures of the worst slices; the prediction is scaled by one gain, so that the difference shows no gain error.
 
     Args:
-        slices: [K] in their last poses, with their pixels.
-        rows: [K] of slices.tsv.
-        names: of the stacks.
-        volume: as it was written, in the space of the poses.
+        slices: [K] in their final poses, with their pixels.
+        rows: [K] rows of slices.tsv.
+        names: names of the stacks.
+        volume: the written volume, in the space of the poses.
     """
     chosen = worst_first(rows)
     some = slices.take(chosen)

@@ -1,4 +1,4 @@
-"""slices.tsv read back: a record for each slice, and its motion against the mean of the head."""
+"""slices.tsv read back: a record per slice, and its motion relative to the mean pose of the head."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class SliceRows:
     """The K rows of slices.tsv.
 
     Attributes:
-        stack, number: [K] of the stack, and of the slice in it.
-        motion: [K] takes a point by the file's header to where it was found to be.
+        stack, number: [K] number of the stack, and of the slice in it.
+        motion: [K] motion of points from their place by the file's header to the estimated one.
         weight, ncc: [K] weight in the volume and correlation with it.
-        reason: K words on why a slice counts less; "-" where it does not.
+        reason: K reasons for weights below one; "-" for none.
     """
 
     stack: NDArray[np.int64]
@@ -41,7 +41,7 @@ class SliceRows:
         """Read the table that g3r-infer wrote.
 
         Raises:
-            InputError: it is missing, no such table, or names a stack that run.json does not have.
+            InputError: it is missing, is not such a table, or names a stack that run.json does not have.
         """
         try:
             head, *lines = path.read_text(encoding="utf-8").splitlines()
@@ -80,16 +80,16 @@ class SliceRows:
         )
 
     def acquisition_key(self, record: RunRecord) -> NDArray[np.int64]:
-        """Order [K] of the slices in time, stack after stack, by the interleaving that was found."""
+        """Order [K] of the slices in time, stack after stack, by the interleave found in registration."""
         step = np.array([stack.interleave or 1 for stack in record.stacks])[self.stack]
         return np.lexsort((self.number // step, self.number % step, self.stack))
 
     def head_motion(self, record: RunRecord, center_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """How the head lay in each slice, against its mean, along the axes of the scanner (RAS).
+        """Motion of the head in each slice relative to its mean pose, along the axes of the scanner (RAS).
 
         Args:
-            record: with the mean motion of all slices, where there is one.
-            center_mm: [3] of the head, in the volume's space.
+            record: has the mean motion of all slices, if there is one.
+            center_mm: [3] centre of the head, in the volume's space.
 
         Returns:
             Shift of the head's centre [K, 3] (mm) and rotation vector [K, 3] (degrees).
@@ -98,7 +98,7 @@ class SliceRows:
         if record.registration and record.registration.standard_from_scanner is not None:
             matrix = np.array(record.registration.standard_from_scanner, dtype=np.float64)
             mean = RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])
-        # the slice lies still, the head moves: so the inverse of where the slice was put
+        # the motion of the head is the inverse of the motion of the slice
         head = self.motion.inverse() @ mean
         center = mean.inverse().apply(center_mm[None])[0]
         in_scanner = self.motion.inverse().apply(np.tile(center_mm, (len(self), 1)))

@@ -1,4 +1,4 @@
-"""What the page says of each stack."""
+"""The rows of the page's table of stacks."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class StackRow:
     """One stack in words.
 
     Attributes:
-        name: of the file.
-        thickness, thickness_from: of a slice, and who said so.
-        thickness_assumed: whether nobody did.
-        spacing: of pixels and slices.
-        mask, mask_from: its size, and who made it.
-        used, n_slices: slices of at least half the full weight, and all.
-        agreement: with the other stacks, as text.
-        place: of the agreement on the scale, 0 to 1; None where nothing was compared.
+        name: name of the file.
+        thickness, thickness_from: slice thickness and its source.
+        thickness_assumed: whether the thickness is unknown and assumed equal to the slice spacing.
+        spacing: distances of pixels and of slices.
+        mask, mask_from: volume of the mask and its source.
+        used, n_slices: slices of at least half the full weight, and all slices.
+        agreement: correlation with the other stacks, as text.
+        place: position of the agreement on the scale, 0 to 1; None if nothing was compared.
         judgement: "good", "doubtful", "bad", "left out" or "not checked".
         segments: how often the head jumped while it was acquired, in words.
     """
@@ -58,7 +58,7 @@ class StackRow:
 
 
 def scale_ends() -> tuple[float, float]:
-    """Where on the scale, 0 to 1, "bad" ends and "good" begins."""
+    """Positions on the scale, 0 to 1, at which "bad" ends and "good" begins."""
     return _place(MIN_HELD_OUT), _place(RETRY_BELOW_CORRELATION)
 
 

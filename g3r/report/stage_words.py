@@ -1,7 +1,7 @@
-"""What the terminal says while a run goes on: every sentence about a stage is in `DOING` and `LINES`.
+"""Progress messages of a run on the terminal: every sentence about a stage is in `DOING` and `LINES`.
 
-The verdict at the end has its own table, in `verdict.py`. Nothing heavy is imported here: the first word stands
-on the terminal before torch is loaded.
+The verdict at the end has its own table, in `verdict_messages.py`. Nothing heavy is imported here: the first message
+is printed before torch is loaded.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 STARTING, FINDING_MASKS, LOADING, PREPARING = "starting", "finding masks", "loading", "preparing"
-"""What comes before the stages that a run keeps: files are checked and read, programs are loaded."""
+"""Steps before the stages of the run context: files are checked and read, programs are loaded."""
 
 WRITING = "writing"
-"""What comes after them."""
+"""Step after the stages of the run context."""
 
 DOING = {
     STARTING: "starting",
@@ -33,7 +33,7 @@ DOING = {
     "uncertainty": "estimating the errors",
     WRITING: "writing the files",
 }
-"""By stage: what stands beside the bar, and before the sentence when the stage has ended."""
+"""Words by stage: shown beside the bar, and before the sentence when the stage has ended."""
 
 LINES = {
     "stacks": (LOADING, "{n_stacks:stack}, {n_slices:slice} {thickness} thick"),
@@ -70,10 +70,10 @@ LINES = {
     "errors": ("uncertainty", "uncertainty.nii.gz says them of each voxel"),
     "written": (WRITING, "done"),
 }
-"""By name: the stage, and what is said of it when it has ended. `{n:stack}` is "1 stack" or "3 stacks"."""
+"""Lines by name: the stage, and the sentence when it has ended. `{n:stack}` is "1 stack" or "3 stacks"."""
 
 WITHOUT_FACTS = {"prior share": "shares", "uncertainty": "errors"}
-"""Stages of which one thing is said, whatever they found."""
+"""Stages with one fixed line, whatever their result."""
 
 RESUMED = " (from the earlier run)"
 
@@ -81,14 +81,14 @@ COMPILING = "first run on this machine: programs are compiled once, about {secon
 
 
 STOPPING = "stopping after this step"
-"""Beside the bar, from a first Ctrl-C on."""
+"""Shown beside the bar after a first Ctrl-C."""
 
 
 class Count(int):
-    """A number of things: formatted with their name, it says one or several of them."""
+    """A number of things that is formatted with their name, in the singular or the plural."""
 
     def __format__(self, name: str) -> str:
-        """As "1 stack", "3 stacks"; the number alone without a name."""
+        """The number and the name, as "1 stack" or "3 stacks"; the number alone without a name."""
         if not name:
             return str(int(self))
         return f"{int(self)} {name}" if int(self) == 1 or name in ("more",) else f"{int(self)} {name}s"
@@ -98,8 +98,8 @@ def line(name: str, facts: Mapping[str, object], *, resumed: bool = False) -> st
     """A line of the table, filled in.
 
     Args:
-        name: in `LINES`.
-        facts: what is filled in.
+        name: key of `LINES`.
+        facts: values to fill in.
         resumed: whether the stage was taken from an earlier run.
     """
     stage, text = LINES[name]

@@ -1,4 +1,4 @@
-"""The slices of an earlier run with their pixels, which its folder does not hold, read from the stacks again."""
+"""Slices of an earlier run with their pixels: its folder holds none, so the stacks are read again."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from g3r.reuse.other_images import load_images, slices_of
 
 
 def stored_slices(folder: Path, stacks: Sequence[str | os.PathLike[str]]) -> Slices:
-    """Slices [K] in the last poses of a run.
+    """Slices [K] in the final poses of a run.
 
     Args:
-        folder: of the run.
-        stacks: its files, in its order.
+        folder: folder of the run.
+        stacks: files of the run's stacks, in the same order.
 
     Raises:
-        InputError: other files than those of the run, or a folder without reuse.npz.
+        InputError: the files are not those of the run, or the folder is without reuse.npz.
     """
     run = FinishedRun.load(folder)
     return slices_of(run.geometry, load_images(run, stacks))

@@ -1,6 +1,6 @@
-"""The verdict on a volume, "use", "check" or "do not use", with its reasons: what terminal and report say.
+"""The verdict on a volume for terminal and report, "use", "check" or "do not use", with its reasons.
 
-Every sentence is in `verdict_messages`. Thresholds are those of the code that judges: `registration.thresholds`,
+Every sentence is in `verdict_messages`. The thresholds are in the code that applies them: `registration.thresholds`,
 `uncertainty.unseen` and `fitting.volume_check`.
 """
 
@@ -31,7 +31,7 @@ class Reason:
 
     @property
     def sentence(self) -> str:
-        """The text as a sentence of its own; the name of a file that it begins with stays as it is."""
+        """The text as a sentence with a capital and a full stop; a file name at its beginning stays unchanged."""
         first = self.text.split()[0]
         text = self.text if "." in first else self.text[0].upper() + self.text[1:]
         return text if text.endswith(".") else f"{text}."
@@ -39,23 +39,23 @@ class Reason:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The word and its reasons, the worst first; where the word is "use", what speaks for it."""
+    """The word and its reasons, the worst first; for "use", the reasons in favour."""
 
     word: Word
     reasons: tuple[Reason, ...]
 
     @property
     def headline(self) -> str:
-        """What the word means, as a sentence."""
+        """The meaning of the word, as a sentence."""
         return HEADLINES[self.word]
 
     @property
     def deciding(self) -> list[str]:
-        """The reasons of the word's weight."""
+        """The reasons that are as severe as the word."""
         return [reason.text for reason in self.reasons if reason.word == self.word]
 
     def line(self) -> str:
-        """The word and all reasons of its weight in one line, for the terminal."""
+        """The word and the deciding reasons in one line, for the terminal."""
         return f"{self.word}: {'; '.join(self.deciding)}"
 
 
@@ -76,7 +76,7 @@ def _reason(name: str, facts: dict[str, object]) -> Reason:
 
 
 def _faults(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
-    """Names of messages, and what is filled in."""
+    """Names of messages, and the values to fill in."""
     for stack in record.stacks:
         yield from _of_stack(stack)
     yield from _unlike_others(record)
@@ -147,7 +147,7 @@ def _of_stack(stack: StackRecord) -> Iterator[tuple[str, dict[str, object]]]:
 
 
 def _unlike_others(record: RunRecord) -> Iterator[tuple[str, dict[str, object]]]:
-    """Stacks that passed every test of their own, but agree less with the volume than the best one does."""
+    """Stacks that passed all tests of single stacks, but agree less with the volume than the best stack does."""
     found = [(stack.name, stack.quality) for stack in record.stacks if stack.quality]
     ncc = [0.0 if one.left_out else one.median_slice_ncc or 0.0 for _, one in found]
     for n in unlike_others([one for _, one in found]):
@@ -164,7 +164,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _is_said_otherwise(line: str, record: RunRecord) -> bool:
-    """Whether a warning of the run has a message of its own in the table."""
+    """Whether a warning of the run has its own message in the table."""
     if line.startswith("the loss of the fit rose: "):
         return record.n_rollbacks > 0
     if line.startswith(PARALLEL):

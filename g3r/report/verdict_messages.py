@@ -1,4 +1,4 @@
-"""What a verdict may say of a volume: its words, every message, and what to do about it."""
+"""The messages of a verdict: its words, every reason, and what to do about it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MILDEST_FIRST: tuple[Word, ...] = (USE, CHECK, DO_NOT_USE)
 
 @dataclass(frozen=True)
 class Message:
-    """What may be said of a result.
+    """A reason that a verdict may have.
 
     Attributes:
-        word: the best verdict that is possible with it.
-        text: the fact; names in braces are filled in.
+        word: the best verdict that is possible with this message.
+        text: the fact; values replace the names in braces.
         advice: what to do about it.
     """
 
@@ -157,11 +157,11 @@ MESSAGES = {
     ),
     "all seen": Message(USE, "slices saw the whole {what}", ""),
 }
-"""By name: what terminal and report may say."""
+"""Messages of terminal and report, by name."""
 
 HEADLINES = {
     USE: "No fault was found by the checks that g3r makes.",
     CHECK: "Look at the points below before using this volume.",
     DO_NOT_USE: "This volume must not be used.",
 }
-"""What the words mean."""
+"""Meaning of the words."""

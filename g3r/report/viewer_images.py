@@ -1,4 +1,4 @@
-"""Small copies of a result's images for the viewer: one grid, cropped to the head, one or two bytes a voxel."""
+"""Small copies of a result's images for the viewer: on one grid, cropped to the head, one or two bytes per voxel."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from g3r.geometry.grid import bounding_box, on_grid
 Kind = Literal["grey", "map", "mark"]
 
 REGIONS = frozenset({"mask", "unseen"})
-"""Images that say together where the head is."""
+"""Images whose union is the extent of the head."""
 
 MAX_VOXELS = 2_500_000
-"""Of the cropped grid; above, voxels are joined two by two by two, so that the page stays below 10 MB."""
+"""Limit of the cropped grid. Above it, blocks of 2 x 2 x 2 voxels are averaged, so that the page stays below 10 MB."""
 
 MARGIN_VOXELS = 3
 COMPRESSION = 6
@@ -35,11 +35,11 @@ class Layer:
     """One image of the folder as the viewer shows it.
 
     Attributes:
-        name: of the file, without ending.
-        title: on its button.
+        name: name of the file, without its ending.
+        title: label of its button.
         caption: how to read it.
-        kind: "grey" for intensities, "map" for figures in colour, "mark" for a part that is outlined.
-        top: value of the bright end; None takes the 97th percentile in the brain.
+        kind: "grey" for intensities, "map" for values in colour, "mark" for an outlined part.
+        top: value shown brightest; None takes the 97th percentile in the brain.
     """
 
     name: str
@@ -79,17 +79,17 @@ LAYERS = (
     Layer(name="unseen", title="not seen", caption="brain that no slice saw", kind="mark"),
     Layer(name="mask", title="brain outline", caption="what was taken for brain", kind="mark"),
 )
-"""In the order of the buttons; of each, the file NAME.nii.gz of the folder is shown if it is there."""
+"""The layers in the order of the buttons; a layer is shown if its file NAME.nii.gz is in the folder."""
 
 
 @dataclass(frozen=True)
 class ViewerImages:
-    """What the page embeds.
+    """The images that the page embeds.
 
     Attributes:
-        grid: of all copies: RAS, cropped.
-        data: name to array [I, J, K] on it, in the file's values.
-        window: name to the values that are shown dark and bright.
+        grid: grid of all copies: RAS, cropped.
+        data: name to array [I, J, K] on `grid`, in the values of the file.
+        window: name to the values shown darkest and brightest.
         mask_center_mm: [3] middle of the brain, in the space of the volume.
     """
 
@@ -129,7 +129,7 @@ class ViewerImages:
         return cls(grid, cropped, {one.name: _window(one, cropped, inside) for one in shown(cropped)}, center)
 
     def records(self) -> list[dict[str, Any]]:
-        """For the script of the page: title, caption, window, and a compressed NIfTI as text (base64)."""
+        """Layers for the script of the page: title, caption, window, and a compressed NIfTI as text (base64)."""
         layers = shown(self.data)
         with ThreadPoolExecutor() as pool:  # compression takes one thread, and releases Python's lock
             packed = pool.map(self._nifti, layers)
@@ -166,7 +166,7 @@ class ViewerImages:
 
 
 def shown(data: dict[str, NDArray[np.float32]]) -> list[Layer]:
-    """Layers that there is something to show of."""
+    """Layers that have something to show."""
     return [one for one in LAYERS if one.name in data and (one.kind != "mark" or data[one.name].any())]
 
 
@@ -177,7 +177,7 @@ def _canonical(volume: Volume) -> Volume:
 
 
 def _on(image: Volume, grid: VolumeGrid, box: tuple[slice, ...]) -> NDArray[np.float32]:
-    """An image in a box of a grid."""
+    """An image interpolated on a box of a grid."""
     if image.data.shape == grid.shape and np.allclose(image.affine, grid.affine, atol=1e-3):
         return image.data[box]
     return on_grid(image.data, image.grid, grid.cropped(box), outside=0.0)
@@ -190,7 +190,7 @@ def _middle(brain: NDArray[np.bool_]) -> list[float]:
 
 
 def _joined(data: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means of two by two by two voxels; an odd last layer is left out, which is margin."""
+    """Means of 2 x 2 x 2 voxels; an odd last layer is dropped, because it is margin."""
     i, j, k = (n // 2 for n in data.shape)
     return data[: 2 * i, : 2 * j, : 2 * k].reshape(i, 2, j, 2, k, 2).mean((1, 3, 5), dtype=np.float32)
 
@@ -204,7 +204,7 @@ def _joined_grid(grid: VolumeGrid) -> VolumeGrid:
 
 
 def _window(layer: Layer, data: dict[str, NDArray[np.float32]], inside: NDArray[np.bool_]) -> tuple[float, float]:
-    """Values shown as black and as bright."""
+    """Values shown darkest and brightest."""
     if layer.kind == "mark":
         return 0.0, 1.0
     values = data[layer.name][inside] if inside.any() else data[layer.name].ravel()

@@ -1,1 +1,1 @@
-"""What a finished run is good for afterwards: other grids, other images of the same slices, other programs' files."""
+"""Further uses of a finished run: other grids, other images of the same slices, files of other programs."""

@@ -22,10 +22,10 @@ from g3r.output.reuse_record import ReuseRecord
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """One run: its record, its geometry, and its other files when they are asked for.
+    """A finished run: its record, its geometry, and its other files on demand.
 
     Attributes:
-        folder: of the run.
+        folder: output folder of the run.
         record: run.json.
         geometry: reuse.npz.
     """
@@ -39,7 +39,7 @@ class FinishedRun:
         """Read a folder that g3r-infer wrote.
 
         Raises:
-            InputError: no such folder, or files in it that are missing, damaged or of another version.
+            InputError: the folder does not exist, or files in it are missing, damaged or of another version.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -57,26 +57,26 @@ class FinishedRun:
 
     @property
     def registration(self) -> RegistrationRecord:
-        """How the poses were found."""
+        """The record of the registration."""
         assert self.record.registration is not None, "checked on reading"
         return self.record.registration
 
     @property
     def space(self) -> Space:
-        """That the poses and the volume are in."""
+        """Space of the poses and the volume."""
         return self.registration.space
 
     @property
     def standard_from_scanner(self) -> RigidPose | None:
-        """The rigid motion of points (RAS, mm) from the scanner to the volume; None where both are one."""
+        """The rigid motion of points (RAS, mm) from the scanner to the volume; None if that is in scanner space."""
         if self.registration.standard_from_scanner is None:
             return None
         matrix = np.array(self.registration.standard_from_scanner, dtype=np.float64)
-        return RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])  # the text has nine decimals
+        return RigidPose(orthonormal(matrix[None, :3, :3]), matrix[None, :3, 3])  # run.json has nine decimals
 
     @property
     def stack_names(self) -> list[str]:
-        """Names of the files that it was made of."""
+        """Names of its input files."""
         return [stack.name for stack in self.record.stacks]
 
     @cached_property
@@ -90,7 +90,7 @@ class FinishedRun:
 
     @cached_property
     def mixture(self) -> Mixture:
-        """What makes the volume of the Gaussians.
+        """The mixture that makes the volume from the Gaussians.
 
         Raises:
             InputError: prior or density are missing, damaged or on another grid.

@@ -1,4 +1,4 @@
-"""Other images of the same slices: echoes, contrasts and label maps in the poses that the run found."""
+"""Other images of the same slices: echoes, contrasts and label maps in the poses of a finished run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from g3r.output.reuse_record import ReuseRecord
 from g3r.reuse.finished_run import FinishedRun
 
 MAX_LABEL = 32767
-"""Label maps are written as int16."""
+"""Largest label, because label maps are written as int16."""
 
 LABEL_MARGIN_PIXELS = 3
-"""Slices are cut to their masks; beyond these, label maps vote for background."""
+"""Slices are cropped to their masks; label maps also vote, for background, in a margin of this size around them."""
 
 LEAST_VOTES = 0.1
-"""Density of votes below which a voxel gets no label: a tenth of what one gapless stack gives."""
+"""Density of votes below which a voxel gets no label: a tenth of that of one gapless stack."""
 
 Pixels = NDArray[np.float32]
 
@@ -33,11 +33,11 @@ def load_images(run: FinishedRun, paths: Sequence[str | os.PathLike[str]]) -> li
     """Images [I, J, K] on the grids of the run's stacks, slices along the third axis.
 
     Args:
-        run: whose stacks they belong to.
+        run: the run of the stacks that they belong to.
         paths: one per stack, in the order of the run.
 
     Raises:
-        InputError: another number of images than of stacks, or one that cannot be read or is on another grid.
+        InputError: the numbers of images and stacks differ, or an image cannot be read or is on another grid.
     """
     if len(paths) != len(run.geometry.stacks):
         names = ", ".join(run.stack_names)
@@ -51,13 +51,13 @@ def load_images(run: FinishedRun, paths: Sequence[str | os.PathLike[str]]) -> li
 
 
 def slices_of(geometry: ReuseRecord, images: Sequence[Pixels], margin_pixels: int = 0) -> Slices:
-    """The run's slices in their last poses, with the pixels of other images.
+    """The run's slices in their final poses, with the pixels of other images.
 
     Args:
-        geometry: of the run.
+        geometry: geometry of the run.
         images: [I, J, K] for each stack, slices along the third axis.
-        margin_pixels: around the part that the run used, as far as the image reaches; the mask is larger by it on
-            every side of its bounding box, and holds every pixel then.
+        margin_pixels: margin around the part of a slice that the run used, as far as the image reaches. With a margin
+            the mask holds every pixel.
     """
     planes, slices = geometry.slices.planes, geometry.slices
     limit = np.array([geometry.stacks[s].grid.shape[:2] for s in slices.stack_id]).reshape(-1, 2)
@@ -78,15 +78,15 @@ def slices_of(geometry: ReuseRecord, images: Sequence[Pixels], margin_pixels: in
 def reconstruct_images(run: FinishedRun, images: Sequence[Pixels], *, with_gain: bool = True) -> Pixels:
     """The volume [I, J, K] of other images on the run's grid, by regularised least squares in the run's poses.
 
-    V_sharp of these images: no prior, no Gaussians, which are of the run's contrast. Zero outside the support.
+    V_sharp of these images, without prior and Gaussians, which have the run's contrast. Zero outside the support.
 
     Args:
-        run: with poses, masks, PSF and slice weights.
+        run: has poses, masks, PSF and slice weights.
         images: from `load_images`.
-        with_gain: whether the slices' intensity factors of the run are divided out.
+        with_gain: whether the run's gains of slices are divided out.
 
     Raises:
-        InputError: values inside the masks that are not finite, or the same everywhere.
+        InputError: values inside the masks are not finite, or all equal.
     """
     found = run.geometry
     slices = slices_of(found, images)
@@ -106,15 +106,15 @@ def reconstruct_images(run: FinishedRun, images: Sequence[Pixels], *, with_gain:
 def fuse_labels(run: FinishedRun, images: Sequence[Pixels]) -> NDArray[np.int16]:
     """Label maps of the stacks as one [I, J, K] on the run's grid: each voxel takes the label with most votes.
 
-    A pixel votes for its label in the voxels that its PSF reaches, with its weight there; 0, background, has votes,
+    A pixel votes for its label in the voxels that its PSF reaches, with its weight there. Background (0) has votes,
     too. Pixels outside the masks vote, as far as `LABEL_MARGIN_PIXELS` beyond the masks' bounding boxes.
 
     Args:
-        run: with poses, PSF and slice weights.
+        run: has poses, PSF and slice weights.
         images: from `load_images`; whole numbers from 0.
 
     Raises:
-        InputError: values that are no labels, or nothing but background.
+        InputError: some values are not labels, or there is only background.
     """
     for n, (image, name) in enumerate(zip(images, run.stack_names, strict=True)):
         whole = np.isfinite(image).all() and (image == np.rint(image)).all()

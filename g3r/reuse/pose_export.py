@@ -24,12 +24,12 @@ WRITERS: dict[TransformFormat, tuple[str, Callable[[Path, RigidPose], None]]] = 
 
 
 def write_transforms(folder: Path, run: FinishedRun, form: TransformFormat) -> int:
-    """Write a motion per slice, and `standard_from_scanner` where the run is in standard space.
+    """Write one motion per slice, and `standard_from_scanner` if the run is in standard space.
 
     Args:
-        folder: that exists.
-        run: whose poses.
-        form: of the files.
+        folder: existing folder.
+        run: the run with the poses.
+        form: format of the files.
 
     Returns:
         The number of slices.
@@ -46,18 +46,18 @@ def write_transforms(folder: Path, run: FinishedRun, form: TransformFormat) -> i
 
 
 def write_slice_folders(folder: Path, run: FinishedRun, measured: Slices | None) -> int:
-    """Write `slices/` (where their pixels are known), `simulated/` and `index.tsv`, which names each number's slice.
+    """Write `slices/` (if their pixels are given), `simulated/` and `index.tsv`, with stack and slice of each number.
 
     Args:
-        folder: that exists.
-        run: whose poses and Gaussians.
-        measured: the run's slices with the pixels of its stacks; None where these were not given.
+        folder: existing folder.
+        run: the run with poses and Gaussians.
+        measured: the run's slices with the pixels of its stacks; None if these were not given.
 
     Returns:
         The number of slices.
 
     Raises:
-        InputError: there are no Gaussians to simulate slices of.
+        InputError: there are no Gaussians to simulate slices from.
     """
     slices = run.geometry.slices
     if not len(run.cloud):

@@ -15,17 +15,17 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.reuse.finished_run import FinishedRun
 
 RESOLUTION_RANGE_MM = (0.1, 10.0)
-"""Of a rendered volume; `g3r-infer` itself takes a narrower one."""
+"""Accepted voxel sizes of a rendered volume; `g3r-infer` itself accepts a narrower range."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where to render.
+    """The grid of a rendered volume, in the space of the file and in that of the run.
 
     Attributes:
         written: grid of the file, in `space`.
         evaluated: the same voxels in the space of the run.
-        space: that the file's affine leads to.
+        space: space of the file's affine.
     """
 
     written: VolumeGrid
@@ -39,14 +39,14 @@ def target_grid(
     """The grid of a rendered volume.
 
     Args:
-        run: to render.
-        resolution_mm: voxel size over the run's field of view; the run's own when None.
-        like: an image whose grid is taken, in place of a resolution.
-        space: of the file (and of `like`); the run's when None. The run's voxels are moved to another space by their
-            affine alone, so that nothing is resampled.
+        run: the run to render.
+        resolution_mm: voxel size over the run's field of view; None takes that of the run.
+        like: an image whose grid is used instead of a resolution.
+        space: space of the file (and of `like`); the run's when None. The run's voxels are moved to another space by
+            their affine alone, so that nothing is resampled.
 
     Raises:
-        InputError: a resolution out of range, too many voxels, sheared axes, or a space that the run does not know.
+        InputError: a resolution out of range, too many voxels, sheared axes, or a space unknown to the run.
     """
     space = run.space if space is None else space
     run_from_space = RigidPose.identity(1)
@@ -82,8 +82,8 @@ def render_volume(run: FinishedRun, grid: VolumeGrid) -> NDArray[np.float32]:
     On the run's own grid it is `volume.nii.gz` (to rounding: prior.nii.gz holds scaled intensities).
 
     Args:
-        run: with Gaussians, prior and density.
-        grid: with orthogonal axes.
+        run: has Gaussians, prior and density.
+        grid: grid with orthogonal axes.
 
     Raises:
         InputError: a file of the run is missing or damaged.

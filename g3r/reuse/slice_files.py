@@ -1,4 +1,4 @@
-"""Reading of slices whose headers hold their poses: `N.nii.gz`, `mask_N.nii.gz` and what `index.tsv` says of N."""
+"""Reader of slices whose headers hold their poses: `N.nii.gz`, `mask_N.nii.gz` and the lines of `index.tsv`."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ INDEX_NAME = "index.tsv"
 INDEX_COLUMNS = ["number", "stack", "slice"]
 
 MAX_SLICE_NUMBER = 2000
-"""Stacks of more slices are a mistake, and would take memory for those between."""
+"""Larger slice numbers are errors, and would take memory for the slices in between."""
 
 FILE_NAME = re.compile(r"(mask_)?(\d+)\.nii(?:\.gz)?", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceFile:
-    """A slice as its file has it.
+    """A slice as read from its file.
 
     Attributes:
-        number: N of its name.
-        path: of the image.
-        mask_path: None where pixels above zero are taken.
+        number: N of its file name.
+        path: path of the image.
+        mask_path: path of the mask; None if the pixels above zero are the mask.
         image: [I, J] float32.
         mask: [I, J] bool; may be empty.
         affine: [4, 4] RAS mm from index, as in the header.
-        remarks: on the header.
+        remarks: remarks on the header.
     """
 
     number: int
@@ -50,7 +50,7 @@ class SliceFile:
 
     @cached_property
     def spacing_mm(self) -> NDArray[np.float64]:
-        """Of pixels (two numbers), and the thickness [3]."""
+        """Pixel spacing (two numbers) and thickness [3]."""
         return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0), np.float64)
 
     @cached_property
@@ -67,10 +67,10 @@ class SliceFile:
 
 
 def slice_folder_of(path: str | os.PathLike[str]) -> Path:
-    """The folder itself where it holds N.nii.gz, or else `slices/` in it.
+    """The folder itself if it holds N.nii.gz, or else its folder `slices/`.
 
     Raises:
-        InputError: it is no folder, or neither holds slices.
+        InputError: it is not a folder, or neither holds slices.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -85,10 +85,10 @@ def slice_folder_of(path: str | os.PathLike[str]) -> Path:
 
 
 def numbered_files(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    """Files of slices and of masks by their numbers, in ascending order; other files are not looked at.
+    """Files of slices and of masks by their numbers, in ascending order; other files are ignored.
 
     Raises:
-        InputError: two files of one number, or a folder that cannot be read.
+        InputError: two files have one number, or the folder cannot be read.
     """
     found: tuple[dict[int, Path], dict[int, Path]] = {}, {}
     try:
@@ -113,7 +113,7 @@ def read_slices(folder: Path) -> list[SliceFile]:
     """All slices of a folder in the order of their numbers.
 
     Raises:
-        InputError: a file that cannot be used.
+        InputError: a file cannot be used.
     """
     images, masks = numbered_files(folder)
     return [read_slice(path, masks.get(number), number) for number, path in images.items()]
@@ -123,13 +123,13 @@ def read_slice(path: Path, mask_path: Path | None, number: int) -> SliceFile:
     """Read one slice and its mask.
 
     Args:
-        path: of the image.
+        path: path of the image.
         mask_path: None takes the pixels above zero.
-        number: of the slice.
+        number: number of the slice.
 
     Raises:
-        InputError: an unreadable file, more than one slice, axes that are no slice's, values in the mask that are not
-            finite, a mask on another grid.
+        InputError: the file is unreadable, holds more than one slice or has no slice's axes, values in the mask are
+            not finite, or the mask is on another grid.
     """
     volume = load_volume(path)
     _check_geometry(volume)
@@ -150,7 +150,7 @@ def read_slice(path: Path, mask_path: Path | None, number: int) -> SliceFile:
 
 
 def _check_geometry(volume: Volume) -> None:
-    """Raise `InputError` for what is no slice with a pose."""
+    """Raise `InputError` unless a volume is a slice with a pose."""
     name, shape = volume.name, volume.data.shape
     if shape[2] != 1:
         raise InputError(
@@ -174,12 +174,12 @@ def _check_geometry(volume: Volume) -> None:
 
 
 def read_index(folder: Path) -> tuple[Path, dict[int, tuple[int, int]]] | None:
-    """What `index.tsv` in the folder, or in the one above, says: stack and slice by number; None without one.
+    """Path of `index.tsv` in the folder or the one above, and its stack and slice by number; None without one.
 
-    A file of that name with other columns is somebody else's.
+    A file of that name with other columns belongs to another program.
 
     Raises:
-        InputError: a line that is not three whole numbers from 0 on, or a number or a slice twice.
+        InputError: a line is not three whole numbers from 0 on, or a number or a slice occurs twice.
     """
     for path in (folder / INDEX_NAME, folder.resolve().parent / INDEX_NAME):
         if not path.is_file():

@@ -1,7 +1,7 @@
 """Slices as a folder of single images whose headers hold the poses, as NeSVoR reads and writes them.
 
-`N.nii.gz` is a slice, one voxel thick, `mask_N.nii.gz` its mask. The affine puts it where it was found to be, and the
-size of the third axis is the slice thickness.
+`N.nii.gz` is a slice, one voxel thick, and `mask_N.nii.gz` its mask. The affine holds the estimated pose, and the
+voxel size of the third axis is the slice thickness.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from g3r.reuse.finished_run import FinishedRun
 
 
 def slice_affines(slices: Slices) -> NDArray[np.float64]:
-    """World from voxel [K, 4, 4] (RAS, mm) of slices as images of their own, right-handed."""
+    """Affines [K, 4, 4] (world RAS mm from voxel) of slices as single images, right-handed."""
     planes = slices.planes
     spacing = np.column_stack([planes.spacing_mm, slices.thickness_mm])
     affine = np.tile(np.eye(4), (len(slices), 1, 1))
@@ -29,9 +29,9 @@ def slice_affines(slices: Slices) -> NDArray[np.float64]:
 
 
 def simulated_slices(run: FinishedRun) -> NDArray[np.float32]:
-    """What the Gaussians predict for each pixel [P] of the run's slices, in the stacks' intensities.
+    """Pixels [P] of the run's slices as predicted by the Gaussians, in the stacks' intensities.
 
-    Through the PSF and times the slice's gain, in the last poses; without bias field, V_prior and noise.
+    Rendered through the PSF and times the slice's gain, in the final poses; without bias field, V_prior and noise.
     """
     found, planes = run.geometry, run.geometry.slices.planes
     pixels = render(run.cloud, planes, cutoff_sigma=run.record.settings.slice_stage.cutoff_sigma).numpy()
@@ -43,9 +43,9 @@ def write_slices(folder: Path, slices: Slices, space: Space) -> None:
     """Write each slice and its mask; pixels outside the mask are zero.
 
     Args:
-        folder: that exists.
-        slices: [K] in place, with their pixels.
-        space: that the poses lead to.
+        folder: existing folder.
+        slices: [K] in their poses, with their pixels.
+        space: space of the poses.
 
     Raises:
         InputError: the folder cannot be written.

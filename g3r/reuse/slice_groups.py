@@ -1,8 +1,8 @@
-"""Which slices of a folder are of one stack, and their places in it: by `index.tsv`, or by what the headers say.
+"""Grouping of the slices of a folder into stacks, with their places in them: by `index.tsv`, or by the headers.
 
-Without an index the numbers tell the order. A stack ends where pixel size, thickness or orientation become others, or
-where the position along the normal starts again. Single slices that moved far away are no new stack: the slices after
-them decide.
+Without an index slices are in the order of their numbers. A stack ends where pixel size, thickness or orientation
+change, or where the position along the normal starts again. Single slices that moved far away do not begin a stack:
+the slices after them decide.
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ from g3r.registration.pose_sampling import angle_deg
 from g3r.reuse.slice_files import MAX_SLICE_NUMBER, SliceFile
 
 SAME_LENGTH = 1e-4
-"""Relative difference of pixel sizes or thickness up to which they are one: headers keep seven digits."""
+"""Largest relative difference of pixel sizes or thickness within a stack: headers keep seven digits."""
 
 SAME_STACK_DEG = 45.0
-"""Slices of one stack are turned against each other by less; the planes of stacks are mostly 90 degrees apart."""
+"""Largest rotation between slices of one stack; the planes of stacks are mostly 90 degrees apart."""
 
 N_LAST = 5
-"""Slices at the end of a stack that say how it is oriented and where it has come to."""
+"""Number of last slices of a run that give its present orientation."""
 
 N_COMPARED = 100
-"""Slices that say how long a stack is so far."""
+"""Number of last slices of a run that give its step and its length so far."""
 
 RESTART_STEPS, RESTART_SHARE = 3.0, 0.5
 """A stack starts again where a slice lies behind the last one by more than this many steps, and by more than this share
-of the length so far; motion alone moves slices by less."""
+of the length so far; motion alone moves slices less."""
 
 HOLE_STEPS, HOLE_TURN_DEG = 2.0, 5.0
-"""Between slices of consecutive numbers, others are missing where these are further apart by so many steps, by far more
-than any go backwards, and turned by less than this: motion turns slices and goes both ways. A hole that is taken for
-motion does no harm, since poses are given; motion that is taken for a hole would make the head longer."""
+"""Slices are missing between consecutive numbers if their distance exceeds a step by at least this many steps, and by
+far more than any slice goes backwards, and if they are rotated by less than this angle: motion rotates slices and goes
+in both directions. A hole mistaken for motion does no harm, because poses are given; motion mistaken for a hole would
+make the head longer."""
 
 REACH = 4
-"""Slices so near to each other say how long a step is, before holes are known."""
+"""Largest distance of slices, in numbers, whose positions give the length of a step before holes are known."""
 
 PASS_THICKNESSES = 1.5
-"""Slices whose steps are at least so many thicknesses may be one pass of an interleaved stack."""
+"""Slices with a step of at least this many thicknesses may be one pass of an interleaved stack."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +53,9 @@ class SliceGroup:
     """Slices of one stack.
 
     Attributes:
-        name: of the stack.
-        files: in ascending order of their places.
-        place: [K] number of each in the stack, from 0; not every number need be there.
+        name: name of the stack.
+        files: its slices, in ascending order of their places.
+        place: [K] number of each slice in the stack, from 0; numbers may be missing.
     """
 
     name: str
@@ -74,15 +75,15 @@ class SliceGroup:
 def grouped_by_index(
     files: Sequence[SliceFile], index: Mapping[int, tuple[int, int]], index_name: str
 ) -> list[SliceGroup]:
-    """Groups as an index says; slices that it names and that are not there were left out.
+    """Groups according to an index; slices that it names and that have no file were left out.
 
     Args:
-        files: of the folder.
+        files: slices of the folder.
         index: stack and slice by number.
-        index_name: of its file, for messages.
+        index_name: name of the index file, for messages.
 
     Raises:
-        InputError: a slice that the index does not name, or one of other pixels than its stack.
+        InputError: the index does not name a slice, or a slice differs from its stack in pixel size or thickness.
     """
     for one in files:
         if one.number not in index:
@@ -101,10 +102,10 @@ def grouped_by_headers(files: Sequence[SliceFile]) -> list[SliceGroup]:
     """Groups by pixel size, thickness, orientation and position; interleaved passes make one stack.
 
     Args:
-        files: in the order of their numbers.
+        files: slices in the order of their numbers.
 
     Raises:
-        InputError: a stack of too many slices.
+        InputError: a stack has too many slices.
     """
     found: list[SliceGroup] = []
     for passes in _stacks_of_passes(_runs(files)):
@@ -122,12 +123,12 @@ def grouped_by_headers(files: Sequence[SliceFile]) -> list[SliceGroup]:
 
 
 def slope(along_mm: NDArray[np.float64], place: NDArray[np.int64], reach: int | None = None) -> float:
-    """Median over pairs of the distance over the difference of their numbers; 0 for a single one.
+    """Median over pairs of slices of their distance divided by the difference of their numbers; 0 for a single slice.
 
     Args:
-        along_mm: [K].
+        along_mm: [K] positions along the normal.
         place: [K] ascending numbers.
-        reach: only pairs that are at most so many slices apart; all when None.
+        reach: uses only pairs at most this many slices apart; None uses all.
     """
     first, second = np.triu_indices(len(place), 1)
     if reach is not None:
@@ -150,7 +151,7 @@ def _along_mm(files: Sequence[SliceFile], frame: NDArray[np.float64]) -> NDArray
 
 
 def _runs(files: Sequence[SliceFile]) -> list[list[SliceFile]]:
-    """Slices that follow each other in one direction."""
+    """Split slices into runs that advance in one direction."""
     runs: list[list[SliceFile]] = [[files[0]]]
     for n, one in enumerate(files[1:], 1):
         run = runs[-1]
@@ -162,14 +163,14 @@ def _runs(files: Sequence[SliceFile]) -> list[list[SliceFile]]:
 
 
 def _strays(run: list[SliceFile], one: SliceFile, next_ones: Sequence[SliceFile]) -> bool:
-    """Whether a slice that leaves a run is alone: the next ones go on with the run, or begin one without it."""
+    """Whether a slice that leaves a run is a stray: the next ones continue the run, or begin one without it."""
     if not any(_leaves(run, other) for other in next_ones):
         return True
     return float(angle_deg(one.rotation, next_ones[0].rotation)) > SAME_STACK_DEG
 
 
 def _leaves(run: list[SliceFile], one: SliceFile) -> bool:
-    """Whether a slice does not go on where a run has come to."""
+    """Whether a slice does not continue a run."""
     frame = _frame(run[-N_LAST:])
     if not _same_lengths(one, run[0]) or float(angle_deg(frame, one.rotation)) > SAME_STACK_DEG:
         return True
@@ -183,7 +184,7 @@ def _leaves(run: list[SliceFile], one: SliceFile) -> bool:
 
 
 def _stacks_of_passes(runs: list[list[SliceFile]]) -> list[list[list[SliceFile]]]:
-    """Runs that belong together as passes of an interleaved stack."""
+    """Join runs that are passes of one interleaved stack."""
     stacks: list[list[list[SliceFile]]] = []
     for run in runs:
         if stacks and _interleaves(stacks[-1], run):
@@ -194,7 +195,7 @@ def _stacks_of_passes(runs: list[list[SliceFile]]) -> list[list[list[SliceFile]]
 
 
 def _interleaves(passes: list[list[SliceFile]], run: list[SliceFile]) -> bool:
-    """Whether a run lies between the slices of the passes before."""
+    """Whether a run is a further pass of a stack: its slices lie between those of the passes before."""
     n_passes = _n_passes(passes[0])
     if n_passes < 2 or len(passes) >= n_passes or len(run) < 2 or not _same_lengths(run[0], passes[0][0]):
         return False
@@ -205,14 +206,14 @@ def _interleaves(passes: list[list[SliceFile]], run: list[SliceFile]) -> bool:
 
 
 def _n_passes(run: list[SliceFile]) -> int:
-    """Passes that would fill the steps of a run; 1 where the run is a whole stack."""
+    """Number of passes that would fill the steps of a run; 1 if the run is a whole stack."""
     step = abs(slope(_along_mm(run, _frame(run)), np.arange(len(run))))
     thickness = float(run[0].spacing_mm[2])
     return int(np.rint(step / thickness)) if step >= PASS_THICKNESSES * thickness else 1
 
 
 def _offsets(passes: list[list[SliceFile]], n_passes: int) -> NDArray[np.int64]:
-    """Where each pass begins, in steps of the whole stack."""
+    """Beginning of each pass, in steps of the whole stack."""
     frame = _frame([one for run in passes for one in run])
     along = [_along_mm(run, frame) for run in passes]
     step = slope(along[0], np.arange(len(along[0])))
@@ -221,7 +222,7 @@ def _offsets(passes: list[list[SliceFile]], n_passes: int) -> NDArray[np.int64]:
 
 
 def _places(passes: list[list[SliceFile]]) -> NDArray[np.int64]:
-    """Number in the stack, from 0, of each slice of its passes."""
+    """Number, from 0, of each slice in its stack of one or more passes."""
     if len(passes) > 1:
         n_passes = _n_passes(passes[0])
         offset = _offsets(passes, n_passes)
@@ -243,13 +244,13 @@ def _places(passes: list[list[SliceFile]]) -> NDArray[np.int64]:
 def _steps_by_position(
     run: list[SliceFile], along_mm: NDArray[np.float64], gap_mm: float, by_number: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Step [K] to each slice from the one before: above 1 where a hole is far longer than motion makes jumps.
+    """Step [K] from the slice before to each slice: above 1 at a hole, which is far longer than jumps by motion.
 
     Args:
-        run: of K slices.
-        along_mm: [K] along the normal.
-        gap_mm: of one step.
-        by_number: [K] steps as the numbers have them.
+        run: K slices.
+        along_mm: [K] positions along the normal.
+        gap_mm: length of one step.
+        by_number: [K] steps by the numbers of the files.
     """
     steps = np.ones(len(run), np.int64)
     beyond = np.array([_jump(along_mm, n, gap_mm) if n else 1.0 for n in range(len(run))]) - by_number
@@ -262,7 +263,7 @@ def _steps_by_position(
 
 
 def _jump(along_mm: NDArray[np.float64], n: int, gap_mm: float) -> float:
-    """Steps from slice n - 1 to slice n, by three slices on either side; hardly more than these two are apart."""
+    """Steps from slice n - 1 to slice n, by three slices on either side; at most 1 more than these two are apart."""
     if gap_mm == 0:
         return 1.0
     before, after = along_mm[max(0, n - 3) : n], along_mm[n : n + 3]

@@ -1,8 +1,8 @@
 """A folder of slices with poses as input: stacks of a nominal geometry, and the motions that lead to the poses.
 
-The fit needs stacks: bias fields, neighbours and missing slices belong to them. Each group of slices becomes one, in a
-frame that is the robust mean of its poses, with pixels at whole steps from each other. What that leaves of the poses is
-in the motions, in float64: composed with the stack they give what the headers say.
+The fit needs stacks, to which bias fields, neighbours and missing slices belong. Each group of slices becomes a stack,
+in a frame that is the robust mean of its poses, with slices shifted by whole pixels. The motions hold the rest, in
+float64: composed with the geometry of the stack they give the poses of the headers.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from g3r.reuse.slice_files import read_index, read_slices, slice_folder_of
 from g3r.reuse.slice_groups import SliceGroup, grouped_by_headers, grouped_by_index, slope
 
 REACH_MM = 60.0
-"""The middle of a slice is at most so far from that of its stack in the nominal geometry; motions say the rest."""
+"""Largest in-plane distance of the middle of a slice from that of its stack in the nominal geometry; the motions hold
+the rest."""
 
 MARGIN_MM = 10.0
-"""Around all slices of a stack. Slices are mostly cut to the brain, and what was cut off holds none."""
+"""In-plane margin around all slices of a stack. Slices are mostly cropped to the brain, so it holds none."""
 
 TURN_SCALE_DEG = 5.0
-"""A slice that is turned by this against the mean of its stack counts half in it."""
+"""Rotation against the mean of its stack at which a slice has half the weight in that mean."""
 
 GAP_RANGE = (0.3, 4.0)
-"""The distance of slices over their thickness; outside it slices are taken as gapless."""
+"""Accepted ratio of slice spacing to thickness; outside it slices are taken as gapless."""
 
 N_ROUNDS = 15
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceFolder:
-    """What a folder of slices holds.
+    """A folder of slices as stacks and poses.
 
     Attributes:
-        folder: of the files.
-        index_path: of the index; None where the headers decided the grouping.
-        groups: one for each stack.
-        stacks: of nominal geometry.
-        poses: of their slices.
+        folder: folder of the files.
+        index_path: path of the index; None if slices were grouped by headers.
+        groups: one per stack.
+        stacks: stacks of nominal geometry.
+        poses: poses of their slices.
     """
 
     folder: Path
@@ -63,7 +64,7 @@ class SliceFolder:
 
     @property
     def n_slices(self) -> int:
-        """Slices that the folder holds."""
+        """Number of slices in the folder."""
         return sum(len(group.files) for group in self.groups)
 
 
@@ -72,30 +73,30 @@ def read_slice_folder(
 ) -> tuple[list[Stack], GivenPoses]:
     """Stacks and poses of a folder of slices, for `GaussianReconstructor.reconstruct`.
 
-    `N.nii.gz` is a slice, one voxel thick, and `mask_N.nii.gz` its mask; without one pixels above zero are taken. The
+    `N.nii.gz` is a slice, one voxel thick, and `mask_N.nii.gz` its mask; without one, pixels above zero are used. The
     affine is the slice's pose and its third voxel size the thickness, as NeSVoR and `g3r-export-poses` write them.
-    `index.tsv` beside them, or in the folder above, says which slices are of one stack; else the headers do.
+    `index.tsv` beside them, or in the folder above, assigns slices to stacks; without it the headers do.
 
     Args:
-        path: of the folder, or of one that holds it as `slices`.
-        thickness_mm: of the slices, one for all or one for each stack; that of the headers when None.
+        path: path of the folder, or of one that holds it as `slices`.
+        thickness_mm: slice thickness, one for all or one per stack; None takes that of the headers.
 
     Raises:
-        InputError: a folder or file that cannot be used.
+        InputError: a folder or file cannot be used.
     """
     found = load_slice_folder(path, thickness_mm)
     return found.stacks, found.poses
 
 
 def load_slice_folder(path: str | os.PathLike[str], thickness_mm: Sequence[float] | None = None) -> SliceFolder:
-    """As `read_slice_folder`, with how slices were grouped.
+    """As `read_slice_folder`, with the groups of slices.
 
     Args:
-        path: of the folder, or of one that holds it as `slices`.
-        thickness_mm: one for all or one for each stack; that of the headers when None.
+        path: path of the folder, or of one that holds it as `slices`.
+        thickness_mm: one for all or one per stack; None takes that of the headers.
 
     Raises:
-        InputError: see there.
+        InputError: see `read_slice_folder`.
     """
     folder = slice_folder_of(path)
     files = read_slices(folder)
@@ -127,14 +128,14 @@ def load_slice_folder(path: str | os.PathLike[str], thickness_mm: Sequence[float
 
 
 def images_of_run(run: FinishedRun, path: str | os.PathLike[str]) -> list[NDArray[np.float32]]:
-    """Images [I, J, K] of the stacks that a run made of a folder of slices.
+    """Images [I, J, K] of the stacks that a run made from a folder of slices.
 
     Args:
-        run: of these slices.
-        path: of the folder.
+        run: a run of these slices.
+        path: path of the folder.
 
     Raises:
-        InputError: see `read_slice_folder`, or the run was made of other slices.
+        InputError: see `read_slice_folder`, or the run was made from other slices.
     """
     stacks, _ = read_slice_folder(path)
     if [stack.name for stack in stacks] != run.stack_names:
@@ -177,11 +178,11 @@ def _placed(group: SliceGroup, thickness_mm: float | None) -> tuple[Stack, Rigid
     """A stack for a group, and the motions [K] (world from header) that give its slices their poses.
 
     Args:
-        group: of K slices.
-        thickness_mm: that of the headers when None.
+        group: K slices of a stack.
+        thickness_mm: slice thickness; None takes that of the headers.
 
     Raises:
-        InputError: what `Stack` refuses.
+        InputError: as `Stack`.
     """
     files = group.files
     spacing = np.median([one.spacing_mm for one in files], axis=0)
@@ -226,7 +227,7 @@ def _placed(group: SliceGroup, thickness_mm: float | None) -> tuple[Stack, Rigid
 
 
 def _mean_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The robust mean [3, 3] of rotations [K, 3, 3]: few strays hardly count."""
+    """The robust mean [3, 3] of rotations [K, 3, 3], on which a few strays have little influence."""
     each = Rotation.from_matrix(rotation)
     weight = np.ones(len(rotation))
     for _ in range(N_ROUNDS):
@@ -239,9 +240,9 @@ def _mean_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def _centred(
     stacks: Sequence[Stack], motions: Sequence[RigidPose], groups: Sequence[SliceGroup]
 ) -> tuple[list[Stack], GivenPoses]:
-    """Each stack moved to where its slices are on robust average, so that all motions together lead nowhere.
+    """Each stack moved to the robust mean of its slices, so that the mean of its motions is the identity.
 
-    What a run records as its common motion is then the way from the frame of the files to that of the volume.
+    The common motion that a run records is then the motion from the frame of the files to that of the volume.
     """
     poses = GivenPoses(
         stack_id=np.repeat(np.arange(len(groups)), [len(group.files) for group in groups]),

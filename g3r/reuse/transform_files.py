@@ -1,6 +1,6 @@
 """Rigid motions as files of other programs: ITK's .tfm, and the .dof of MIRTK and IRTK.
 
-Both say where a point goes that the file's header puts at x: to R x + t, as slices.tsv does.
+Both map a point that the file's header puts at x to R x + t, as slices.tsv does.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from g3r.geometry import RigidPose
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0])
-"""ITK's world has its first two axes the other way round."""
+"""ITK's world has its first two axes reversed."""
 
 DOF_MAGIC, DOF_RIGID, N_RIGID = 815007, 2, 6
 """First words of a .dof, the type of a rigid transformation, and the number of its parameters."""
@@ -49,7 +49,7 @@ def dof_bytes(pose: RigidPose) -> bytes:
     Source: MIRTK (github.com/BioMedIA/MIRTK), `Transformation::WriteDOFs` and `RigidParametersToMatrix`.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Gimbal lock")  # one of the many triples is as good
+        warnings.filterwarnings("ignore", message="Gimbal lock")  # any of the equivalent triples will do
         angles_deg = Rotation.from_matrix(pose.rotation[0].T).as_euler("xyz", degrees=True)
     return struct.pack(DOF_FORMAT, DOF_MAGIC, DOF_RIGID, N_RIGID, *pose.translation_mm[0], *angles_deg)
 

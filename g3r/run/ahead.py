@@ -1,4 +1,4 @@
-"""Values that take seconds to make, made ahead in a thread of their own while something else is under way."""
+"""Values that take seconds to compute, computed in a background thread while other work goes on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Value = TypeVar("Value")
 
 
 class Ahead(Generic[Value]):
-    """A value that is made once: when it is asked for, or before.
+    """A lazily computed value that a background thread can compute in advance.
 
     Args:
-        make: makes it; what it raises, `value` raises.
+        make: computes the value; `value` raises its exceptions.
     """
 
     def __init__(self, make: Callable[[], Value]) -> None:
@@ -24,13 +24,13 @@ class Ahead(Generic[Value]):
         self._made: Future[Value] | None = None
 
     def start(self) -> None:
-        """Begin to make it, beside what the caller does next. The thread does not keep the program from ending."""
+        """Start computing the value in a background thread, a daemon that does not keep the program from ending."""
         future, is_new = self._future()
         if is_new:
             Thread(target=self._run, args=(future,), name="ahead", daemon=True).start()
 
     def value(self) -> Value:
-        """The value; waits for it where it is being made, and makes it here where nobody has begun."""
+        """The value; waits if a thread is computing it, and computes it here if none has started."""
         future, is_new = self._future()
         if is_new:
             self._run(future)
@@ -50,9 +50,9 @@ class Ahead(Generic[Value]):
 
 
 def import_ahead(*modules: str) -> None:
-    """Begin to import modules that will be needed later, which hold Python's lock only in part.
+    """Start importing modules in a background thread. Importing holds Python's global lock only part of the time.
 
     Args:
-        modules: names; one that cannot be imported says so where it is used.
+        modules: names; a failed import is reported where the module is used.
     """
     Ahead(lambda: [import_module(name) for name in modules]).start()

@@ -12,18 +12,18 @@ LARGE_BLOCK_BYTES = 1_000_000
 
 
 def release_memory() -> None:
-    """Return freed memory to the system, where glibc can: some 0.05 s."""
+    """Return freed memory to the system, if the C library is glibc; takes about 0.05 s."""
     trim = _libc_function("malloc_trim")
     if trim is not None:
         trim(ctypes.c_size_t(0))
 
 
 def release_memory_eagerly() -> bool:
-    """Return large blocks to the system whenever they are freed, from now on; True if this system can.
+    """Return large blocks to the system as soon as they are freed, from now on; True if this system can.
 
-    glibc keeps freed blocks of up to 32 MB, and those with small ones between them stay. Setting the
-    threshold stops it from growing. Every block is then cleared by the system when it is taken: about a
-    seventh more CPU time (docs/tradeoff.md).
+    By default glibc raises its threshold and keeps freed blocks of up to 32 MB, and small blocks between them prevent
+    their return. Setting the threshold here stops it from growing. The system then clears each block when it is
+    allocated: about a seventh more CPU time (docs/tradeoff.md).
     """
     set_option = _libc_function("mallopt")
     return set_option is not None and bool(set_option(M_MMAP_THRESHOLD, LARGE_BLOCK_BYTES))

@@ -24,8 +24,8 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
         OSError: the file cannot be written or renamed.
     """
     path = Path(path)
-    # Hidden, and with the whole name at the end: writers choose the format by the suffix. At random, because two
-    # containers on one file system may both be process 1; made by the writer, so that its umask holds.
+    # Hidden, with the whole name at the end because writers choose the format by the suffix. With a random part,
+    # because two containers on one file system may both be process 1. Created by the writer, so that its umask applies.
     temporary = path.with_name(f".{process_mark()}-{uuid4().hex[:8]}.{path.name}")
     try:
         yield temporary
@@ -50,11 +50,11 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def remove_leftovers(folder: Path, suffix: str) -> None:
-    """Remove the temporary files of `atomic_path` in a folder whose process was killed, here and not elsewhere.
+    """Remove temporary files of `atomic_path` whose process was killed, if it ran on this host.
 
     Args:
-        folder: to look in.
-        suffix: of the files that were being written; others are left alone.
+        folder: searched folder, without its subfolders.
+        suffix: suffix of the files that were being written; other temporary files are left alone.
     """
     for temporary in folder.glob(f".*{suffix}"):
         if is_left_over(temporary.name.split(".")[1]):
@@ -67,7 +67,7 @@ def sync(path: Path) -> None:
     Raises:
         OSError: the disk is full or broken, which some systems report only now.
     """
-    descriptor = os.open(path, os.O_RDWR)  # Windows refuses to sync what is open for reading
+    descriptor = os.open(path, os.O_RDWR)  # Windows cannot sync a file that is open for reading
     try:
         os.fsync(descriptor)
     finally:

@@ -33,19 +33,19 @@ class StoppedAt:
 
 @dataclass(kw_only=True)
 class RunContext:
-    """Runs the stages of one computation: times them, keeps what they give, and ends early when a stop is requested.
+    """Runs the stages of one computation: times them, stores their results, and ends early on a stop request.
 
     A stop request before the first droppable or stoppable stage raises `KeyboardInterrupt`. Afterwards it
-    sets `stopped_at`, and the caller makes its result of what there is.
+    sets `stopped_at`, and the caller builds its result from the stages that are done.
 
     Args:
-        store: keeps what stages give, or has it from an earlier run; by default nothing is kept.
+        store: stores results of stages, or supplies those of an earlier run; by default nothing is stored.
         stop_request: signals that end the run early; None leaves them alone.
-        reporter: is told when stages begin, go on and end, and what they found.
+        reporter: is notified when stages begin, progress and end, with their results.
         clock: seconds of each stage.
         notes: remarks for the record.
         warnings: about the result; logged when the result is made.
-        stopped_at: where a stop request ended the run; None while it was not.
+        stopped_at: where a stop request ended the run; None if none did.
     """
 
     store: StageStore = field(default_factory=StageStore)
@@ -62,10 +62,10 @@ class RunContext:
         return self._run(name, make)
 
     def droppable_stage(self, name: str, make: Callable[[], Result]) -> Result | None:
-        """A stage that a first stop request ends at once.
+        """Result of a stage that a first stop request ends at once.
 
         Returns:
-            What the stage gives; None where it was stopped.
+            The result; None if the stage was stopped.
         """
         try:
             return self._run(name, make)
@@ -80,15 +80,15 @@ class RunContext:
     def stoppable_stage(
         self, name: str, make: Callable[[], Result], steps_of: Callable[[Result], tuple[int, int]]
     ) -> Result | None:
-        """A stage whose loop a stop request ends after the step under way; what it gives then is not kept.
+        """Result of a stage whose loop ends after the current step on a stop request; it is not stored then.
 
         Args:
-            name: of the stage.
-            make: does it; its loop looks at a deadline from `deadline`.
-            steps_of: steps done and steps in all of what it gives.
+            name: name of the stage.
+            make: computes it; its loop obeys a deadline from `deadline`.
+            steps_of: (steps done, steps in all) of a result.
 
         Returns:
-            What the stage gives; None where the run was stopped before it.
+            The result; None if the run was stopped before this stage.
         """
         if self.stopped_at is not None:
             return None
@@ -100,7 +100,7 @@ class RunContext:
 
     @contextmanager
     def timed(self, name: str) -> Iterator[Callable[[object], None]]:
-        """Run the block as a stage that is not kept; call what it gives with what there is to tell of it."""
+        """Run the block as a stage that is not stored; yields a function that takes the result to report."""
         told: list[object] = []
         self.reporter.begun(name)
         with self.clock(name):
@@ -108,11 +108,11 @@ class RunContext:
         self.reporter.ended(name, told[-1] if told else None)
 
     def deadline(self, deadline: Deadline | None) -> Deadline | None:
-        """A deadline that also comes when the stop is requested; None where there is neither."""
+        """A deadline that also passes on a stop request; None if there is neither."""
         return deadline if self.stop_request is None else self.stop_request.with_deadline(deadline)
 
     def postpone_stop(self) -> None:
-        """From now on there is something worth keeping: a first signal only sets the stop request."""
+        """From now on let a first signal only set the stop request, because there is something worth keeping."""
         if self.stop_request is not None:
             self.stop_request.postpone()
 

@@ -1,4 +1,4 @@
-"""How long loops run: for a number of steps, until a deadline, or until a stop is requested."""
+"""Length of loops: they run for a number of steps, until a deadline, or until a stop is requested."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def _nobody() -> bool:
 
 @dataclass
 class LoopRecord:
-    """Decisions of the clock in the loops of a run, in order, so that a later run can repeat them.
+    """Step fractions of the timed loops of a run, in order, so that a later run can replay them.
 
     Attributes:
         loops: for each loop the fractions of its steps (see `timed_steps`).
-        repeating: whether the loops are followed, and no longer written.
+        repeating: whether the loops are replayed rather than recorded.
     """
 
     loops: list[list[float]] = field(default_factory=list)
@@ -26,7 +26,7 @@ class LoopRecord:
     _next: int = 0
 
     def begin(self) -> list[float]:
-        """The fractions of the next loop: as they were, or a list to fill."""
+        """The fractions of the next loop: as recorded, or an empty list to fill."""
         if self.repeating:
             self._next += 1
             return self.loops[self._next - 1] if self._next <= len(self.loops) else []
@@ -39,10 +39,10 @@ class Deadline:
     """A moment by which something has to end.
 
     Args:
-        end_s: on the clock; infinity for none.
-        clock: seconds that only go forwards.
+        end_s: time of `clock`; infinity for no deadline.
+        clock: gives monotonic seconds.
         is_stopped: whether a stop is requested, whatever the clock says.
-        loop_record: remembers what the clock decided; None for nobody.
+        loop_record: records the step fractions so that a later run can replay them; None records nothing.
     """
 
     end_s: float = math.inf
@@ -61,11 +61,11 @@ class Deadline:
         return self.end_s - self.clock()
 
     def part(self, share: float, reserve_s: float = 0.0) -> Deadline:
-        """The deadline of a stage that may take a share of what is left but for a reserve."""
+        """The deadline of a stage that may take a share of the time left after a reserve."""
         return replace(self, end_s=self.clock() + share * max(0.0, self.remaining_s - reserve_s))
 
     def has_passed(self) -> bool:
-        """Whether no time is left, by the clock, or as recorded."""
+        """Whether no time is left: by the clock, or as recorded if loops are replayed."""
         if self.loop_record is None:
             return self.remaining_s <= 0
         known = self.loop_record.begin()
@@ -75,15 +75,15 @@ class Deadline:
 
 
 def timed_steps(n_steps: int, deadline: Deadline | None = None, least: int = 1) -> Iterator[tuple[int, float]]:
-    """Numbers of steps, and the fraction of the whole that is done before each, from 0 to below 1.
+    """Step numbers of a loop, each with the fraction of the loop that is done before it, from 0 to below 1.
 
-    With a deadline the whole is what fits into the time left, as the steps so far suggest, so that a schedule
+    With a deadline, the number of steps that fit is estimated from the mean time per step so far, so that a schedule
     that follows the fraction reaches its end in any case. The fraction never falls.
 
     Args:
         n_steps: largest number of steps.
-        deadline: no step begins that would probably end after it, or once a stop is requested; None gives all steps.
-        least: steps that are made even after the deadline, but not once a stop is requested.
+        deadline: no step begins that would probably end after it, or once a stop is requested; None runs all steps.
+        least: steps that run even after the deadline, but not once a stop is requested.
     """
     if deadline is None:
         for step in range(n_steps):

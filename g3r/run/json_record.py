@@ -1,4 +1,4 @@
-"""Dataclasses as JSON and back: every field there and of its type, or an error that names it."""
+"""Dataclasses as JSON and back; a missing field or a wrong type raises an error that names the field."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def to_plain(value: Any) -> Any:
     """Dataclasses, sequences and mappings as the dicts, lists and plain values of JSON.
 
     Raises:
-        TypeError: something else is in it.
+        TypeError: it contains another type.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -38,8 +38,8 @@ def from_plain(kind: type[Record], value: Any, name: str = "record") -> Record:
 
     Args:
         kind: a dataclass, list, tuple, dict, union with None, `Literal` of strings, plain type or `Any`.
-        value: what `json.loads` gave.
-        name: of the value, for errors.
+        value: output of `json.loads`.
+        name: name of the value, for error messages.
 
     Raises:
         ValueError: a field is missing, unknown or of another type.
@@ -73,7 +73,7 @@ def _built(kind: Any, value: Any, name: str) -> Any:
 
 
 def _one_of(kinds: Sequence[Any], value: Any, name: str) -> Any:
-    """The first kind of a union that takes the value; None only where it is one of them."""
+    """The value as the first type of a union that accepts it; None only if the union includes None."""
     if value is None and type(None) in kinds:
         return None
     errors = []

@@ -1,8 +1,8 @@
-"""Where numba keeps compiled kernels, decided before any is declared.
+"""The folder of numba's compiled kernels, chosen before any kernel is declared.
 
-Numba looks for a folder that it may write when a kernel is declared: next to the source, then in the user's
-cache folder; where neither can be written (a read-only installation and home), it raises. Then a folder of
-this user among the temporary files takes their place. Nothing heavy is imported here.
+When a kernel is declared, numba looks for a writable folder: next to the source, then in the user's cache folder. If
+neither is writable (a read-only installation and home), it raises. This module then substitutes a folder of this user
+among the temporary files. It imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -17,33 +17,34 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 
 COMPILING_FIT_S = 22.0
-"""Seconds that the kernels of the fit to the slices take to compile, on a core of the machine of the tables."""
+"""Seconds to compile the kernels of the fit to the slices, on one core of the machine of the tables."""
 
 
 def ensure_kernel_cache() -> None:
-    """Set NUMBA_CACHE_DIR to a temporary folder where numba would find no folder of its own."""
+    """Set NUMBA_CACHE_DIR to a temporary folder if numba would find no writable folder of its own."""
     if os.environ.get("NUMBA_CACHE_DIR") or may_write(PACKAGE / "__pycache__") or may_write(_user_cache()):
         return
     folder = _temporary_folder()
     os.environ["NUMBA_CACHE_DIR"] = folder
-    if "numba" in sys.modules:  # it has read its environment already
+    if "numba" in sys.modules:  # numba has already read its environment
         sys.modules["numba"].config.CACHE_DIR = folder
 
 
 def needs_compiling(room: str = "") -> bool:
-    """Whether numba will compile: none of its results lies in the folders that it keeps them in.
+    """Whether numba will have to compile: no compiled kernels lie in its cache folders.
 
     Args:
-        room: package of the kernels that are asked for; all when empty.
+        room: package of the kernels in question; all packages when empty.
     """
     rooms = [PACKAGE / room] if room else [path for path in PACKAGE.iterdir() if path.is_dir()]
     return not any(next(kept_in(one).glob("kernels*.nbi"), None) for one in rooms)
 
 
 def kept_in(room: Path) -> Path:
-    """The folder that numba keeps the kernels of a package in.
+    """The folder in which numba keeps the compiled kernels of a package.
 
-    A folder for all packages may serve other programs and other copies of g3r, so it has one of its own for each.
+    A cache folder outside the package may serve other programs and other copies of g3r, so each package has a
+    subfolder there.
 
     Args:
         room: folder of the sources.
@@ -56,7 +57,7 @@ def kept_in(room: Path) -> Path:
 
 
 def may_write(folder: Path) -> bool:
-    """Whether a folder can be written, or made where it does not exist yet."""
+    """Whether a folder is writable, or can be created if it does not exist."""
     try:
         while not folder.exists():
             if folder == folder.parent:
@@ -80,7 +81,7 @@ def _user_cache() -> Path:
 
 
 def _temporary_folder() -> str:
-    """A folder that nobody else can write: its content is run as code."""
+    """A temporary folder that no other user can write, because its content is executed."""
     name = f"g3r-kernels-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
     folder = Path(tempfile.gettempdir()) / name
     try:

@@ -1,8 +1,8 @@
-"""MONAI and nibabel without the packages that they would import because they happen to be installed.
+"""Imports of MONAI and nibabel without their optional packages, even if those are installed.
 
-`import monai` tries dozens of optional packages, plotting and statistics among them, and takes twice as long for those
-that it finds; nibabel tries pydicom. A command of g3r uses nothing of them through these two. Elsewhere, in a notebook
-say, they may be in use for other things, so that a program has to ask for this.
+`import monai` tries dozens of optional packages, plotting and statistics among them, and takes twice as long if it
+finds them; nibabel tries pydicom. The commands of g3r use none of them through MONAI or nibabel. Elsewhere, such as in
+a notebook, they may be in use for other things, so a program has to opt in.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ OPTIONAL = {
     "monai": ("matplotlib", "pandas", "scipy.signal", "scipy.stats", "skimage", "itk", "tqdm"),
     "nibabel": ("pydicom",),
 }
-"""What is hidden of which package's import."""
+"""Optional packages that are hidden while a package is imported."""
 
 _is_asked: list[bool] = []
 
 
 def import_lean() -> None:
-    """From now on networks are imported without what MONAI could do besides. For programs, not for libraries."""
+    """Import MONAI and nibabel without their optional packages from now on. For programs, not for libraries."""
     _is_asked[:] = [True]
 
 
 def load_nibabel() -> None:
-    """Import nibabel, without DICOM where a program asked for lean imports."""
+    """Import nibabel, without pydicom if a program opted in."""
     with lean("nibabel"):
         import_module("nibabel")
 
 
 @contextmanager
 def lean(package: str = "monai") -> Iterator[None]:
-    """Hide optional packages of another one while the block imports it, where a program asked for that.
+    """Hide the optional packages of a package while the block imports it, if a program opted in.
 
-    What is loaded already stays as it is. The package says what is missing where it is used.
+    Packages that are loaded already stay. A hidden one raises only where the importing package uses it.
 
     Args:
-        package: of `OPTIONAL`.
+        package: key of `OPTIONAL`.
     """
     hidden = []
     if _is_asked and package not in sys.modules:

@@ -1,4 +1,4 @@
-"""log.txt: everything that a run says, the developers' detail included, with times and without folders."""
+"""log.txt: all log lines of a run, debug detail included, with times and without folder names."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from g3r.run.hidden_folders import HiddenFolders
 LOG_NAME = "log.txt"
 
 MAX_CHARACTERS = 20_000_000
-"""More than any run says; what comes after it is dropped."""
+"""Limit of the log, more than any run needs; later lines are dropped."""
 
 OURS = "g3r"
 
 
 class LogFile(logging.Handler):
-    """Keeps all lines of g3r, and writes them to a file as soon as it is told where.
+    """Log handler that buffers all lines of g3r, and writes them to a file once that is known.
 
-    Lines of other libraries are left out: nobody knows what they may quote of a header. Folders are left out of
-    paths. A file that cannot be written does not end the run.
+    Lines of other libraries are left out, because they might quote an image header. Folders are removed from paths. A
+    file that cannot be written does not end the run.
 
     Args:
-        paths: of the user's files; the folders that they are in are not to be named.
-        folders: of the user, not to be named either.
+        paths: the user's files; their folders are hidden.
+        folders: further folders to hide.
     """
 
     def __init__(self, paths: Iterable[str] = (), folders: Iterable[str] = ()) -> None:
@@ -40,12 +40,12 @@ class LogFile(logging.Handler):
         self.hidden = HiddenFolders([*(os.path.dirname(path) for path in paths), *folders])
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record, and write it where there is a file."""
+        """Buffer a record, and write it if there is a file."""
         try:
             text = record.getMessage()
             if record.exc_info:
                 text += "\n" + logging.Formatter().formatException(record.exc_info)
-        except Exception:  # a line that cannot be formatted is a defect, and none of the run's
+        except Exception:  # a defect of the log line must not end the run
             return
         level = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
         self.say(f"{record.name}: {level}{text}")
@@ -61,12 +61,12 @@ class LogFile(logging.Handler):
         self._write(line, "a")
 
     def keep_in(self, folder: Path) -> None:
-        """Write to the log.txt of a folder from now on, beginning with all that was said."""
+        """Write to the log.txt of a folder from now on, beginning with the buffered lines."""
         self.path = folder / LOG_NAME
         self._write("".join(self.lines), "w")
 
     def copy_to(self, folder: Path) -> None:
-        """Write all that was said until now to the log.txt of another folder.
+        """Write all lines so far to the log.txt of another folder.
 
         Raises:
             OSError: it cannot be written.
@@ -74,7 +74,7 @@ class LogFile(logging.Handler):
         (folder / LOG_NAME).write_text("".join(self.lines), encoding="utf-8", errors="backslashreplace")
 
     def go_on_in(self, folder: Path) -> None:
-        """Write further lines to the log.txt that `copy_to` wrote, wherever its folder has been moved."""
+        """Append further lines to the log.txt that `copy_to` wrote, in the present place of its folder."""
         self.path = folder / LOG_NAME if (folder / LOG_NAME).is_file() else None
 
     def _write(self, text: str, mode: str) -> None:

@@ -25,10 +25,10 @@ def use_threads(n_threads: int | None = None) -> int:
     """Give torch's and numba's thread pools the same number of threads; they take turns, stage by stage.
 
     Args:
-        n_threads: as many as there are cores for this process when None.
+        n_threads: number of threads; None for one per core of this process.
 
     Returns:
-        The number that is used.
+        The number in use.
 
     Raises:
         InputError: more than numba was started with.
@@ -57,19 +57,19 @@ def _offered_threads() -> int:
 
 
 def held_bytes() -> int:
-    """Memory that this process holds now."""
+    """Resident memory of this process."""
     return int(psutil.Process().memory_info().rss)
 
 
 def available_bytes() -> int:
-    """Memory that the machine could still give."""
+    """Memory that is still available on this machine."""
     return int(psutil.virtual_memory().available)
 
 
 def peak_bytes() -> int:
-    """The most memory that this process has held so far.
+    """Peak resident memory of this process so far.
 
-    Linux counts in `/proc`: by `getrusage` a process begins with the peak of the one that started it.
+    On Linux it is read from `/proc`, because `getrusage` starts with the peak of the parent process.
     """
     if _STATUS.is_file():
         for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():

@@ -1,8 +1,8 @@
-"""torch, imported when something of it is first used: it takes seconds, and a preview uses nothing of it.
+"""torch, imported on first use: the import takes seconds, and a preview needs none of it.
 
     from g3r.run.on_demand import torch
 
-Modules whose classes derive from those of torch import it as usual, and are imported on demand themselves.
+Modules with subclasses of torch's classes import torch as usual, and are imported on demand themselves.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 __all__ = ["is_tensor", "threads_of_torch", "torch"]
 
 _n_threads: list[int] = []
-"""Of torch, where somebody has set them."""
+"""Number of torch's threads, once it is set."""
 
 
 class _OnDemand:
-    """Stands for torch until one of its names is asked for."""
+    """Proxy that imports torch on the first access to one of its names."""
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(loaded_torch(), name)
@@ -31,7 +31,7 @@ class _OnDemand:
 
 
 def loaded_torch() -> Any:
-    """Return torch, imported now if it was not, with as many threads as were set before."""
+    """Return torch, imported if necessary, with the number of threads that was set before."""
     is_new = "torch" not in sys.modules
     module = importlib.import_module("torch")
     if is_new and _n_threads:
@@ -51,7 +51,7 @@ def threads_of_torch(n_threads: int) -> None:
 
 
 def is_tensor(value: object) -> bool:
-    """Whether a value is a tensor; without torch nothing is."""
+    """Whether a value is a tensor; False while torch is not loaded."""
     return "torch" in sys.modules and isinstance(value, loaded_torch().Tensor)
 
 

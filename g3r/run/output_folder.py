@@ -1,4 +1,4 @@
-"""The folder that a run writes: staged in a locked folder, then put in place as a whole.
+"""The output folder of a run: staged in a locked folder, then put in place as a whole.
 
 `DIR.unfinished` holds the stages that are done (`g3r.run.stage_store`) and the result while it is written. The
 lock ends with the process, however that ends. So an unlocked folder belongs to a dead run, and the next run to the
@@ -30,19 +30,19 @@ FOUND_ON_DISKS = {SUFFIX, "lost+found"}
 """Names that an empty file system may hold."""
 
 LAST_NAME = "run.json"
-"""Moved last where files move one by one: a result that has it is complete once it is there."""
+"""Moved last where files move one by one, so that a result that has it is complete."""
 
 
 class OutputFolder:
-    """The folder of one run; use it as a context, which holds the lock.
+    """The output folder of one run, as a context manager that holds the lock.
 
-    At the end the staging folder goes, unless `stages` holds something to go on from. `is_written` says whether a
+    On exit the staging folder is removed, unless `stages` holds stages to resume from. `is_written` says whether a
     result of this run is in place.
 
     Args:
-        output: folder that the result will be.
-        names: of files that a result may have; others that are in an earlier result are kept. None replaces
-            the whole folder, but for what file systems hold of their own (`FOUND_ON_DISKS`).
+        output: folder of the result.
+        names: names of files that a result may have; other files of an earlier result are kept. None replaces
+            the whole folder, except what file systems hold of their own (`FOUND_ON_DISKS`).
 
     Raises:
         InputError: another run is writing the same output, or the folder cannot be made.
@@ -84,11 +84,11 @@ class OutputFolder:
         self._let_go()
 
     def forget_stages(self) -> None:
-        """Remove the stages: the result is whole, or the run starts anew."""
+        """Remove the stored stages, because the result is complete or the run starts anew."""
         shutil.rmtree(self.stages, ignore_errors=True)
 
     def make_room(self, needed_bytes: int) -> None:
-        """Give the stages up where only that leaves enough space for the result."""
+        """Remove the stored stages if only that leaves enough space for the result."""
         kept = sum(path.stat().st_size for path in self.stages.glob("*"))
         free = shutil.disk_usage(self.staging).free
         if free < needed_bytes <= free + kept:
@@ -96,12 +96,12 @@ class OutputFolder:
 
     @contextmanager
     def result(self) -> Iterator[Path]:
-        """A folder to write a result into; it becomes the output at the end, or is gone if writing fails.
+        """A folder to write a result into; it becomes the output at the end, or is removed if writing fails.
 
-        An earlier result steps aside first and is removed afterwards.
+        An earlier result is moved aside first and is removed afterwards.
 
         Raises:
-            OSError: it cannot be put in place.
+            OSError: the result cannot be put in place.
         """
         assert self._lock is not None, "enter first"
         shutil.rmtree(self._new, ignore_errors=True)
@@ -143,7 +143,7 @@ class OutputFolder:
         shutil.rmtree(self._backup, ignore_errors=True)
 
     def _clean_mount(self) -> None:
-        """The name of the backup says how far the exchange came, so that a clean-up may be cut short, too."""
+        """As `_clean`. The backup's name records how far the exchange came, so a clean-up may be cut short, too."""
         if self._backup.exists():  # some of the new files, or all, were moved in
             self._new.mkdir(exist_ok=True)
             _move_files(self.output, self._new, self.names)
@@ -187,7 +187,7 @@ class OutputFolder:
 
 
 def is_mount(folder: Path) -> bool:
-    """Whether a folder is a file system of its own, onto which nothing can be renamed."""
+    """Whether a folder is a mount point, onto which nothing can be renamed."""
     return folder.stat().st_dev != folder.parent.stat().st_dev
 
 
@@ -204,10 +204,10 @@ def check_output_folder(
     """Refuse an output that is a file, or a folder that holds files unless they may be replaced.
 
     Args:
-        folder: that will be written.
-        names: of files that a result may have.
-        replace: whether it may hold an earlier result.
-        inputs: files that are read; none of them may be in the way.
+        folder: output folder.
+        names: names of files that a result may have.
+        replace: whether the folder may hold an earlier result.
+        inputs: files that are read; none of them may be overwritten.
 
     Raises:
         InputError: see above, or a parent in which no folder can be made and renamed.

@@ -1,4 +1,4 @@
-"""Names that tell which process is writing a file, and whether it still runs."""
+"""Tags in file names that identify the writing process, to find out whether it still runs."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from hashlib import sha256
 import psutil
 
 COUNT = "/proc/self/ns/pid"
-"""A file of Linux whose number says which count the numbers of processes belong to."""
+"""A file whose inode number identifies the PID namespace (Linux)."""
 
 
 def process_mark() -> str:
-    """Two words for a name, `PLACE-NUMBER`: this process, among all that may share a file system."""
+    """A tag HOST-PID for file names, unique on a shared file system."""
     return f"{_place()}-{os.getpid()}"
 
 
 def is_left_over(name: str) -> bool:
-    """Whether a name that begins with a mark is of a process that has ended.
+    """Whether a name begins with the tag of a process that has ended.
 
-    Processes of other machines and containers cannot be seen from here, so they count as running.
+    Processes of other machines and containers cannot be checked from here and count as running.
     """
     place, _, rest = name.partition("-")
     number = rest.partition("-")[0]
@@ -28,9 +28,9 @@ def is_left_over(name: str) -> bool:
 
 
 def _place() -> str:
-    """Where numbers of processes mean what they mean here: one host, and one container on it.
+    """Hash of the host name and the PID namespace: where a PID means the same process.
 
-    A container may have the host's name and a count of its own, so the name alone would not do.
+    A container may share the host's name but count its own PIDs, so the name alone does not do.
     """
     try:
         count = os.stat(COUNT).st_ino

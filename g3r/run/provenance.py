@@ -1,4 +1,4 @@
-"""Inputs of a result: its files by their SHA-256, and the settings."""
+"""Provenance of a result: its input files by their SHA-256, and the settings."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class FileHash:
 
 
 def provenance(settings: Any, files: Mapping[str, FileHash], **further: object) -> dict[str, str]:
-    """Everything that decides a result, by name: a run may only resume one that has all of it in common.
+    """Everything that determines a result, by name; a run may only resume a run with equal provenance.
 
     Args:
         settings: dataclass of settings.
-        files: inputs by what they are.
-        further: other decisions, by name.
+        files: inputs by their role.
+        further: other determining values, by name.
     """
     found = {name: file.sha256 for name, file in files.items()}
     found |= {f"setting {name}": repr(value) for name, value in _leaves(to_plain(settings))}

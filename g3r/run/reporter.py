@@ -1,4 +1,4 @@
-"""Who hears how a run goes on: a bar on a terminal, TensorBoard, or nobody."""
+"""How a run reports progress: terminal bar, TensorBoard, or nothing."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 
 class Reporter:
-    """Is told of the stages of a run; this one tells nobody.
+    """Receives the progress of a run; this base class ignores it.
 
-    What a stage found is handed over as it is: words for it are made by whoever hears it.
+    Results of stages are passed unchanged; each reporter words them itself.
     """
 
     def begun(self, stage: str) -> None:
@@ -28,13 +28,13 @@ class Reporter:
 
         Args:
             stage: its name.
-            found: what it gives; None where there is nothing to tell.
-            resumed: whether it was taken from an earlier run.
+            found: its result; None if there is nothing to report.
+            resumed: whether the result was read from an earlier run.
         """
 
 
 class Reporters(Reporter):
-    """Passes everything on to several."""
+    """Forwards to several reporters."""
 
     def __init__(self, reporters: Sequence[Reporter]) -> None:
         self.reporters = tuple(reporters)

@@ -1,4 +1,4 @@
-"""Results of stages as files: arrays in an .npz, the records around them as JSON. Nothing in it is run."""
+"""Stage results as files: an .npz with the arrays, and with the records around them as JSON. No code is run."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Arrays = dict[str, Any]
 
 
 class UnreadableStage(Exception):
-    """The file is cut off, or not one of a stage."""
+    """The file is truncated, or is not a stage file."""
 
 
 def write_stage(path: Path, value: Any) -> None:
-    """Write records, arrays, tensors, lists, tuples, dicts with text keys, and plain values; whole or not.
+    """Write records, arrays, tensors, lists, tuples, dicts with text keys, and plain values; whole or not at all.
 
     Raises:
         OSError: the file cannot be written.
-        TypeError: something else is in it.
+        TypeError: it contains another type.
     """
     arrays: Arrays = {}
     tree = json.dumps(_packed(value, arrays, {})).encode()
@@ -46,11 +46,11 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
     """Read what `write_stage` wrote.
 
     Args:
-        path: of the file.
+        path: the stage file.
         records: dataclasses that may be in it.
 
     Raises:
-        UnreadableStage: see there.
+        UnreadableStage: the file is truncated, or is not a stage file.
     """
     known = {record.__name__: record for record in records}
     damaged = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
@@ -63,7 +63,7 @@ def read_stage(path: Path, records: Sequence[type]) -> Any:
 
 
 def as_stored(value: Any) -> Any:
-    """A value as reading its file would give it: sums over arrays may depend on their order in memory."""
+    """A value as its file would return it, because sums over arrays may depend on their order in memory."""
     arrays: Arrays = {}
     records: dict[str, type] = {}
     tree = _packed(value, arrays, records)
@@ -71,7 +71,7 @@ def as_stored(value: Any) -> Any:
 
 
 def _in_order(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, or a copy in C order where a file could not keep the order it has."""
+    """The array, or a copy in C order if a file cannot keep its order."""
     return array if array.flags.forc else np.ascontiguousarray(array)
 
 

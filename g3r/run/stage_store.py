@@ -1,4 +1,4 @@
-"""Files that hold what the stages of a run gave, so that a later run goes on from the last one that is there."""
+"""Stored stage results, so that a later run resumes after the last finished stage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class FinishedStage:
-    """Result of a stage in an earlier run, and the seconds that it took."""
+    """Result of a stage of an earlier run, and the seconds that it took."""
 
     value: Any
     seconds: float
@@ -30,16 +30,16 @@ class FinishedStage:
 
 
 class StageStore:
-    """Keeps what stages give in a folder, one file a stage.
+    """Stores stage results in a folder, one file per stage.
 
     Args:
-        folder: for the files; None keeps nothing.
-        provenance: everything that decides the results, by name.
+        folder: for the files; None stores nothing.
+        provenance: everything that determines the results, by name.
         records: dataclasses that the results may hold.
-        resume: whether to read the stages that are there already, rather than to begin anew.
+        resume: whether to read existing stages rather than begin anew.
 
     Raises:
-        InputError: the stages that are there were made of something else.
+        InputError: the existing stages have another provenance.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class StageStore:
         self._begin(path, provenance or {})
 
     def read(self, name: str) -> FinishedStage | None:
-        """Result of a stage in an earlier run; None where it has to be computed."""
+        """Result of a stage of an earlier run; None if it has to be computed."""
         path = self._path(name)
         if path is None or not self.reads or not path.exists():
             return None
@@ -76,14 +76,14 @@ class StageStore:
         return FinishedStage(value, seconds, cpu_seconds)
 
     def as_stored(self, value: Result) -> Result:
-        """A value as reading its file would give it, so that a run with and without files computes the same."""
+        """A value as its file would return it, so that a run with and without files computes the same."""
         return as_stored(value)
 
     def write(self, name: str, value: Any, seconds: float, cpu_seconds: float) -> None:
         """Store the result of a stage. On a full disk the store is dropped and the run goes on.
 
         Args:
-            name: of the stage.
+            name: name of the stage.
             value: its result.
             seconds: wall-clock time that it took.
             cpu_seconds: processor time that it took.

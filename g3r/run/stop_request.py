@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the end at once, or, once there is something worth keeping, at the next step."""
+"""Stop requests by Ctrl-C and SIGTERM: obeyed at once, or at the next step if there is something worth keeping."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """Listens to both signals while it is entered.
+    """Handles SIGINT and SIGTERM, as a context manager.
 
-    The first one raises `KeyboardInterrupt` wherever the program is, until `postpone` is called; from then on
-    it only sets `is_requested`, for loops to look at. A second one always raises.
+    A first signal raises `KeyboardInterrupt` immediately until `postpone` is called; from then on it only sets
+    `is_requested`, which loops check. A second signal always raises.
 
-    Kernels are never cut: Python handles signals between two of its own instructions.
+    Kernels are never interrupted, because Python handles signals between two of its own instructions.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class StopRequest:
         for number in SIGNALS:
             try:
                 self._before[number] = signal.signal(number, self._heard)
-            except ValueError:  # not the main thread: signals are somebody else's affair
+            except ValueError:  # only the main thread may handle signals
                 break
         return self
 
@@ -44,7 +44,7 @@ class StopRequest:
         return self.signal is not None
 
     def postpone(self) -> None:
-        """From now on there is something to keep: a first signal lets the present step end."""
+        """From now on let a first signal wait for the current step, because there is something to keep."""
         self._postponed = True
 
     def with_deadline(self, deadline: Deadline | None) -> Deadline:
@@ -53,7 +53,7 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """As shells count: 130 after Ctrl-C, 143 after SIGTERM."""
+        """Exit code as in shells: 130 after Ctrl-C, 143 after SIGTERM."""
         return 128 + (self.signal or signal.SIGINT)
 
     def _heard(self, number: int, frame: FrameType | None) -> None:

@@ -1,1 +1,1 @@
-"""Training of the networks with Lightning; imported by `g3r-pretrain` alone."""
+"""Training of the networks with Lightning; imported only by `g3r-pretrain`."""

@@ -1,4 +1,4 @@
-"""Common part of the trainings: the optimiser annealed over a budget, the throughput, and what an export needs."""
+"""Common base of the trainings: optimiser annealed over a budget, throughput, and the facts that an export needs."""
 
 import inspect
 import math
@@ -21,19 +21,19 @@ from g3r.run.atomic_file import atomic_path, remove_leftovers
 
 
 class AnnealedModule(LightningModule):
-    """A module that trains its `network` by AdamW over whatever budget the trainer has.
+    """A module that trains its `network` by AdamW over the budget of the trainer.
 
     The learning rate warms up over `warmup_steps`, then follows half a cosine to 1 % by the budget that
-    runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run given 70 minutes ends
-    annealed, however fast the machine.
+    runs out first: `max_epochs`, `max_steps` or `max_time` of the trainer. So a run of 70 minutes ends
+    annealed on any machine.
 
     Args:
         learning_rate: peak rate of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
 
     Raises:
-        ValueError: a rate out of range.
+        ValueError: a rate is out of range.
     """
 
     kind: ClassVar[str]
@@ -53,30 +53,30 @@ class AnnealedModule(LightningModule):
         self._training_data = "not recorded"
 
     def n_samples(self, batch: Any) -> int:
-        """Samples of a batch."""
+        """Number of samples of a batch."""
         raise NotImplementedError
 
     def own_description(self) -> dict[str, Any]:
-        """Values that the exported model needs apart from its weights, in plain values."""
+        """Plain values that the exported model needs besides its weights."""
         raise NotImplementedError
 
     def keep_hyperparameters(self, network: NetworkConfig) -> None:
         """Log the constructor's arguments; call it from the constructor.
 
-        The network's are kept as plain values: a checkpoint that holds a class of ours could not be read safely.
+        The network's arguments are kept as plain values: a checkpoint with a class of ours could not be read safely.
         """
         self.save_hyperparameters(ignore=["network"], frame=inspect.currentframe().f_back)  # type: ignore[union-attr]
         self.save_hyperparameters({"network": asdict(network)})
 
     def describe_data(self) -> dict[str, Any]:
-        """Note the data module in words; return its settings."""
+        """Record the data module in words; return its settings."""
         data = getattr(self.trainer, "datamodule", None)
         settings = dict(getattr(data, "hparams", None) or {})
         self._training_data = data_in_words(data, settings)
         return settings
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what `g3r-export` needs, in plain values only."""
+        """Add what `g3r-export` needs, as plain values only."""
         metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
         checkpoint[TRAINING_ENTRY] = {
             "kind": self.kind,
@@ -88,10 +88,10 @@ class AnnealedModule(LightningModule):
         }
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Note when the data arrived, and begin the step's own random numbers.
+        """Note when the data arrived, and seed the step's own random numbers.
 
-        They depend on the run's seed and the number of the step alone: a run that was killed and goes on from
-        a checkpoint draws what it would have drawn.
+        The seed depends only on the run's seed and the number of the step, so that a killed run that is resumed from a
+        checkpoint draws the numbers that it would have drawn.
         """
         self._throughput.start_batch()
         run_seed = int(os.environ.get("PL_GLOBAL_SEED", "0"))
@@ -102,8 +102,8 @@ class AnnealedModule(LightningModule):
         """Log samples per second and the share of time spent waiting for data.
 
         Args:
-            outputs: of the training step; not used.
-            batch: that was trained on.
+            outputs: outputs of the training step; not used.
+            batch: the training batch.
             batch_idx: its number in the epoch, from 0.
         """
         self._throughput.end_batch(self.n_samples(batch))
@@ -114,7 +114,7 @@ class AnnealedModule(LightningModule):
             self.log("train/waiting_for_data", waiting)
 
     def on_train_epoch_start(self) -> None:
-        """Forget the time spent in validation."""
+        """Reset the throughput, to leave out the time spent in validation."""
         self._throughput = _Throughput()
 
     def configure_optimizers(self) -> Any:
@@ -144,7 +144,7 @@ class AnnealedModule(LightningModule):
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a checkpoint to a temporary file and renames it: a kill leaves the earlier one.
+    """Writes a checkpoint to a temporary file and renames it, so that a kill leaves the earlier one.
 
     Lightning's own temporary file may be on another disk, from which it is copied.
     """
@@ -155,12 +155,12 @@ class WholeCheckpoints(TorchCheckpointIO):
         """Write a checkpoint, whole or not at all.
 
         Args:
-            checkpoint: what Lightning keeps of the training.
-            path: of the file; folders are made.
+            checkpoint: Lightning's state of the training.
+            path: path of the file; folders are created.
             storage_options: not used.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         path = Path(path)
         try:
@@ -169,13 +169,13 @@ class WholeCheckpoints(TorchCheckpointIO):
                 torch.save(checkpoint, temporary)
         except OSError as error:
             raise cannot_be_written(path, error) from None
-        except RuntimeError as error:  # what torch makes of a full disk
+        except RuntimeError as error:  # raised by torch on a full disk
             if "write" not in str(error):
                 raise
             raise InputError(f"{path}: cannot be written ({error}); free some space") from None
 
     def load_checkpoint(self, path: str | Path, *arguments: Any, **options: Any) -> dict[str, Any]:
-        """Read a checkpoint to resume from; remove what a killed run has left of those it was writing."""
+        """Read a checkpoint to resume from; remove temporary files of killed runs."""
         remove_leftovers(Path(path).parent, Path(path).suffix)
         return super().load_checkpoint(path, *arguments, **options)
 
@@ -211,7 +211,7 @@ def cosine_factor(progress: float, final: float = 0.01) -> float:
 def data_in_words(data: object, settings: Mapping[str, Any]) -> str:
     """Return the data module and its settings in one line, with folders by name only.
 
-    The line ends up in files that are passed on, which should not show where the data were on this machine.
+    The line goes into files that are passed on, which should not show the folders of this machine.
     """
     if data is None:
         return "not recorded"

@@ -21,23 +21,23 @@ ones; masks are shares of a pixel, 0 to 1."""
 
 DEFAULT_NETWORK = MaskNetworkConfig()
 MIN_TRUE_MM2 = 3000.0
-"""Images that hold less brain, summed over their slices, are not scored by their Dice."""
+"""Least area of brain, summed over slices, of an image that is scored by its Dice."""
 N_PANEL_SLICES = 6
 
 
 class MaskModule(AnnealedModule):
-    """Supervised training of the mask network at both pixel sizes: Dice and cross entropy, of a batch as a whole.
+    """Supervised training of the mask network at both pixel sizes, by Dice and cross entropy over a whole batch.
 
     Args:
         network: see `MaskNetworkConfig`.
         learning_rate: peak rate of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
-        wide_weight: of the loss in large pixels relative to that in small ones.
-        start_from: training checkpoint whose weights to begin with.
+        wide_weight: weight of the loss in large pixels relative to that in small ones.
+        start_from: training checkpoint with the initial weights.
 
     Raises:
-        ValueError: a rate out of range, or from the network.
+        ValueError: a rate is out of range, or from the network.
     """
 
     kind = MaskModel.kind
@@ -60,13 +60,13 @@ class MaskModule(AnnealedModule):
         self.network = MaskNetwork(network)
         if start_from is not None:
             self._take_weights(start_from)
-        # one Dice of the whole batch: an image without brain has none of its own
+        # one Dice for the whole batch, because an image without brain has no Dice of its own
         self._loss = DiceCELoss(sigmoid=True, batch=True)
         self._scores: list[dict[str, float]] = []
         self._panel: Tensor | None = None
 
     def n_samples(self, batch: Batch) -> int:
-        """Stacks of a batch."""
+        """Number of stacks of a batch."""
         return len(batch["image"])
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -78,7 +78,7 @@ class MaskModule(AnnealedModule):
         return self.wide_weight * find + outline
 
     def on_validation_epoch_start(self) -> None:
-        """Forget the last epoch's scores."""
+        """Reset the scores of the last epoch."""
         self._scores = []
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -90,7 +90,7 @@ class MaskModule(AnnealedModule):
             self._panel = panel(fine, batch)
 
     def on_validation_epoch_end(self) -> None:
-        """Log the scores' means, and send a row of images."""
+        """Log the means of the scores, and a row of images."""
         for name, value in summary(self._scores).items():
             self.log(f"val/{name}", value, prog_bar=name == "outline_dice")
         for board in self.loggers:
@@ -103,7 +103,7 @@ class MaskModule(AnnealedModule):
                 )
 
     def setup(self, stage: str) -> None:
-        """Compare the data's resolutions with the network's.
+        """Check that the pixel sizes of the data are those of the network.
 
         Raises:
             InputError: they differ.
@@ -115,7 +115,7 @@ class MaskModule(AnnealedModule):
                 raise InputError(f"data.{name}: {theirs}, but the network looks at {mine}; leave it out")
 
     def own_description(self) -> dict[str, Any]:
-        """Nothing apart from the weights."""
+        """No values besides the weights."""
         return {}
 
     def _losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -124,12 +124,12 @@ class MaskModule(AnnealedModule):
         return find, outline
 
     def _take_weights(self, path: str) -> None:
-        """Begin with the weights of another run."""
+        """Start from the weights of another run."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
             prefix = "network."
             self.network.load_state_dict({n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)})
-        except Exception as error:  # torch.load says "damaged" in many types
+        except Exception as error:  # torch.load raises many types for a damaged file
             raise InputError(
                 f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
                 "checkpoint of this mask network"
@@ -143,13 +143,13 @@ def dice(predicted: Tensor, true: Tensor) -> float:
 
 
 def scores_of(wide: Tensor, fine: Tensor, batch: Batch, config: MaskNetworkConfig) -> dict[str, float]:
-    """Dice where there is a head; what is taken for one elsewhere, in square centimetres over all slices.
+    """Dice of an image with brain; without brain, the false-positive area over all slices, in square centimetres.
 
     Args:
         wide: [1, 1, A, B, K] probabilities in large pixels.
         fine: [1, 1, H, W, K] probabilities in small ones.
         batch: one stack.
-        config: of the network.
+        config: arguments of the network.
     """
     result = {}
     images = {"find": (wide, "wide_mask", config.wide_mm), "outline": (fine, "mask", config.pixel_mm)}
@@ -169,11 +169,11 @@ def summary(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def panel(probability: Tensor, batch: Batch) -> Tensor:
-    """Picture of slices of the first stack, the probability of brain below them, and the truth.
+    """Picture of slices of the first stack, with the probability of brain and the truth below them.
 
     Args:
         probability: [1, 1, H, W, K].
-        batch: that it is of.
+        batch: the batch of these probabilities.
 
     Returns:
         [rows, columns] in [0, 1].

@@ -28,11 +28,11 @@ Batch = Mapping[str, Tensor]
 
 DEFAULT_NETWORK = PoseNetworkConfig()
 FULL_AREA_MM2 = 600.0
-"""Slices of less area count less in the loss."""
+"""Slices with a smaller masked area are down-weighted in the loss."""
 SECOND_REFINEMENT_SHARE = 0.2
-"""Share of training batches that refine twice, so that a refinement also knows good poses."""
+"""Share of training batches with two refinements, so that a refinement also learns to start from good poses."""
 DISTURBED_SHARE = 0.6
-"""Share of heads whose poses are disturbed before a refinement, by at most these deviations per axis."""
+"""Share of heads with disturbed poses before a refinement, with at most the following deviations per axis."""
 STACK_ROTATION_RAD, STACK_TRANSLATION_MM = 0.3, 6.0
 SLICE_ROTATION_RAD, SLICE_TRANSLATION_MM = 0.1, 2.5
 VOTE_WEIGHT_MM = 10.0
@@ -43,24 +43,24 @@ class PoseModule(AnnealedModule):
     """Supervised training of the pose network against the slices' true poses.
 
     Loss: mean distance in mm of five points of a slice (its centre and (+-25, +-25) mm) between predicted and
-    true pose, over all steps of the network; slices with little in their mask count less. Added to it is the
-    squared error of every slice's vote, which teaches a vote to be the mean over what the slice may be: long
-    where it is certain, short where it is not.
+    true pose, over all steps of the network; slices with a small mask weigh less. Added to it is the
+    squared error of every slice's vote. From it a vote learns to be the mean of the rotations that the slice may have:
+    long if they are certain, short if not.
 
-    The poses that a refinement starts from are disturbed: on heads that it is trained on, the first guess is
-    better than it will be on others.
+    The poses from which a refinement starts are disturbed, because the first guess is better on training heads than on
+    others.
 
     The atlas template comes from the data module's `template()`.
 
     Args:
         network: see `PoseNetworkConfig`; the template's shape is that of the data module's template.
         learning_rate: peak rate of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
-        start_from: training checkpoint whose weights to begin with.
+        start_from: training checkpoint with the initial weights.
 
     Raises:
-        ValueError: a rate out of range, or from the network.
+        ValueError: a rate is out of range, or from the network.
     """
 
     kind = PoseModel.kind
@@ -88,7 +88,7 @@ class PoseModule(AnnealedModule):
         return self.network(batch)
 
     def n_samples(self, batch: Batch) -> int:
-        """Heads of a batch."""
+        """Number of heads of a batch."""
         return int(batch["set_of_stack"].max()) + 1
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -108,11 +108,11 @@ class PoseModule(AnnealedModule):
         return torch.stack(losses).mean() + VOTE_WEIGHT_MM * torch.stack(votes).mean()
 
     def on_validation_epoch_start(self) -> None:
-        """Forget the last epoch's scores."""
+        """Reset the scores of the last epoch."""
         self._scores = []
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score one head: errors of slices, as inference finds them, and of stacks after the robust fit."""
+        """Score one head: errors of slices by `poses_of`, and of stacks after the robust fit."""
         steps = self.network(batch)
         self._scores.append(scores_of(as_pose(*steps[0][:2]), poses_of(self.network, batch), batch))
         self.log("val/mm_loss", point_loss(steps[-1], batch), batch_size=1)
@@ -120,7 +120,7 @@ class PoseModule(AnnealedModule):
             self._panel = panel(steps[-1], batch, self.network)
 
     def on_validation_epoch_end(self) -> None:
-        """Log medians over all slices and stacks, and by the number of stacks; send the row of images."""
+        """Log medians over all slices and stacks, and by the number of stacks; log the row of images."""
         for name, value in summary(self._scores).items():
             self.log(f"val/{name}", value, prog_bar=name == "slice_mm")
         for board in self.loggers:
@@ -136,7 +136,7 @@ class PoseModule(AnnealedModule):
         """Take the atlas template from the data module.
 
         Raises:
-            InputError: the data module makes images of another size, or a template on another grid.
+            InputError: the data module's image size or template grid differs from the network's.
         """
         settings = self.describe_data()
         config = self.network.config
@@ -156,13 +156,13 @@ class PoseModule(AnnealedModule):
             self.weeks = [float(week) for week in template.weeks]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse to resume a run of another network or template with `InputError`."""
+        """Raise `InputError` for a checkpoint of another network or template."""
         before, now = checkpoint.get(TRAINING_ENTRY, {}).get("network_arguments"), asdict(self.network.config)
         if before is not None and before != now:
             raise InputError(f"ckpt_path: its network is {before}, now it is {now}; resume with the same data")
 
     def _take_weights(self, path: Path) -> None:
-        """Begin with the weights of another run where they fit; the template comes from the data module."""
+        """Start from those weights of another run that fit; the template comes from the data module."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
             own = self.network.state_dict()
@@ -174,19 +174,19 @@ class PoseModule(AnnealedModule):
             if fresh:
                 logger.warning("model.start_from: %d of %d arrays start anew", len(fresh), len(own))
             self.network.load_state_dict({**own, **taken, "template": own["template"]})
-        except Exception as error:  # torch.load says "damaged" in many types
+        except Exception as error:  # torch.load raises many types for a damaged file
             raise InputError(
                 f"model.start_from: {path} cannot be used ({type(error).__name__}); expected a training "
                 "checkpoint of a pose network"
             ) from error
 
     def own_description(self) -> dict[str, Any]:
-        """Values that a `PoseModel` needs apart from its weights."""
+        """Values that a `PoseModel` needs besides its weights."""
         return {"weeks": self.weeks}
 
 
 def point_loss(step: PoseStep, batch: Batch) -> Tensor:
-    """Mean distance (mm) of five slice points from where they truly are, a scalar."""
+    """Mean distance (mm) of five slice points from their true positions, a scalar."""
     rotation, translation_mm, _ = step
     points = torch.as_tensor(SLICE_POINTS_MM, dtype=rotation.dtype, device=rotation.device)
     true = moved_points(batch["true_rotation"], batch["true_translation_mm"], points)
@@ -196,11 +196,11 @@ def point_loss(step: PoseStep, batch: Batch) -> Tensor:
 
 
 def disturbed(rotation: Tensor, translation_mm: Tensor, stack: Tensor, set_of_stack: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw poses with errors: one common to each stack, one of each slice, of a random size per head.
+    """Draw disturbed poses: an error common to each stack and one of each slice, of a random size per head.
 
     Args:
         rotation: [S, 3, 3] poses to disturb.
-        translation_mm: [S, 3] of these poses.
+        translation_mm: [S, 3] translations of these poses.
         stack: [S] stack of each slice.
         set_of_stack: [T] head of each stack.
 

@@ -24,7 +24,7 @@ N_PANEL_SLICES = 12
 SLICE_POINTS_MM = np.array([[0, 0, 0], [-25, -25, 0], [-25, 25, 0], [25, -25, 0], [25, 25, 0]], dtype=float)
 """Points of a slice over which a pose error is averaged."""
 ROBUST_SCALE_MM = 3.0
-"""Slices further than this from their stack's common motion count less in it, in proportion."""
+"""Slices further than this from their stack's common motion are down-weighted in inverse proportion."""
 
 
 def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.ndarray]:
@@ -33,7 +33,7 @@ def scores_of(first: RigidPose, last: RigidPose, batch: Batch) -> dict[str, np.n
     Args:
         first: [S] poses after the first step.
         last: [S] poses after the last step.
-        batch: of this one head; see `PoseDataModule`.
+        batch: the slices of this one head; see `PoseDataModule`.
 
     Returns:
         [S] or [T] errors by name, for S slices in T stacks.
@@ -75,8 +75,8 @@ def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
 
     Args:
         pose: rotations [S, 3, 3] and translations [S, 3] in mm.
-        batch: that holds the slices.
-        network: that holds the template.
+        batch: has the slices.
+        network: has the template.
 
     Returns:
         [H, W] in [0, 1].
@@ -93,8 +93,8 @@ def panel(pose: PoseStep, batch: Batch, network: PoseNetwork) -> Tensor:
 def stack_motions(atlas_from_slice: RigidPose, world_from_slice: RigidPose, stack_id: NDArray[np.int64]) -> RigidPose:
     """One motion per stack, atlas frame from world, that most of its slices agree with.
 
-    The start is the slice whose own motion suits the others best in the median, so that a minority of
-    slices that are upside down has no effect; then weighted least squares with weights 1 / distance.
+    It starts from the motion of the slice that fits the others best in the median, so that a minority of upside-down
+    slices has no effect. Weighted least squares with weights 1 / distance follow.
 
     Args:
         atlas_from_slice: predicted poses [K].

@@ -12,29 +12,29 @@ from g3r.prior.inputs import PriorInputs
 Batch = Mapping[str, Tensor]
 """Volumes by `IMAGE_KEYS` of the data module, each float32 [B, 1, I, J, K], intensities "p99-coarse-v1".
 
-`n_stacks`, int64 [B], is optional: scores are also logged by the number of stacks where it is there. `thickness_mm`,
-float32 [B], is needed for the printed density. Other entries are left as they are."""
+`n_stacks`, int64 [B], is optional: with it, scores are also logged by the number of stacks. `thickness_mm`,
+float32 [B], is needed for the printed density. Other entries are not changed."""
 
 DENSITY_KINDS = ("coverage", "masked", "printed")
-"""What gate and F may take for M_rho: Eq. 6 over whole slices, dimensionless; over masked pixels alone; or over whole
-slices as printed, which has the unit 1/mm."""
+"""Definitions of M_rho for gate and F: Eq. 6 over whole slices, dimensionless; over masked pixels alone; or over whole
+slices as printed, with the unit 1/mm."""
 
 BAND_VOXELS = 5
-"""Width of the band of background next to the brain, where the prior must end as the brain does."""
+"""Width of the band of background next to the brain, where the prior must fall off as the brain does."""
 BAND_FACTOR = 5.0
-"""Weight of the band, in weights of the background."""
+"""Weight of the band relative to the background."""
 UNSEEN_EMPHASIS = 2.0
-"""A voxel without coverage weighs this much more than one with; there are few of them."""
+"""Additional weight of a voxel without coverage, because there are few of them."""
 SQUARED_FACTOR = 2.0
-"""Weight of the squared error of unseen voxels next to the absolute one of seen ones: alike at an error of 0.5."""
+"""Factor of the squared error of unseen voxels; at an error of 0.5 it equals the absolute error of seen ones."""
 BRAIN_FACTOR = 0.1
 """Weight of the brain's cross-entropy in the loss."""
 SEEN_BRAIN_WEIGHT = 0.1
-"""Weight in it of voxels whose masks are known, next to unseen ones."""
+"""Weight of seen voxels, whose masks are known, in that cross-entropy, relative to unseen ones."""
 
 
 def prior_inputs(batch: Batch, density: str = "coverage") -> PriorInputs:
-    """What the network sees of a batch.
+    """The inputs of the network from a batch.
 
     Args:
         batch: see `Batch`.
@@ -56,7 +56,7 @@ def loss_weight(batch: Batch, background_weight: float) -> Tensor:
     `BAND_FACTOR` times that next to the brain.
 
     Args:
-        batch: with `mask` and `density`.
+        batch: has `mask` and `density`.
         background_weight: 0 to 1.
     """
     brain = (batch["mask"] > 0.5).to(batch["mask"].dtype)
@@ -66,7 +66,7 @@ def loss_weight(batch: Batch, background_weight: float) -> Tensor:
 
 
 def _dilated(mask: Tensor, n_voxels: int) -> Tensor:
-    """A mask [B, 1, I, J, K] grown by some voxels along every axis: axis by axis, a tenth of the time of a cube."""
+    """A mask [B, 1, I, J, K] dilated axis by axis, which takes a tenth of the time of a cubic kernel."""
     for axis in range(3):
         kernel, padding = [1, 1, 1], [0, 0, 0]
         kernel[axis], padding[axis] = 2 * n_voxels + 1, n_voxels
@@ -81,8 +81,8 @@ def prior_loss(found: PriorOutput, batch: Batch, weight: Tensor) -> Tensor:
     possible, and their mean is wanted, not their median. In addition the cross-entropy of brain and background.
 
     Args:
-        found: of the network.
-        batch: that it was made from.
+        found: output of the network.
+        batch: the batch that it was made from.
         weight: from `loss_weight`.
     """
     unseen = torch.exp(-batch["density"])
@@ -109,7 +109,7 @@ def weighted_l1(volume: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
 
     Args:
         volume: V, [B, 1, I, J, K].
-        truth: of the same shape.
+        truth: [B, 1, I, J, K].
         weight: w >= 0, of the same shape.
     """
     return mean_by_weight((volume - truth).abs(), weight)

@@ -41,27 +41,27 @@ DEFAULT_NETWORK = PriorNetworkConfig()
 class PriorModule(AnnealedModule):
     """Supervised training of V_prior against the true volume.
 
-    Loss: `prior_loss`, weighted by `loss_weight`. Only the mask is used later, and V_coarse ends in a bright halo
-    around it: with a larger weight of the background (0.1, and 1 within 3 voxels of the mask, was tried) the network
-    learnt to trim the halo and nothing else.
+    Loss: `prior_loss`, weighted by `loss_weight`. Only voxels in the mask are used later, and V_coarse ends in a bright
+    halo around it: with a larger weight of the background (0.1, and 1 within 3 voxels of the mask, was tried) the
+    network learnt to trim the halo and nothing else.
 
     Args:
         network: see `PriorNetworkConfig`.
         learning_rate: peak rate of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up.
         background_weight: loss weight outside the brain mask, 0 to 1; see `loss_weight`.
         augment_orientation: rotate and mirror each training batch by a random symmetry of the cube, so that
             the prior does not depend on the orientation in which a subject is reconstructed.
-        density: what gate and F take for M_rho, of `DENSITY_KINDS`. All but the first are for comparison: such a
+        density: definition of M_rho for gate and F, of `DENSITY_KINDS`. All but the first are for comparison: such a
             network cannot be exported.
         voxel_mm: isotropic voxel size of the training data; None takes the data module's `spacing_mm`.
-        start_from: exported prior whose weights to begin with; channels that it lacks begin at zero, and so
+        start_from: exported prior with the initial weights; channels that it lacks start at zero, and so
             does the last layer if its prior has another base.
 
     Raises:
-        ValueError: a rate or weight out of range, or from the network.
-        InputError: `start_from` cannot be read, or is of a network of another size.
+        ValueError: a rate or weight is out of range, or from the network.
+        InputError: `start_from` cannot be read, or its network has another size.
     """
 
     kind = Prior.kind
@@ -117,7 +117,7 @@ class PriorModule(AnnealedModule):
         return loss
 
     def n_samples(self, batch: Batch) -> int:
-        """Patches of a batch."""
+        """Number of patches of a batch."""
         return int(batch["truth"].shape[0])
 
     def on_validation_epoch_start(self) -> None:
@@ -138,8 +138,8 @@ class PriorModule(AnnealedModule):
                 self._panels[n] = panel({k: x[b : b + 1] for k, x in batch.items()}, prior[b : b + 1], gate)
 
     def on_validation_epoch_end(self) -> None:
-        """Log mean L1, PSNR (dB), SSIM and gain, over all and by number of stacks; send the images."""
-        # summed over the processes, so that all of them log, and keep, the same
+        """Log mean L1, PSNR (dB), SSIM and gain, over all and by number of stacks; log the images."""
+        # summed over the processes, so that all of them log and keep the same values
         sums, squares = (self._over_processes(one) for one in (self._scores.sums, self._scores.squares))
         for name, value in {**validation_means(sums), **psnr_by_place(squares)}.items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr_gain")
@@ -163,7 +163,7 @@ class PriorModule(AnnealedModule):
         """Take the atlas template from the data module.
 
         Raises:
-            InputError: a template on another grid than the network's.
+            InputError: the template is on another grid than the network's.
         """
         data: Any = getattr(self.trainer, "datamodule", None)
         if hasattr(data, "template"):
@@ -185,8 +185,8 @@ class PriorModule(AnnealedModule):
         """Take the voxel size from the data module.
 
         Raises:
-            InputError: the voxel size is not known, or differs from the data's, or the weights to go on with
-                were trained on another.
+            InputError: the voxel size is unknown or differs from the data's, or the initial weights were trained on
+                another one.
         """
         settings = self.describe_data()
         spacing_mm = settings.get("spacing_mm", getattr(getattr(self.trainer, "datamodule", None), "spacing_mm", None))
@@ -212,17 +212,17 @@ class PriorModule(AnnealedModule):
             self._learnt_at_mm["ckpt_path"] = float(voxel_mm)
 
     def own_description(self) -> dict[str, Any]:
-        """Values that a `Prior` needs apart from its weights."""
-        # g3r-infer gives every prior the coverage
+        """Values that a `Prior` needs besides its weights."""
+        # g3r-infer passes the coverage to every prior
         kind = self.kind if self.density == DENSITY_KINDS[0] else f"{self.kind} of the {self.density} density"
         return {"voxel_mm": self.voxel_mm, "weeks": self.weeks, "kind": kind}
 
 
 def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
-    """Begin with the weights of an exported prior, of a network that may have had no template.
+    """Start from the weights of an exported prior, whose network may lack the template.
 
     Returns:
-        The voxel size (mm) that they were trained on.
+        The voxel size (mm) of their training.
 
     Raises:
         InputError: the file cannot be read, or its network has other channels, units or inputs.
@@ -230,10 +230,10 @@ def take_weights(network: DensityGatedPriorNetwork, path: str) -> float:
     other = Prior.load(path)
     own = network.state_dict()
     mine, theirs = network.config, other.network.config
-    # the template comes last in the first layer; without another input those after it would take its place
+    # the template is the last input of the first layer; if another one were missing, later ones would take its place
     same_inputs = (mine.use_sharp, mine.use_density) == (theirs.use_sharp, theirs.use_density)
     for name, given in other.network.state_dict().items():
-        if name == "template":  # the data module's is taken
+        if name == "template":  # that of the data module is used
             continue
         into = own.get(name)
         fits = into is not None and into.ndim == given.ndim and into.shape[:1] == given.shape[:1]

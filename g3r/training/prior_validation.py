@@ -14,10 +14,10 @@ from g3r.prior.gate import DensityGate, confidence_from_density
 from g3r.training.prior_batches import Batch, weighted_l1
 
 VALIDATED = ("prior", "sharp", "coarse", "template")
-"""Volumes that are scored: the network's, and what it starts from."""
+"""Volumes that are scored: the network's, and those it starts from."""
 METRICS = ("l1", "psnr", "ssim")
 MAX_STACKS = 12
-"""More are counted as this many."""
+"""Larger numbers of stacks are counted as this many."""
 PANEL_TAG = "coarse, sharp, template, confidence, gate, prior, truth, 4 x error"
 
 CONFIDENCE_BINS = {"unseen": 0.05, "hardly_seen": 0.3, "thinly_seen": 0.6, "seen": np.inf}
@@ -28,10 +28,10 @@ PLACES = ("rim", "deep")
 
 
 class ValidationScores:
-    """Sums and numbers of the scores of one epoch; row 0 is over all volumes, row n over those of n stacks.
+    """Sums and counts of the scores of one epoch; row 0 is over all volumes, row n over those of n stacks.
 
     Args:
-        voxel_mm: of the volumes.
+        voxel_mm: voxel size of the volumes.
     """
 
     def __init__(self, voxel_mm: float) -> None:
@@ -44,8 +44,8 @@ class ValidationScores:
 
         Args:
             volumes: [B, 1, I, J, K] for each name in `VALIDATED`.
-            batch: that they were made from.
-            weight: of the L1 error, [B, 1, I, J, K].
+            batch: the batch that they were made from.
+            weight: weight of the L1 error, [B, 1, I, J, K].
         """
         for b, n in enumerate(stack_numbers(batch)):
             for v, name in enumerate(VALIDATED):
@@ -69,7 +69,7 @@ def confidence_bins(density: Tensor) -> list[Tensor]:
 
 
 def l1_by_confidence(volume: Tensor, batch: Batch) -> dict[str, Tensor]:
-    """Mean absolute error of a batch's brain in each of `CONFIDENCE_BINS` that it has voxels in."""
+    """Mean absolute error of a batch's brain in each of `CONFIDENCE_BINS` that has voxels."""
     error, brain = (volume - batch["truth"]).abs(), batch["mask"] > 0.5
     chosen = {name: bins & brain for name, bins in zip(CONFIDENCE_BINS, confidence_bins(batch["density"]), strict=True)}
     return {name: error[one].mean() for name, one in chosen.items() if bool(one.any())}
@@ -91,7 +91,7 @@ def psnr_by_place(squares: Tensor) -> dict[str, float]:
 
 
 def psnr_by_bin(squares: Tensor) -> dict[str, float]:
-    """PSNR (dB, of an intensity of 1) of the prior by bin of confidence, where there are voxels.
+    """PSNR (dB, of an intensity of 1) of the prior by bin of confidence, for bins with voxels.
 
     Args:
         squares: as for `psnr_by_place`.
@@ -111,13 +111,13 @@ def _places(mask: Tensor, voxel_mm: float) -> list[Tensor]:
 def sample_scores(volume: Tensor, truth: Tensor, mask: Tensor, weight: Tensor) -> dict[str, float]:
     """Return weighted L1 of one sample, and PSNR (dB) and SSIM in the mask as `g3r-evaluate` defines them.
 
-    PSNR and SSIM are absent where the mask is empty, and NaN where the volume is not finite.
+    PSNR and SSIM are absent if the mask is empty, and NaN if the volume is not finite.
 
     Args:
         volume: [1, I, J, K].
         truth: of the same shape.
         mask: brain, of the same shape.
-        weight: of the L1 error, of the same shape.
+        weight: weight of the L1 error, of the same shape.
     """
     found = {"l1": float(weighted_l1(volume, truth, weight))}
     inside = (mask[0] > 0.5).cpu().numpy()
@@ -130,7 +130,7 @@ def sample_scores(volume: Tensor, truth: Tensor, mask: Tensor, weight: Tensor) -
 
 
 def stack_numbers(batch: Batch) -> list[int]:
-    """The number of stacks of each sample, at most `MAX_STACKS`; 0 where the batch does not say."""
+    """The number of stacks of each sample, at most `MAX_STACKS`; 0 if the batch does not state it."""
     if "n_stacks" not in batch:
         return [0] * len(batch["truth"])
     return [min(int(n), MAX_STACKS) for n in batch["n_stacks"]]
@@ -165,7 +165,7 @@ def panel(batch: Batch, prior: Tensor, gate: DensityGate | None) -> Tensor:
     The section is the one with the most brain of the batch's first sample. The error is 4 |prior - truth|.
 
     Args:
-        batch: with at least one sample.
+        batch: has at least one sample.
         prior: V_prior of the same samples, [B, 1, I, J, K].
         gate: None shows a gate of 1 everywhere.
     """
@@ -182,5 +182,5 @@ def panel(batch: Batch, prior: Tensor, gate: DensityGate | None) -> Tensor:
         truth,
         4.0 * (shown - truth).abs(),
     ]
-    # Columns follow i (the patient's right), rows follow j upwards (anterior).
+    # columns follow i (to the patient's right), rows follow j upwards (to anterior)
     return torch.cat([image[:, :, section].T.flip(0) for image in row], 1).clamp(0.0, 1.0)
