@@ -161,7 +161,7 @@ def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | No
         return SliceProfile(thickness_mm=thickness_mm, origin=ProfileOrigin(thickness_from=source))
     axis = sidecar.phase_axis_of(slice_axis)
     if axis is not None and AXES.index(axis) == slice_axis:
-        # slices that are excited one by one are encoded in their plane: the file's axes were changed
+        # slices that are excited one by one are encoded in their plane: the file or its axes were changed
         if sidecar.phase_resolution is not None:
             logger.warning("%s: phase encoding along %s, which counts the slices; it is not used", sidecar.name, axis)
         axis = None

@@ -2,7 +2,7 @@
 
 A stack of another head of the same age finds a place among the others, and the volume becomes a mean of both heads.
 All stacks then agree with it about equally, and less than they would with their own head, so no comparison of one stack
-with the others tells which one is to blame. What the others gain without a stack does.
+with the others tells which one is to blame. It is found by what the others gain without it.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def unknown_orientation_note(slices: Slices) -> str:
 
 
 def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQuality]:
-    """The quality of each given stack, in their order; `n_stacks` includes stacks without slices here."""
+    """The quality of each given stack, in their order; `n_stacks` counts stacks without slices, too."""
     found, left_out = [], dict(registration.left_out)
     present = np.unique(registration.slices.stack_id).tolist()
     for n in range(n_stacks):
