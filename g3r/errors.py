@@ -16,7 +16,7 @@ class G3RError(Exception):
     exit_code = 1
 
     def __str__(self) -> str:
-        """The message on one line, whatever file names and headers brought along."""
+        """The message on one line, whatever file names and headers contain."""
         return "".join(c if c.isprintable() else repr(c)[1:-1] for c in super().__str__())
 
 
@@ -27,7 +27,7 @@ class InputError(G3RError):
 
 
 class NumericalError(G3RError):
-    """The computation did not hold; what exists so far is kept and marked."""
+    """The computation broke down; results so far are kept and marked."""
 
     exit_code = 4
 
@@ -36,9 +36,9 @@ def cannot_be_written(path: str | os.PathLike[str], error: OSError, needed_bytes
     """The error to raise where a file or folder could not be written.
 
     Args:
-        path: what was being written.
+        path: of the file or folder.
         error: of the system.
-        needed_bytes: what the file takes at most, where that is known.
+        needed_bytes: size of the file at most, if known.
     """
     reason = error.strerror or type(error).__name__
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

@@ -30,10 +30,10 @@ class Networks:
     """Prior and pose network of a reconstruction, and the atlas template of its registration.
 
     Args:
-        prior: checkpoint of the prior, or the name of a set of weights that ships with the package; the usual one
+        prior: checkpoint of the prior, or the name of a set of weights that ships with the package; the default set
             when None.
-        pose: the same of the pose network; when None that of the set that `prior` names.
-        settings: of the reconstruction, which say what of these it uses.
+        pose: the same for the pose network; when None, that of the set that `prior` names.
+        settings: of the reconstruction, which decide what of these is used.
         device: see `device_of`.
 
     Raises:
@@ -48,7 +48,7 @@ class Networks:
         self.stored_pose = StoredModel(pose or set_of(prior), "pose", self._load_pose) if use_pose else None
 
     def start(self) -> None:
-        """Begin to load the prior, beside what the caller does next. The pose network is rarely asked."""
+        """Begin to load the prior in the background. The pose network is not loaded ahead, since it is rarely used."""
         if self.stored_prior:
             self.stored_prior.start()
 
@@ -68,7 +68,7 @@ class Networks:
         return stored_template(self.stored_pose) if self.stored_pose else None
 
     def subject_prior(self, settings: ReconstructionSettings) -> SubjectPrior:
-        """What makes the volumes of a subject; waits for the prior network where settings use it."""
+        """The maker of a subject's volumes; waits for the prior network if the settings use it."""
         prior = self.prior if settings.use_prior else None
         own_voxel_mm = max(settings.resolution_mm, settings.least_squares_voxel_mm)
         return SubjectPrior(
@@ -84,7 +84,7 @@ class Networks:
         return number(self.stored_prior.file.description, "voxel_mm") if self.stored_prior else None
 
     def proposed_motion(self, slices: Slices) -> RigidPose | None:
-        """Motions [K] (world from header) of slices as the pose network sees them; None where it is not used.
+        """Motions [K] (world from header) of slices as the pose network predicts them; None where it is not used.
 
         Args:
             slices: at their header poses.

@@ -117,7 +117,7 @@ class GaussianReconstructor:
         return ReportedResult.of(assemble(found, plan, run))
 
     def register_stacks(self, stacks: Sequence[Stack]) -> Registration:
-        """Poses of all slices of some stacks, as `reconstruct` finds them and takes them.
+        """Poses of all slices of some stacks, as `reconstruct` estimates them and accepts them as its argument.
 
         Raises:
             InputError: stacks that cannot be used.
@@ -148,8 +148,8 @@ class GaussianReconstructor:
     def _poses(
         self, slices: Slices, given: Registration | GivenPoses | None, plan: Plan, run: RunContext
     ) -> Registration:
-        """The slices in their poses."""
-        deadline = plan.for_registration() if given is None else None  # first: a time budget chooses the search
+        """The slices in their poses: estimated, given, or from a given registration."""
+        deadline = plan.for_registration() if given is None else None  # before settings are read: it may change them
         asked, report = plan.settings.registration, run.report(Stage.REGISTRATION)
         if isinstance(given, GivenPoses):
             run.notes += given.notes
@@ -169,7 +169,7 @@ class GaussianReconstructor:
     def _masks(
         self, stacks: Sequence[Stack], poses: Registration, intensity: float, plan: Plan, run: RunContext
     ) -> tuple[Sequence[Stack], Registration]:
-        """Stacks and slices with masks that were found once more, with what registration knows."""
+        """Stacks and slices with automatic masks refined by what registration knows."""
         if not any(stack.mask_source == REFINED for stack in stacks):
             return stacks, poses
         with run.timed(Stage.MASKS) as tell:
@@ -178,7 +178,7 @@ class GaussianReconstructor:
         return refined.stacks, refined.poses
 
     def _prior(self, volumes: InitialVolumes, poses: Registration, plan: Plan, run: RunContext) -> PriorVolume:
-        """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move to it if it fits them."""
+        """V_prior (Eq. 7); slices of a single stack, which no other stack checks, move towards it if it fits them."""
         plan.for_prior(run.clock.seconds[Stage.COARSE])
         maker = self.networks.subject_prior(plan.settings)
         n_stacks, tiling = volumes.slices.n_stacks, plan.settings.tiling
@@ -196,7 +196,7 @@ class GaussianReconstructor:
     def _rounds(
         self, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
     ) -> tuple[PriorVolume, Registration, PoseRounds | None]:
-        """Prior volume and poses after rounds of both; as they are where none is due, or where a stop was requested."""
+        """Prior volume and poses after rounds of both; unchanged if no round is due, or if a stop was requested."""
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
         n_rounds = settings.pose_rounds.n_rounds(prior.volumes.slices.n_stacks)
         if not n_rounds:
@@ -245,7 +245,7 @@ class GaussianReconstructor:
     def _held_out(
         self, cloud: PriorCloud | None, prior: PriorVolume, poses: Registration, plan: Plan, run: RunContext
     ) -> HeldOutChoice | None:
-        """What held-out slices say of profile and prior; None where they are not asked."""
+        """Widths of the slice profiles by held-out slices; None where these are not used."""
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)
         if cloud is None or (asked := settings.held_out) is None:
             return None
@@ -274,7 +274,7 @@ class GaussianReconstructor:
         plan: Plan,
         run: RunContext,
     ) -> SliceFit | None:
-        """Gaussians and poses fitted to the slices (Eq. 9); as far as it came where a stop was requested."""
+        """Gaussians and poses fitted to the slices (Eq. 9); the state so far if a stop was requested."""
         if cloud is None:
             return None
         settings = adapted(plan.settings, prior.volumes.slices.n_stacks)

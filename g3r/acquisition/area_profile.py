@@ -1,8 +1,8 @@
-"""How much of the head each stack saw: area along the normal, with the slices that are missing put back.
+"""Area of the head along the normal of each stack, with missing slices filled in.
 
-A mask counts only what was acquired. Slices that are missing inside a stack are interpolated between their
-neighbours. Where a stack ends in a large slice, its field of view cut the head: the rest is continued as an
-ellipsoid, whose length other stacks show in their planes.
+A mask covers only what was acquired. Slices that are missing inside a stack are interpolated between their neighbours.
+If a stack ends in a large slice, its field of view cut the head: the rest is continued as an ellipsoid, whose length
+is taken from stacks that show it in plane.
 """
 
 from __future__ import annotations
@@ -16,54 +16,54 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.slicing import slice_spacing_mm
 
 MIN_MISSING_AREA = 0.2
-"""Slices that are missing between others count from this share of the largest area; smaller ones are tips of the
-head, of which masks often lack a slice."""
+"""Slices missing between others count from this share of the largest area. Smaller ones are at the tips of the head,
+where masks often lack a slice."""
 
 MIN_CUT_AREA = 0.3
-"""A stack whose first or last slice is larger than this share of its largest one was cut there. Whole heads end at
-0 to 0.19 of it, with 4 mm between slices at the most; a field of view that lacks a tenth of the head at 0.36."""
+"""A stack was cut at an end whose slice is larger than this share of its largest slice. Stacks of whole heads, with up
+to 4 mm between slices, end at 0 to 0.19 of it; a field of view that lacks a tenth of the head ends at 0.36."""
 
 MIN_CUT_SHARE = 0.05
 """Share of a head beyond its field of view that counts. In slices of 5 mm the outermost one of a whole head may have
 `MIN_CUT_AREA`, too; then next to nothing lies beyond it."""
 
 MIN_SLICES = 6
-"""Stacks of fewer slices are too coarse to say where they were cut."""
+"""Stacks of fewer slices are too coarse to tell where they were cut."""
 
 LENGTH_RATIO, LENGTH_SPREAD = 1.0, 0.2
-"""Length of a head along the normal over the diameter of a disc of its largest area, and the deviation of its
-logarithm: 0.85 to 1.3 for axial to coronal stacks of an ellipsoid with the proportions of a fetal brain."""
+"""Usual length of a head along the normal over the diameter of a disc of its largest area, and the standard deviation
+of its logarithm: 0.85 to 1.3 for axial to coronal stacks of an ellipsoid with the proportions of a fetal brain."""
 
 SEEN_LENGTH_SPREAD = 0.08
-"""The same deviation where another stack shows the length in its planes."""
+"""Standard deviation of the logarithm of the length, relative to the length that other stacks show in plane."""
 
 AREA_SPREAD = 0.08
-"""Deviation of areas from an ellipsoid's, as a share of the largest."""
+"""Standard deviation of areas from those of an ellipsoid, as a share of the largest area."""
 
 MIN_ANGLE_DEG = 45.0
-"""Stacks whose normals are at least so far apart see each other's length."""
+"""Smallest angle between the normals of two stacks at which each shows the other's length in plane."""
 
 WHOLE_VOLUME_SPREAD = 0.08
-"""Deviation of the logarithm of a cut stack's volume, continued, from that of stacks that show the whole head."""
+"""Standard deviation of the logarithm of a cut stack's continued volume, relative to stacks of whole heads."""
 
 MAX_AREA_GAIN = 1.25
-"""The largest area of a head over the largest that a cut stack shows: 1.2 where it lacks 70 % of the length."""
+"""Upper bound of a head's largest area over the largest that a cut stack shows: 1.2 where it lacks 70 % of length."""
 
 MAX_LENGTH_GAIN = 2.5
-"""No head is longer than this times what was seen of it."""
+"""Upper bound of a head's length over the length that was seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AreaProfile:
-    """Slices of one stack by the header, those that are missing included.
+    """Masked area of each slice of one stack by the header, missing slices included.
 
     Args:
         index: [N] numbers of the slices in their stack, ascending; may begin below zero.
-        area_mm2: [N] masked area, or what is expected of a missing slice.
+        area_mm2: [N] masked area; the expected one for a missing slice.
         center_mm: [N, 3] middle of that area by the header.
         seen: [N] whether the slice was acquired.
-        spacing_mm: distance of slices.
-        cut: whether the field of view cut the head before the first and after the last slice that was seen.
+        spacing_mm: slice spacing.
+        cut: whether the field of view cut the head before the first and after the last acquired slice.
     """
 
     index: NDArray[np.int64]
@@ -75,7 +75,7 @@ class AreaProfile:
 
     @property
     def volume_mm3(self) -> float:
-        """Of the head, missing slices included."""
+        """Volume of the head, missing slices included."""
         return float(self.area_mm2.sum() * self.spacing_mm)
 
     @property
@@ -90,13 +90,13 @@ class AreaProfile:
 
     @property
     def n_inside(self) -> int:
-        """Slices that are missing between others."""
+        """Number of missing slices between acquired ones."""
         first, last = np.flatnonzero(self.seen)[[0, -1]]
         return int((~self.seen[first : last + 1]).sum())
 
     @property
     def longest_gap_mm(self) -> float:
-        """Length along the normal of the longest span without a slice between others; 0 without one."""
+        """Length along the normal of the longest gap between acquired slices; 0 without one."""
         steps = np.diff(self.index[self.seen])
         return float((steps.max(initial=1) - 1) * self.spacing_mm) if self.n_inside else 0.0
 
@@ -132,7 +132,7 @@ def area_profiles(slices: Slices) -> list[AreaProfile]:
 def head_volume_mm3(slices: Slices) -> float:
     """Median over stacks of masked area times slice spacing (mm^3), missing slices included.
 
-    Stacks that show the whole head decide, if there are any.
+    If any stack shows the whole head, only such stacks count.
     """
     profiles = area_profiles(slices)
     whole = [one for one in profiles if not one.is_cut]
@@ -140,7 +140,7 @@ def head_volume_mm3(slices: Slices) -> float:
 
 
 def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
-    """From the first to the last slice of a stack."""
+    """The profile from the first to the last acquired slice of a stack."""
     stack = slices.take(of_stack)
     number, plane = stack.slice_index, stack.pixel_plane
     count = np.bincount(plane, minlength=len(stack))
@@ -167,7 +167,7 @@ def _profile(slices: Slices, of_stack: NDArray[np.bool_]) -> AreaProfile:
 def _continued(
     slices: Slices, of_stack: NDArray[np.bool_], profile: AreaProfile, volume_mm3: float | None
 ) -> AreaProfile:
-    """A profile with the slices beyond its cut ends; the middle of the area goes on along the normal."""
+    """The profile continued beyond its cut ends; the middle of the area moves on along the normal."""
     before, after = _beyond(profile, _length_of_others_mm(slices, of_stack), volume_mm3)
     first, last = -np.arange(len(before), 0, -1), np.arange(1, len(after) + 1)
     step = _step_mm(slices.take(of_stack))
@@ -188,7 +188,7 @@ def _continued(
 
 
 def _step_mm(stack: Slices) -> NDArray[np.float64]:
-    """From one slice to the next [3] by the header, along the normal."""
+    """Step from one slice to the next [3] by the header, along the normal."""
     normal = stack.header_pose.rotation[0, :, 2]
     along = stack.header_pose.translation_mm @ normal
     if len(stack) < 2:
@@ -197,7 +197,7 @@ def _step_mm(stack: Slices) -> NDArray[np.float64]:
 
 
 def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float | None:
-    """Extent of the other stacks' masks along the normal of a stack, by the headers; None where none shows it."""
+    """Largest extent of other stacks' masks along the normal of a stack, by the headers; None where none shows it."""
     normal = slices.header_pose.rotation[np.flatnonzero(of_stack)[0], :, 2]
     found = []
     for other in np.unique(slices.stack_id[~of_stack]):
@@ -206,7 +206,7 @@ def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float |
             continue
         plane = stack.pixel_plane
         along = stack.planes.with_pose(stack.header_pose).pixel_world_mm(stack.pixel_index) @ normal
-        # slice by slice: slices that moved must not add up to a longer head
+        # slice by slice, so that slices that moved do not add up to a longer head
         low, high = np.full(len(stack), np.inf), np.full(len(stack), -np.inf)
         np.minimum.at(low, plane, along)
         np.maximum.at(high, plane, along)
@@ -217,14 +217,14 @@ def _length_of_others_mm(slices: Slices, of_stack: NDArray[np.bool_]) -> float |
 def _beyond(
     profile: AreaProfile, length_mm: float | None, volume_mm3: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Areas of the slices before the first and after the last one, from the ends outwards.
+    """Areas of the slices before the first and after the last one, each from the end outwards.
 
-    The ellipsoid with area A (1 - ((z - z0) / c)^2) that is most likely, given the areas that were seen, the usual
-    length of a head of that area, the length that other stacks show, and the volume of those that show all.
+    They follow the most likely ellipsoid, with area A (1 - ((z - z0) / c)^2), given the areas that were seen, the usual
+    length of a head of that area, the length that other stacks show, and the volume of stacks that show the whole head.
     """
     cut, spacing_mm = profile.cut, profile.spacing_mm
     z = (profile.index - profile.index[0]) * spacing_mm
-    padded = np.pad(profile.area_mm2, 1, mode="edge")  # slices of an interleaved, moving stack alternate
+    padded = np.pad(profile.area_mm2, 1, mode="edge")  # smoothed: areas alternate if an interleaved stack moved
     area_mm2 = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
     largest = float(area_mm2.max())
     seen_mm = float(z[-1]) + spacing_mm
@@ -246,7 +246,7 @@ def _beyond(
         steps = np.arange(1, int(np.ceil(2 * half[h] / spacing_mm)) + 1)
         model = top[m, h] * (1 - ((start_mm + direction * steps * spacing_mm - middle[m]) / half[h]) ** 2)
         model = model[: int(np.argmax(model <= 0))] if (model <= 0).any() else model
-        # from the area that was seen at the end to the model's
+        # from the area seen at the end to the model's: the difference halves from slice to slice
         at_end = top[m, h] * (1 - ((start_mm - middle[m]) / half[h]) ** 2)
         return np.maximum(model + (end_area - at_end) * 0.5 ** np.arange(1, len(model) + 1), 0.0)
 

@@ -1,4 +1,4 @@
-"""Atlas templates: means of heads in standard orientation, which slices of an unknown head are compared with."""
+"""Atlas templates: mean heads in standard orientation, with which slices of an unknown head are compared."""
 
 from __future__ import annotations
 

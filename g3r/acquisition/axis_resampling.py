@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 
 def axis_weights(n: int, spacing_mm: float, at_mm: NDArray[np.floating], new_spacing_mm: float) -> NDArray[np.float32]:
-    """Weights of n samples in new samples, by a hat as wide as the coarser of the two spacings.
+    """Weights that resample n samples, by a hat as wide as the coarser of the two spacings.
 
-    What lies beyond the samples counts as zero.
+    Values beyond the samples count as zero.
 
     Args:
         n: number of samples N.
         spacing_mm: between them.
         at_mm: [M] positions of the new samples, from the first sample.
-        new_spacing_mm: distance that each of them stands for.
+        new_spacing_mm: spacing of the new samples.
 
     Returns:
         [M, N].
@@ -50,7 +50,7 @@ def along_axes(volume: NDArray[np.float32], weights: Sequence[NDArray[np.float32
 
 
 def centred_positions_mm(n: int, spacing_mm: float, n_old: int, old_spacing_mm: float) -> NDArray[np.floating]:
-    """Positions [n] of new samples about the middle of old ones, from the first old sample (mm).
+    """Positions [n] of new samples centred on the old ones, measured from the first old sample (mm).
 
     Args:
         n: new samples.

@@ -19,14 +19,14 @@ N_TERMS = 5
 
 
 def quadratic_terms(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, x^2, xy, y^2 [P, 5] of coordinates [P] in units of `LENGTH_MM`; a slice's gain is the constant."""
+    """x, y, x^2, xy, y^2 [P, 5] at coordinates [P] in units of `LENGTH_MM`; the constant term is the slice's gain."""
     return np.stack([x, y, x * x, x * y, y * y], axis=1)
 
 
 def stacks_by_header(
     slices: Slices,
 ) -> Iterator[tuple[slice, NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]]:
-    """The pixels of each stack where its header puts them.
+    """The pixels of each stack at their header positions.
 
     Yields:
         For each stack the range of its pixels, their mask [P], their world positions [P, 3] (mm) and the

@@ -1,4 +1,4 @@
-"""Which voxels of a stack are brain, who says so, and stacks that show nothing else."""
+"""Brain masks: their sources, and detection of images that are already brain-extracted."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from g3r.errors import InputError
 from g3r.run.provenance import FileHash
 
 MaskSource = Literal["file", "empty background", "whole image", "automatic", "command"]
-"""Who says what is brain: the user's file, zeros around it, the user by word, the network, or the user's masker."""
+"""Source of a mask: the user's file, zeros around the brain, `--whole-image`, the mask network, or `--mask-command`."""
 
 MIN_ZERO_SHARE = 0.4
-"""A stack that was masked before is zero in most of its voxels; real ones have far fewer zeros."""
+"""A brain-extracted stack has a larger share of zeros than this; stacks with surroundings have far fewer zeros."""
 
 BRAIN_RANGE_ML = (20.0, 900.0)
-"""A fetal or neonatal brain is not smaller or larger; what a whole field of view holds is ten times as large."""
+"""Range of the volume of a fetal or neonatal brain. The tissue in a whole field of view is ten times as large."""
 
 WAYS_ON = (
     "pass --masks with a brain mask for each stack, or --mask-command with a tool that makes them, or --whole-image if "
@@ -31,11 +31,11 @@ WAYS_ON = (
 
 @dataclass(frozen=True, kw_only=True)
 class FoundMask:
-    """A brain mask and who made it.
+    """A brain mask and its source.
 
     Attributes:
         inside: [I, J, K] on the grid of the image's file.
-        source: who made it.
+        source: where it comes from.
         detail: network or command, with what it found.
     """
 
@@ -44,16 +44,16 @@ class FoundMask:
     detail: str = ""
 
     def volume_ml(self, volume: Volume) -> float:
-        """Size of what is marked in an image."""
+        """Volume of the mask (ml) on the grid of an image."""
         return float(np.count_nonzero(self.inside) * volume.grid.voxel_volume_mm3 / 1000)
 
     def hash(self) -> FileHash:
-        """By which a mask that is no file is told from another one."""
+        """Hash that identifies a mask which is not a file."""
         return FileHash(self.source, hashlib.sha256(np.packbits(self.inside).tobytes()).hexdigest())
 
 
 def empty_background_mask(volume: Volume) -> FoundMask | None:
-    """The positive voxels of an image that shows the brain alone; None where tissue surrounds it.
+    """The positive voxels of a brain-extracted image; None where tissue surrounds the brain.
 
     Args:
         volume: of a stack.
@@ -71,10 +71,10 @@ def empty_background_mask(volume: Volume) -> FoundMask | None:
 
 
 def whole_image(volume: Volume) -> FoundMask:
-    """Every positive voxel.
+    """A mask of every positive voxel.
 
     Raises:
-        InputError: there is none.
+        InputError: no voxel is positive.
     """
     positive = np.nan_to_num(volume.data) > 0
     if not positive.any():
@@ -83,10 +83,10 @@ def whole_image(volume: Volume) -> FoundMask:
 
 
 def required_mask(volume: Volume) -> FoundMask:
-    """The mask of an image that shows the brain alone.
+    """The mask of a brain-extracted image.
 
     Raises:
-        InputError: there are surroundings, and nobody says what is brain.
+        InputError: the image shows more than the brain, so a mask has to be given.
     """
     found = empty_background_mask(volume)
     if found is None:

@@ -13,7 +13,7 @@ from g3r.errors import InputError
 from g3r.geometry import VolumeGrid
 
 DENSITY_CONVENTION = "dimensionless-whole-slice-v2"
-"""M = 1 where one gapless stack covers once; see `coarse_and_density`."""
+"""Density M: 1 where one gapless stack covers once; see `coarse_and_density`."""
 
 INTENSITY_CONVENTION = "p99-coarse-v1"
 """The 99th percentile of V_coarse, over voxels with M above 0.1, is one; see `normalisation_scale`."""
@@ -71,7 +71,7 @@ def _psf_points(slices: Slices, grid: VolumeGrid) -> tuple[int, int, int]:
 
 
 def confidence(density: NDArray[np.floating]) -> NDArray[np.floating]:
-    """C = 1 - exp(-M) in [0, 1), without loss of digits at small M."""
+    """Confidence c = 1 - exp(-M) in [0, 1) of density M, without loss of digits at small M."""
     return -np.expm1(-density)
 
 

@@ -1,8 +1,8 @@
-"""The bias field that all stacks have in common: what their mutual agreement cannot tell from anatomy (N4).
+"""The bias field that all stacks share, found by N4 in the volume.
 
-Fields of single stacks follow from where stacks disagree (`StackBiasField`), up to what they share. That part is
-left in the volume. N4 finds it in the volume alone: a smooth field whose removal makes the peaks of the histogram
-narrower.
+Fields of single stacks follow from where stacks disagree (`StackBiasField`). What all stacks share shows in no
+disagreement, so it cannot be told from anatomy that way and stays in the volume. N4 finds it in the volume alone: a
+smooth field whose removal narrows the peaks of the histogram.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from g3r.geometry import VolumeGrid
 from g3r.geometry.grid import bounding_box
 
 CONTROL_POINTS = 4
-"""Of the cubic B-spline along each axis, of which four are the fewest: about a quadratic over the head."""
+"""Control points of the cubic B-spline along each axis: four, the fewest possible; about a quadratic over the head."""
 
 MIN_VOXELS = 200
-"""Fewer working voxels have no histogram."""
+"""Fewest working voxels that give a histogram."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class N4Look:
-    """How N4 sees a volume.
+    """One configuration of N4.
 
     Attributes:
-        blur_mm: standard deviation of a Gaussian that the volume is convolved with first.
-        depth_mm: voxels of the brain that are no further inside it are left out.
-        voxel_mm: about the size of the working voxels: a coil's field is smooth.
-        iterations: largest numbers on one level of control points and on the next, twice as fine.
+        blur_mm: standard deviation of the Gaussian with which the volume is blurred first.
+        depth_mm: only voxels deeper inside the brain than this are used.
+        voxel_mm: approximate size of the working voxels; a coil's field is smooth.
+        iterations: largest numbers on the first level of control points and on the second, which is twice as fine.
     """
 
     blur_mm: float = 0.0
@@ -44,21 +44,21 @@ class N4Look:
 
 
 LOOKS = (
-    # weak fields converge in 20 on the first level, strong ones need more; more on the second take anatomy for a field
+    # weak fields converge in 20 on the first level, strong ones need more; more on the second level fit anatomy
     N4Look(voxel_mm=3.2, iterations=(100, 10)),
     N4Look(blur_mm=2.0, depth_mm=2.4, voxel_mm=4.8, iterations=(50, 5)),
 )
-"""Sharp and blurred, which is less sure of tissues but knows no folds. The errors of both have little in common."""
+"""Sharp, and blurred: blur separates tissues less well but hides folds. The errors of both have little in common."""
 
 
 def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], grid: VolumeGrid) -> NDArray[np.float32]:
     """Logarithm [I, J, K] of the smooth intensity field of a volume, with zero mean over the brain.
 
-    N4 looks twice (`LOOKS`). The mean of both fields counts, less the more they differ beside its size: where there is
-    no field, N4 finds one of 1 to 2 % in the anatomy, another one each time.
+    N4 runs twice (`LOOKS`). The result is the mean of both fields, shrunk the more they differ relative to its size:
+    where there is no field, N4 finds one of 1 to 2 % in the anatomy, a different one each time.
 
-    Outside the brain it keeps to the range that it has inside. Zero everywhere where the brain is too small or too
-    flat to tell.
+    Outside the brain the field keeps to its range inside. It is zero everywhere if the brain is too small or has no
+    contrast.
 
     Args:
         volume: [I, J, K], positive where there is tissue.
@@ -72,7 +72,7 @@ def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], gri
         return np.zeros(volume.shape, np.float32)
     box = bounding_box(usable)
     seen, usable = volume[box].astype(np.float32, copy=False), usable[box]
-    with ThreadPoolExecutor(len(LOOKS)) as pool:  # N4 has one thread, and releases Python's lock
+    with ThreadPoolExecutor(len(LOOKS)) as pool:  # N4 runs on one thread and releases the GIL
         found = [
             one for one in pool.map(lambda look: _n4(seen, usable, grid.spacing_mm, look), LOOKS) if one is not None
         ]
@@ -82,7 +82,7 @@ def common_log_field(volume: NDArray[np.floating], brain: NDArray[np.bool_], gri
 
 
 def _as_far_as_alike(fields: Sequence[NDArray[np.float32]], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Mean of fields, times the share that it has in its own square and the variance of the fields."""
+    """Mean of fields times s / (s + v), where s is its mean square and v the mean variance between the fields."""
     mean = np.mean(fields, axis=0)
     mean -= mean[usable].mean()
     if len(fields) == 1:
@@ -95,7 +95,7 @@ def _as_far_as_alike(fields: Sequence[NDArray[np.float32]], usable: NDArray[np.b
 def _n4(
     volume: NDArray[np.float32], usable: NDArray[np.bool_], spacing_mm: NDArray[np.float64], look: N4Look
 ) -> NDArray[np.float32] | None:
-    """What N4 finds with one look; None where the voxels are too few or too flat."""
+    """The log field that one configuration of N4 finds; None where the voxels are too few or without contrast."""
     import SimpleITK as sitk
 
     step = [max(1, round(look.voxel_mm / mm)) for mm in spacing_mm]
@@ -121,7 +121,7 @@ def _n4(
     inside = field[usable]
     if not np.isfinite(inside).all():
         return None
-    # the spline is an extrapolation beyond the brain
+    # beyond the brain the spline extrapolates
     return np.asarray(np.nan_to_num(field).clip(inside.min(), inside.max()) - inside.mean(), np.float32)
 
 

@@ -1,7 +1,7 @@
-"""How densely slices sample each voxel, whatever their masks say: M_rho of G3R Eq. 6, over whole slices.
+"""Coverage of voxels by whole slices, masked or not: the density M_rho of G3R Eq. 6.
 
-A pixel outside the mask has been looked at as one inside it. So the density of Eq. 6 is summed over the field of view
-of a slice, not over its mask; the share of it whose masks say brain is a map of its own (`brain_share`).
+A pixel outside the mask was measured like one inside it. So the density of Eq. 6 is summed over the field of view of a
+slice, not over its mask. The share of it that masks call brain is a separate map (`brain_share`).
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from g3r.acquisition.planes import Slices
 from g3r.geometry import VolumeGrid
 
 UNSEEN_POWER = 4
-"""What no slice saw has the weight (1 - c)^4 = exp(-4 M): 1 without coverage, 0.45 where M = 0.2, 0.02 under one
-gapless stack."""
+"""Unseen voxels have the weight (1 - c)^4 = exp(-4 M): 1 without coverage, 0.45 where M = 0.2, 0.02 under one gapless
+stack."""
 
 REACH_SIGMA = 5.0
-"""Where the profile of a slice ends: beyond it lies a millionth of its integral."""
+"""Where the profile of a slice is cut off; a millionth of its integral lies beyond."""
 
 UNSEEN_BELOW = 0.2
-"""M_rho below which a voxel counts as seen by no slice: what a lone slice gives at 0.75 of its thickness."""
+"""M_rho below which a voxel counts as unseen: that of a lone slice at 0.75 of its thickness from its centre."""
 
 
 def coverage(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
     """M_rho: the density with which slices sample space, over their whole fields of view (G3R Eq. 6).
 
-    The in-plane integral over a rectangle is a product of error functions, so there is no pixel to sum over and the
-    result does not depend on the pixel size. Dimensionless: 1 where one gapless stack covers once (thickness times
-    the unit-integral profile). Slices beyond the masked ones of a stack cover, too (`FieldsOfView.n_beyond`), as they
-    would lie if they moved with the last masked one. Those that are empty, or unmasked between masked ones, do not.
+    The in-plane integral over a rectangle is a product of error functions, so no pixels are summed and the result does
+    not depend on the pixel size. Dimensionless: 1 where one gapless stack covers once (thickness times the
+    unit-integral profile). Slices beyond the masked ones of a stack count, too (`FieldsOfView.n_beyond`), where they
+    would lie if they moved with the last masked one. Empty slices and unmasked ones between masked ones do not count.
 
     Args:
         slices: K slices in place.
@@ -65,7 +65,7 @@ def coverage(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | No
 
 
 def brain_share(masked: NDArray[np.floating], density: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Share of the coverage whose masks say brain, in [0, 1]; 0 where nothing was seen.
+    """Share of the coverage that masks call brain, in [0, 1]; 0 where nothing was measured.
 
     Args:
         masked: density of the masked pixels alone, as `coarse_and_density` gives it.

@@ -1,8 +1,8 @@
-"""From the axes of a file to those of a stack, the same for every program that wrote the file.
+"""Conversion between the axes of a file and those of a stack, the same for every program that wrote the file.
 
-One acquisition reaches us through different converters. They store rows in either order, and the last digits of their
-affines differ. Search and fit (L1, Adam) amplify the smallest difference until it is as large as their own tolerance,
-some 0.5 % of the range. So pixels come in one order, and geometry is read as finely as it matters and no finer.
+One acquisition arrives through different converters. They store rows in either order, and their affines differ in the
+last digits. Search and fit (L1, Adam) amplify the smallest difference until it is as large as their own tolerance,
+some 0.5 % of the range. So pixels are put in one order, and geometry is rounded to steps too small to matter.
 """
 
 from __future__ import annotations
@@ -19,21 +19,23 @@ from g3r.geometry import RigidPose, VolumeGrid
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 QUATERNION_STEP = 5e-5
-"""Of the orientation: at most 0.01 mm at 120 mm from the middle."""
+"""Rounding step of the orientation's quaternion: at most 0.01 mm at 120 mm from the middle."""
 
 CENTER_STEP_MM = 2.0**-7
-"""Of the middle of the image. A power of two, because sizes with few digits never lie between two multiples of it."""
+"""Rounding step of the middle of the image. A power of two: a length with few decimals then never lies half-way between
+two multiples, where its last digit would decide."""
 
 SPACING_STEP_MM = (1e-6, 1e-6, 1e-4)
-"""Of the voxel size. Pixels have few digits (1.171875 mm); slice distances come from positions with few digits."""
+"""Rounding steps of the voxel size. Pixel sizes have few digits (1.171875 mm), as do the positions that slice distances
+are computed from."""
 
 
 @dataclass(frozen=True)
 class FileAxes:
-    """How a file's array becomes one with the slices along the third axis and its rows in the usual order.
+    """How a file's array becomes one with slices along the third axis and rows in the usual order.
 
     Attributes:
-        slice_axis: axis of the file that becomes the third one. A slice keeps its number.
+        slice_axis: axis of the file that becomes the third one. Slices keep their numbers.
         flipped: whether the first and the second axis run backwards.
     """
 
@@ -42,28 +44,28 @@ class FileAxes:
 
     @classmethod
     def of(cls, grid: VolumeGrid) -> FileAxes:
-        """Those of a file: both axes of a slice lead to the right, to the front, or up, whichever is nearest."""
+        """The axes of a file: both axes of a slice point right, to the front, or up, whichever is nearest."""
         through = slice_axis(grid.spacing_mm)
         axes = cls(through).grid_from_file(grid).affine[:3, :2]
         main = axes[np.abs(axes).argmax(0), [0, 1]]
         return cls(through, (bool(main[0] < 0), bool(main[1] < 0)))
 
     def from_file(self, array: NDArray[Scalar]) -> NDArray[Scalar]:
-        """The array [I, J, K], contiguous, of the file's."""
+        """A file's array as [I, J, K], contiguous."""
         return np.ascontiguousarray(np.moveaxis(array, self.slice_axis, 2)[self._steps])
 
     def to_file(self, array: NDArray[Scalar]) -> NDArray[Scalar]:
-        """The file's array of one [I, J, K]."""
+        """An array [I, J, K] with the axes of the file."""
         return np.moveaxis(array[self._steps], 2, self.slice_axis)
 
     def grid_from_file(self, grid: VolumeGrid) -> VolumeGrid:
-        """The grid of `from_file`."""
+        """The grid of `from_file`'s result."""
         shape, affine = [grid.shape[axis] for axis in self._order], grid.affine.copy()
         affine[:3, :3] = affine[:3, self._order]
         return self._turned(VolumeGrid((shape[0], shape[1], shape[2]), affine))
 
     def grid_to_file(self, grid: VolumeGrid) -> VolumeGrid:
-        """The grid of `to_file`."""
+        """The grid of `to_file`'s result."""
         grid = self._turned(grid)
         shape, affine = np.empty(3, int), grid.affine.copy()
         shape[self._order] = grid.shape
@@ -88,7 +90,7 @@ class FileAxes:
 
 
 AS_IN_FILE = FileAxes()
-"""Of an array that is used as it lies in its file."""
+"""The axes of an array that is used as it lies in its file."""
 
 
 def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
@@ -97,15 +99,15 @@ def slice_axis(spacing_mm: NDArray[np.float64]) -> int:
 
 
 def settled(grid: VolumeGrid) -> VolumeGrid:
-    """The grid, rounded, so that headers of one acquisition whose last digits differ give the same one.
+    """The grid, rounded so that headers of one acquisition that differ in their last digits give the same grid.
 
-    No point within 120 mm of the middle moves by more than 0.02 mm. Seldom two headers lie on two sides of a step.
+    No point within 120 mm of the middle moves by more than 0.02 mm. Rarely two such headers round to different grids.
 
     Args:
         grid: slices along the third axis.
     """
     rotation, mirror = _nearest_rotation(grid)
-    # q and -q are one rotation and are rounded to one
+    # q and -q are the same rotation and round to the same one
     quaternion = np.rint(Rotation.from_matrix(rotation).as_quat() / QUATERNION_STEP)
     rounded = Rotation.from_quat(quaternion).as_matrix() * mirror
     stretch = (rotation * mirror).T @ grid.affine[:3, :3]  # keeps what shear there is
@@ -116,18 +118,18 @@ def settled(grid: VolumeGrid) -> VolumeGrid:
     affine[:3, 3] = np.rint(grid.center_mm / CENTER_STEP_MM) * CENTER_STEP_MM - affine[:3, :3] @ middle
     try:
         return VolumeGrid(grid.shape, affine)
-    except ValueError:  # rounding flattens axes that lie nearly in a plane; `Stack` refuses them with a line
+    except ValueError:  # rounding flattens axes that nearly lie in a plane; `Stack` refuses them with a message
         return grid
 
 
 def between(start: VolumeGrid, end: VolumeGrid) -> RigidPose:
-    """The motion (one) that takes a grid to one that `settled` made of it, or back."""
+    """The motion (one) from a grid to the grid that `settled` made of it, or back."""
     frames = [RigidPose(_nearest_rotation(grid)[0][None], grid.center_mm[None]) for grid in (start, end)]
     return frames[1] @ frames[0].inverse()
 
 
 def _nearest_rotation(grid: VolumeGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The rotation [3, 3] nearest to the axes; factors [3] of its columns that mirror it back where the axes are."""
+    """The rotation [3, 3] nearest to the axes, and factors [3] of its columns; the third is -1 for left-handed axes."""
     left, _, right = np.linalg.svd(grid.affine[:3, :3] / grid.spacing_mm)
     mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     return left @ right * mirror, mirror

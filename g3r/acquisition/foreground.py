@@ -1,8 +1,8 @@
-"""The brain mask of the volume: what slices saw and called brain, and what none of them saw.
+"""The brain mask of the volume, from the masks of slices where slices looked, and by shape where none did.
 
-A voxel is in one of three states: seen and called brain, seen and called something else, unseen. The last says
-nothing about the head: it is decided by shape (the prior network's brain probability, or the hull of what was seen),
-never by the absence of a mask.
+A voxel is in one of three states: seen and called brain, seen and called something else, or unseen. The masks say
+nothing about unseen voxels: shape decides there (the prior network's brain probability, or the hull of the seen brain),
+never the absence of a mask.
 """
 
 from __future__ import annotations
@@ -24,58 +24,58 @@ from g3r.geometry import VolumeGrid
 
 INSIDE_SHARE = 1 / 3
 """Share of the slices over a voxel whose masks must contain it, for the volume to be fitted there: one of three stacks.
-At one half some outermost voxels are lost, and with them 1 to 4 dB; one third is generous by about a quarter of the
+At one half some outermost voxels are lost, and with them 1 to 4 dB. One third is too large by about a quarter of the
 slice spacing (docs/method.md, "Mask")."""
 
 CORE_SHARE = 1 / 2
-"""The same share for the mask that is written: the edge of a mask, so that its volume is right."""
+"""The same share for the written mask. One half is the edge of a mask, so that the mask's volume is right."""
 
 EDGE = (0.03, 0.15)
-"""Shares between which the volume fades in. Of voxels with less than the first, next to none is brain."""
+"""Brain shares between which the volume fades in. Voxels below the first hold next to no brain."""
 
 SINGLE_RIM_MM = 1.6
-"""Beyond the support the volume of a single stack is shown so far: its slices may lie a millimetre off, and no other
-stack says where the brain ends."""
+"""How far the volume of a single stack is shown beyond the support: its slices may lie a millimetre off, and no other
+stack shows where the brain ends."""
 
 MASK_WIDTH = 0.5
-"""Width of a mask's profile over that of its slice: whoever draws a mask says where the middle of a pixel lies."""
+"""Width of the profile of a mask over that of its slice: a mask is drawn by where the middle of a pixel lies."""
 
 SMOOTH_SHARE = 0.18
-"""How smooth the share is, as a length over the slice distance."""
+"""Smoothing length of the brain share over the slice spacing."""
 
 N_ITERATIONS = 4
-"""From a start that is nearly right."""
+"""Conjugate-gradient steps for the brain share, from a start that is nearly right."""
 
 SEEN_SHARE = 1 / 3
-"""Coverage, in shares of what one stack gives on average, below which a voxel is unseen: with the smoothing over half
-the slice spacing it ends 0.75 of the spacing beyond a stack's last slice."""
+"""Coverage below which a voxel is unseen, as a share of the average coverage of one stack. With the smoothing over half
+the slice spacing, seen voxels end 0.75 of the spacing beyond a stack's last slice."""
 
 POSSIBLE_MM = 4.0
-"""So far beyond the mask what no slice saw may be shown. Beyond all slices, at the border of the grid, the network
-knows little: two of 16 phantoms showed a slab of 10 ml there, which was brain with a probability of 0.25 to 0.5 and
-touched the brain stem."""
+"""How far beyond the mask unseen voxels may be shown. Beyond all slices, at the border of the grid, the network is
+unreliable: two of 16 phantoms showed a slab of 10 ml there, with a brain probability of 0.25 to 0.5, that touched the
+brain stem."""
 
 THIN_MARGIN_VOXELS = 2
 
 FLAT = 1e-6
-"""In voxels: what is nearer to a face of the hull lies on it."""
+"""Tolerance in voxels: a voxel that is nearer to a face of the hull lies on it."""
 
 LIKELY, POSSIBLE = 0.5, 0.25
-"""Brain probability of an unseen voxel, to be in the mask, and to be shown: a voxel of the rim that is left out costs
-as much as many that are a little wrong."""
+"""Brain probability above which an unseen voxel is in the mask, and above which it is shown. The second is lower: a rim
+voxel that is left out costs as much as many that are a little wrong."""
 
 
 @dataclass(frozen=True)
 class Foreground:
-    """What slices say of each voxel.
+    """State of each voxel by the slices and their masks.
 
     Attributes:
-        brain: [I, J, K] seen, and called brain by a third of the slices.
-        core: [I, J, K] the same by one half.
+        brain: [I, J, K] seen, and brain by more than a third of the slices.
+        core: [I, J, K] seen, and brain by more than half of the slices.
         share: [I, J, K] from 0 to 1, how much of a voxel is brain by the masks; 0 where it is hardly seen. With a
-            single stack it is not known, and 1 in all that is seen.
+            single stack the share is not known; it is 1 in all voxels that are seen.
         unseen: [I, J, K] not seen.
-        thin: [I, J, K] hardly seen or not, between two slices as well.
+        thin: [I, J, K] hardly seen or unseen, gaps between slices included.
         rim_voxels: how far the volume is shown beyond the support, at most.
         possible_voxels: how far beyond the mask the support may reach where no slice looked.
     """
@@ -94,9 +94,9 @@ class Foreground:
         """How much of the volume is shown [I, J, K]: 1 in the brain, fading to 0 at its edge.
 
         Args:
-            support: [I, J, K] where the volume is fitted; what no slice saw is shown there in full.
-            mask: [I, J, K] the brain, holes that were filled included: shown in full.
-            brain_probability: see `mask`; taken for the share of brain where slices hardly looked.
+            support: [I, J, K] where the volume is fitted; where slices hardly looked, it is shown there in full.
+            mask: [I, J, K] the brain with its holes filled, shown in full.
+            brain_probability: see `mask`; a lower bound of the brain share where slices hardly looked.
         """
         low, high = EDGE
         share = self.share
@@ -109,7 +109,7 @@ class Foreground:
     def support(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
         """Where the volume is fitted and shown [I, J, K]: the mask with a margin of about a voxel.
 
-        Where slices hardly looked the margin is wider with a network: its image ends with the brain.
+        With a network the margin is wider where slices hardly looked: the network's image ends with the brain.
 
         Args:
             brain_probability: see `mask`.
@@ -123,12 +123,12 @@ class Foreground:
         return brain | (self.thin & binary_dilation(brain, iterations=THIN_MARGIN_VOXELS))
 
     def mask(self, brain_probability: NDArray[np.floating] | None = None) -> NDArray[np.bool_]:
-        """The brain mask [I, J, K]: what was seen, and of the unseen voxels those that are brain by their shape.
+        """The brain mask [I, J, K]: the seen brain, and the unseen voxels that are brain by shape.
 
-        The largest connected piece is taken, and its holes are filled.
+        Only the largest connected piece is kept, and its holes are filled.
 
         Args:
-            brain_probability: [I, J, K]; the convex hull of what was seen decides where there is none.
+            brain_probability: [I, J, K]; without it the convex hull of the seen brain decides.
         """
         return self._completed(self.core if self.core.any() else self.brain, brain_probability, LIKELY)
 
@@ -150,16 +150,16 @@ class Foreground:
 
 @dataclass(frozen=True)
 class Votes:
-    """What the masks of slices in place say of each voxel, before it is known how much of a voxel is brain.
+    """Votes of the masks of slices in place for each voxel, before the brain share is computed.
 
     Attributes:
         slices: K slices in place.
-        grid: of what follows.
+        grid: of the maps.
         weight: [K] slice weights.
         brain, core, unseen, thin: see `Foreground`.
         density: [I, J, K] of slices over each voxel (`coverage`).
         rough: [I, J, K] share of the slices over a voxel whose masks contain it.
-        distance_voxels: of slices.
+        distance_voxels: the largest slice spacing of the stacks.
     """
 
     slices: Slices
@@ -175,7 +175,7 @@ class Votes:
 
     @classmethod
     def of(cls, slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Votes:
-        """Count them; see `foreground`."""
+        """Count the votes; see `foreground`."""
         counts = np.ones(len(slices)) if weight is None else np.asarray(weight, dtype=np.float64)
         planes = slices.planes
         operator = VoxelOperator(planes, grid, slices.pixel_index, (1, 1, 5))
@@ -199,7 +199,7 @@ class Votes:
         return cls(slices, grid, counts, brain, core, ~seen, thin, density, rough, distance_voxels)
 
     def foreground(self) -> Foreground:
-        """With the share of brain, which takes longer than all else."""
+        """The foreground, with the brain share, which takes longer than all else."""
         voxel_mm = float(self.grid.spacing_mm.mean())
         share, rim_voxels = (~self.unseen).astype(np.float32), 1
         if self.slices.n_stacks > 1:
@@ -213,11 +213,11 @@ class Votes:
 
 
 def foreground(slices: Slices, grid: VolumeGrid, weight: NDArray[np.floating] | None = None) -> Foreground:
-    """What the slices in their places say of each voxel.
+    """The foreground of slices in their places.
 
-    How much of a voxel is brain is a volume whose slices are the masks, found by least squares. It starts from the
-    masked pixels, spread through their PSF, over the coverage of whole slices, both smoothed over half the slice
-    spacing, which closes gaps between neighbouring slices.
+    The brain share of voxels is the volume whose slices are the masks, found by least squares. The start is the masked
+    pixels, spread through their PSF, over the coverage of whole slices, both smoothed over half the slice spacing,
+    which closes gaps between neighbouring slices.
 
     Args:
         slices: K slices in place.
@@ -236,11 +236,11 @@ def _sharpened(
     """Minimise sum_p w_p (A f - m)_p^2 + r (smooth |grad f|)^2 for masks m and the mean coverage r of a voxel.
 
     Args:
-        rough: [I, J, K] where it begins.
+        rough: [I, J, K] the start.
         slices: K slices in place.
         grid: of the share.
         weight: [K] slice weights.
-        smooth_voxels: a length.
+        smooth_voxels: smoothing length.
     """
     planes = replace(slices.planes, psf_var_mm2=slices.planes.psf_var_mm2 * MASK_WIDTH**2)
     operator = VoxelOperator(planes, grid, psf_points=(1, 1, 3))  # hardly wider than a voxel
@@ -255,16 +255,16 @@ def _sharpened(
 
 
 def _hull(brain: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the voxels asked for [I, J, K] lie inside the convex hull of a mask; none where it is flat.
+    """The voxels [I, J, K] of `asked` inside the convex hull of a mask; none where the mask is flat.
 
-    Each line of voxels along the third axis crosses the hull once, between the nearest of its half-spaces on either
-    side: as exact as asking every voxel, and a hundred times faster.
+    Along a line of voxels on the third axis the hull lies between the nearest of its half-spaces on either side. This
+    is as exact as a test of every voxel, and a hundred times faster.
     """
     within = np.zeros_like(brain)
     within[:, :, 1:-1] = brain[:, :, :-2] & brain[:, :, 2:]
     surface = np.argwhere(brain & ~within)
     try:
-        faces = np.unique(np.round(ConvexHull(surface).equations, 9), axis=0)  # triangles in one plane
+        faces = np.unique(np.round(ConvexHull(surface).equations, 9), axis=0)  # triangles of one plane are one face
     except QhullError:
         return np.zeros(brain.shape, bool)
     i, j = np.indices(brain.shape[:2])

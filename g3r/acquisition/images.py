@@ -21,7 +21,7 @@ from g3r.run.atomic_file import atomic_path
 Space = Literal["scanner", "standard"]
 
 FORM_CODES: dict[Space, str] = {"scanner": "scanner", "standard": "aligned"}
-"""What a NIfTI header says of the space that its affine leads to; "aligned" is aligned to anything else."""
+"""NIfTI code of the space that an affine leads to; "aligned" means aligned to anything but the scanner."""
 
 MASK_SHIFT_TOLERANCE_VOXELS = 0.5
 """Masks are drawn on copies whose headers lost digits: corners may differ by this much."""
@@ -66,9 +66,9 @@ def load_volume(path: str | os.PathLike[str]) -> Volume:
 
 
 def names_of(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Names of files by which people can tell stacks apart: without folders, which may name patients.
+    """File names by which people can tell stacks apart: without folders, which may name patients.
 
-    Where a name is there several times, the number of the stack follows it, from 1 in the order given.
+    A name that occurs several times is followed by the number of the stack, from 1 in the order given.
 
     Args:
         paths: of all stacks of a run.
@@ -78,7 +78,7 @@ def names_of(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
 
 
 def load_mask(path: str | os.PathLike[str], reference: Volume) -> NDArray[np.bool_]:
-    """Read a mask [I, J, K] on the grid of an image; above one half (a probability, a label) is inside.
+    """Read a mask [I, J, K] on the grid of an image; values above one half (probabilities, labels) are inside.
 
     Raises:
         InputError: as `load_volume`, or a mask on another grid (other shape, or corners more than half a
@@ -106,8 +106,8 @@ def check_grid(found: Volume, expected: VolumeGrid, of: str, kind: str) -> None:
     """Raise `InputError` for an image on another grid: other shape, or corners more than half a voxel away.
 
     Args:
-        found: that was read.
-        expected: where it should be.
+        found: the image that was read.
+        expected: the grid that it should have.
         of: whose grid that is, in words: "that of stack.nii.gz".
         kind: of image, in one word.
     """
@@ -127,9 +127,9 @@ def check_grid(found: Volume, expected: VolumeGrid, of: str, kind: str) -> None:
 
 
 def _check_mask_values(mask: Volume) -> None:
-    """Raise `InputError` for an image: neither 0 and one value, nor a probability, nor labels."""
+    """Raise `InputError` for an image given as mask: neither 0 and one value, nor a probability, nor labels."""
     above = mask.data[mask.data > 1]
-    if not above.size or above.max() < 2 or (above == above[0]).all():  # a spline overshoots 1
+    if not above.size or above.max() < 2 or (above == above[0]).all():  # spline interpolation overshoots 1
         return
     whole = (above == np.rint(above)).all()
     if not whole or len(np.unique(above)) > MAX_LABELS:
@@ -146,14 +146,14 @@ def save_volume(
     header_text: HeaderText | None = None,
     space: Space = "scanner",
 ) -> None:
-    """Write a volume as NIfTI, whole or not at all: float32, or uint8 for masks; int16 stays.
+    """Write a volume as NIfTI, whole or not at all: float32, or uint8 for masks; uint8 and int16 stay.
 
     Args:
         path: of the file.
         data: [I, J, K].
         affine: [4, 4] RAS+ mm from index.
         header_text: free text for the header; none when None.
-        space: that the affine leads to; the scanner's, or the standard orientation of a result.
+        space: the space that the affine leads to: the scanner's, or the standard orientation of a result.
 
     Raises:
         InputError: the folder cannot be written.

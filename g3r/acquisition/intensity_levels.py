@@ -1,8 +1,8 @@
-"""Stacks whose intensities are on another scale than those of the others, brought to theirs.
+"""Stacks on another intensity scale, brought to the level of the others.
 
-Scanners choose a receiver gain for each stack, and programs rescale what they write. Gains of slices are searched for
-near 1, and a slice that is much darker than most counts less, because one that lost its signal is as dark. So a whole
-stack at a third of the others' level would be taken for one that does not fit them.
+Scanners choose a receiver gain for each stack, and programs rescale what they write. Slice gains are searched for near
+1, and a slice that is much darker than most is down-weighted, because a slice that lost its signal is as dark. So a
+stack at a third of the others' level would be taken for a misfit.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from g3r.acquisition.stacks import Stack
 
 LEVEL_RANGE = 1.25
-"""A level within this factor of that of the others is left as it is: gains of slices make up for it."""
+"""A level within this factor of the others' level is left unchanged; slice gains compensate for it."""
 
 
 def same_level(stacks: Sequence[Stack]) -> tuple[Stack, ...]:
-    """The stacks with the same typical intensity inside their masks, up to `LEVEL_RANGE`; the usual one is kept.
+    """The stacks, scaled to the usual typical intensity inside their masks.
 
-    Stacks that are within the range are returned as they are. `Stack.level` of the others says by what they were
-    multiplied.
+    Stacks within `LEVEL_RANGE` of the usual level are returned unchanged. `Stack.level` of the others is the factor
+    that was applied.
 
     Args:
         stacks: of one head.
@@ -49,7 +49,7 @@ def level_notes(stacks: Sequence[Stack]) -> list[str]:
 def gain_in_files(
     gain: NDArray[np.float64], stack_id: NDArray[np.int64], stacks: Sequence[Stack]
 ) -> NDArray[np.float64]:
-    """Gains [K] of slices as they belong to the intensities of the files.
+    """Gains [K] of slices relative to the intensities in their files.
 
     Args:
         gain: [K] of slices of stacks that were brought to one level.
@@ -60,7 +60,7 @@ def gain_in_files(
 
 
 def _typical(stack: Stack) -> float:
-    """Median of the positive values inside the mask: little depends on how much black or fluid is in it."""
+    """Median of the positive values inside the mask, which depends little on how much black or fluid is in it."""
     inside = stack.image[stack.mask]
     return float(np.median(inside[inside > 0]))
 

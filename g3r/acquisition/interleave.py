@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def acquisition_order(n_slices: int, interleave: int) -> NDArray[np.int64]:
-    """Slice numbers in the order of their acquisition: 1 is sequential, 2 every other one first, and so on.
+    """Slice numbers in the order of acquisition: interleave 1 is sequential, 2 takes every second one first, and so on.
 
     Raises:
         ValueError: an interleave below 1.

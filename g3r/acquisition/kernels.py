@@ -1,8 +1,8 @@
-"""The loops over pixels: where they are, and what they read from a volume or add to it, as vector instructions.
+"""Vectorised loops over pixels: they locate pixels in a volume, and read from it or add to it.
 
-Numba looks at every index for whether it is negative, and no loop with such a look or with a branch becomes vector
-code. So a first loop finds the cells and fractions of a run of pixels of one plane, without a branch, and a second one
-reads at unsigned numbers of voxels. The volume is flat; pixels outside it lie in a cell whose corners are all zero.
+Numba checks whether an index is negative, and no loop with such a check or with a branch is vectorised. So a first loop
+finds the cells and fractions of a run of pixels of one plane, without a branch, and a second one reads at unsigned
+voxel numbers. The volume is flat; pixels outside it lie in a cell whose corners are all zero.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import numba
 import numpy as np
 
 RUN = 512
-"""Pixels that are worked on at once, so that what is known of them stays in the nearest cache."""
+"""Pixels per run, few enough that their data stay in the nearest cache."""
 
 REORDERED = {"reassoc", "contract", "nsz"}
-"""Sums in any order and fused multiply-adds; not-a-number stays what it is."""
+"""Fast-math flags: sums in any order and fused multiply-adds; not-a-number is preserved."""
 
 
 @numba.njit(nogil=True, cache=True)
 def fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
-    """Write plane and in-plane position of pixels; they mostly come in order: the last plane is tried first.
+    """Write plane and in-plane position of pixels; the last plane is tried first, since pixels mostly come in order.
 
     Args:
-        number: [P] of the pixels among those of all planes.
+        number: [P] pixel numbers, counted over all planes.
         offset: [K + 1] first pixel of each plane, and the total.
         shape: [K, 2] pixels along x and y.
         spacing: [K, 2] (mm).
@@ -43,7 +43,7 @@ def fill_plane_and_uv(number, offset, shape, spacing, plane, uv):
 
 @numba.njit(nogil=True, cache=True, fastmath=REORDERED)
 def locate(u, v, matrix, origin, shape, outside, cell, fraction):
-    """Find the cell of each pixel and where in it the pixel lies.
+    """Find the cell of each pixel and its position in the cell.
 
     Args:
         u: [P] in-plane positions along x (mm).
@@ -51,9 +51,9 @@ def locate(u, v, matrix, origin, shape, outside, cell, fraction):
         matrix: [3, 3] index from plane.
         origin: [3] index of the plane's centre.
         shape: [3] of the volume, as reals.
-        outside: number of the cell of pixels outside.
+        outside: number of the cell for pixels outside.
         cell: [P] number of the lowest corner, written.
-        fraction: [3, P] from there, written.
+        fraction: [3, P] position in the cell from that corner, written.
     """
     real = u.dtype.type
     zero, one = real(0), real(1)
@@ -81,7 +81,7 @@ def locate(u, v, matrix, origin, shape, outside, cell, fraction):
 
 @numba.njit(nogil=True, cache=True)
 def end_of_run(plane, first, last):
-    """Number of the first pixel after `first` that is of another plane, or `last`."""
+    """End of the run that starts at `first`: at another plane, after `RUN` pixels, or at `last`."""
     end = first + 1
     while end < last and end < first + RUN and plane[end] == plane[first]:
         end += 1
@@ -98,7 +98,7 @@ def gather(flat, shape, plane, uv, matrix, origin, node_weight, pixels):
         plane: [P] of each pixel.
         uv: [2, P] in-plane positions (mm).
         matrix: [K, 3, 3] index from plane.
-        origin: [K, Q, 3] index of each node of the pixel in the middle of the plane.
+        origin: [K, Q, 3] index of each node of a pixel in the middle of the plane.
         node_weight: [Q].
         pixels: [P], changed.
     """
@@ -135,9 +135,9 @@ def scatter(pixels, shape, plane, uv, matrix, origin, node_weight, buffers):
         plane: [P] of each pixel.
         uv: [2, P] in-plane positions (mm).
         matrix: [K, 3, 3] index from plane.
-        origin: [K, Q, 3] index of each node of the pixel in the middle of the plane.
+        origin: [K, Q, 3] index of each node of a pixel in the middle of the plane.
         node_weight: [Q].
-        buffers: [B, voxels] one flat volume for each thread, changed; what lies outside goes to its first voxel.
+        buffers: [B, voxels] one flat volume for each thread, changed; pixels outside are added to its first voxel.
     """
     to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
     n_buffers, n = len(buffers), len(plane)
@@ -173,7 +173,7 @@ def scatter(pixels, shape, plane, uv, matrix, origin, node_weight, buffers):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def fill_world(plane, uv, rotation, center, position):
-    """Write where pixels lie in the world.
+    """Write the world positions of pixels.
 
     Args:
         plane: [P] of each pixel.

@@ -1,4 +1,4 @@
-"""The loops over voxels of the least-squares solvers."""
+"""Loops over voxels for the least-squares solvers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numba
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def join(buffers, volume):
-    """Write the sum of what threads have scattered, without its margin.
+    """Write the sum of the buffers that threads scattered into, without the margin.
 
     Args:
         buffers: [B, I + 2, J + 2, K + 2].
@@ -64,13 +64,13 @@ def fill_divergence(volume, weight, weighted, out):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def add_roughness(volume, strength, image, along):
-    """Add s D^T D V to what else a system makes of V, and multiply the sum with V.
+    """Add s D^T D V to the image of V under a linear system, and multiply the sum with V.
 
     Args:
         volume: [I, J, K].
         strength: s.
         image: [I, J, K], changed.
-        along: [I] float64, the sum over each plane of voxels, written: the same for any number of threads.
+        along: [I] float64, written: the product summed over each plane of voxels, so that threads do not change it.
     """
     n_x, n_y, n_z = volume.shape
     for x in numba.prange(n_x):
@@ -84,14 +84,14 @@ def add_roughness(volume, strength, image, along):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def descend(volume, residual, direction, image, step, square):
-    """Go one step of conjugate gradients.
+    """Take one step of conjugate gradients.
 
     Args:
         volume: [I, J, K], changed.
         residual: [I, J, K], changed.
         direction: [I, J, K].
-        image: [I, J, K] of the direction.
-        step: its length.
+        image: [I, J, K] of the direction, under the system.
+        step: length of the step.
         square: [I] float64, the residual's sum of squares over each plane of voxels, written.
     """
     n_x, n_y, n_z = volume.shape
@@ -108,12 +108,12 @@ def descend(volume, residual, direction, image, step, square):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def turn(direction, residual, share):
-    """Write the next direction: the residual, and a share of the last direction.
+    """Write the next conjugate-gradient direction: the residual plus a share of the last direction.
 
     Args:
         direction: [I, J, K], changed.
         residual: [I, J, K].
-        share: of the last one.
+        share: factor of the last direction.
     """
     n_x, n_y, n_z = direction.shape
     for x in numba.prange(n_x):

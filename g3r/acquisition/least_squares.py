@@ -14,7 +14,7 @@ SHARPENING_STEPS = 6
 SHARPENING_SMOOTHNESS = 0.1
 
 SHARP_CONVENTION = f"cg{SHARPENING_STEPS}-smoothness{SHARPENING_SMOOTHNESS:g}-v1"
-"""How V_sharp follows from V_coarse; a prior trained on another is refused. See `sharpened_volume`."""
+"""How V_sharp follows from V_coarse; a prior trained with another convention is refused. See `sharpened_volume`."""
 
 
 def sharpened_volume(
@@ -38,7 +38,7 @@ def sharpened_volume(
         weight: [P'] of each masked pixel, from 0 to 1.
 
     Returns:
-        V_sharp [I, J, K] float32; unlike V_coarse it may be negative, and goes a little beyond its support.
+        V_sharp [I, J, K] float32. Unlike V_coarse it may be negative, and it reaches a little beyond the support.
     """
     operator = VoxelOperator(slices.planes, grid, slices.pixel_index)
     value = slices.masked_value if gain is None else slices.masked_value / gain[slices.pixel_plane]
@@ -64,8 +64,8 @@ def solve_volume(
 ) -> NDArray[np.float32]:
     """Minimise sum_p weight_p (A V - value)_p^2 + s ||grad V||^2 over volumes V [I, J, K].
 
-    Conjugate gradients, of which few steps regularise by themselves. The smoothness is relative to the mean
-    coverage of a voxel, so it depends neither on the number of slices nor on the grid.
+    A few steps of conjugate gradients regularise by themselves. The smoothness is relative to the mean coverage of a
+    voxel, so it depends neither on the number of slices nor on the grid.
 
     Args:
         operator: voxel forward operator for the P' pixels.

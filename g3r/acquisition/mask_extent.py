@@ -1,7 +1,7 @@
-"""Whether a mask ends inside the brain, where the image itself shows how far the brain reaches.
+"""Detection of masks that end inside the brain, in images without surroundings.
 
-That is so in images without surroundings, such as those of a tool that has cut out the brain. Where skull and mother
-are shown, too, grey values do not tell brain from what lies beside it, and this says nothing.
+Such images, for example brain-extracted ones, show themselves how far the brain reaches. Where skull and mother are
+shown, too, grey values do not tell brain from what lies beside it, and nothing is detected.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 from g3r.acquisition.stacks import Stack
 
 LEFT_OUT_RANGE = (0.09, 0.4)
-"""Share of an image's content outside its mask at which brain is missing in the mask: a mask that fits leaves out 2 to
-4 %, one that is one pixel of 0.8 mm too small 6 to 8 %, four pixels 18 to 26 % (heads of 24 and 30 weeks of
-docs/stress.md). With more, the image shows something else, too."""
+"""Range of the share of an image's content outside its mask that means that the mask lacks brain. A mask that fits
+leaves out 2 to 4 %, a mask that is one pixel of 0.8 mm too small 6 to 8 %, four pixels 18 to 26 % (heads of 24 and 30
+weeks of docs/stress.md). Above the range the image shows something else, too."""
 
 RIM_MM = 6.0
-"""What a mask leaves out lies around it; whatever reaches further is something else."""
+"""Brain that a mask leaves out lies this close around it; content that reaches further is something else."""
 
 MAX_BEYOND = 0.1
-"""Share of what is left out that may lie further away: noise, edges of the image."""
+"""Largest share of the left-out content that may lie further away: noise, edges of the image."""
 
 BRIGHT_SHARE = 0.3
-"""Of the median in the mask; what is darker is noise, or nothing."""
+"""Share of the median in the mask above which a pixel is content; darker pixels are noise or background."""
 
 MOST_OF_PIXELS = 5
-"""Most pixels of a square of this side in the plane must be brighter: at an SNR of 7 one pixel of noise in ten is.
-That is a median, which leaves edges where they are: on five heads drawn for docs/stress.md, with an SNR of 11 to 27,
-shares change by 0.005 at most."""
+"""Side of an in-plane square (pixels) most of whose pixels must be bright: at an SNR of 7 one pixel of noise in ten is.
+That is a median filter, which leaves edges where they are: on five heads drawn for docs/stress.md, with an SNR of 11 to
+27, it changes shares by 0.005 at most."""
 
 
 def left_out_share(stack: Stack) -> float:
-    """Share of what a stack shows that its mask leaves out; 0 where that is little, or more than the brain is shown.
+    """Share of a stack's content outside its mask; 0 if that is little, or if the image shows more than the brain.
 
     Only slices with a mask count: others may have been left out on purpose.
     """

@@ -1,4 +1,4 @@
-"""Opening NIfTI files of unknown origin: a header is checked before memory is allocated for its claims."""
+"""Opening NIfTI files of unknown origin: a header is checked before memory is allocated for what it claims."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GZIP_RATIO = 1032
 """Largest expansion of deflate (zlib's documentation), which bounds what a compressed file can hold."""
 
 BLOCK_BYTES, MAX_BLOCKS_BEYOND = 2**20, 64
-"""Bytes after the voxels of a compressed file are read in blocks of this size, up to this many."""
+"""What follows the voxels of a compressed file is read in blocks of this size, up to this many."""
 
 NIFTI_ENDINGS = (".nii", ".hdr", ".img")
 """File endings, alone or before .gz; .hdr and .img are the two files of a pair."""
@@ -38,7 +38,7 @@ LENGTH_UNITS = {1: "metres", 3: "micrometres"}
 """Codes of a header's xyzt_units that are not millimetres (2) and not unknown (0)."""
 
 HEADERS_AGREE_VOXELS = 0.5
-"""Largest difference of the corners by sform and by qform that is not reported."""
+"""Largest distance (voxels) between the corners by sform and by qform that is not reported."""
 
 NO_SIZE = "setting 0 dims to 1"
 """nibabel's message for a pixdim of zero, where only an sform gives the voxel size."""
@@ -115,7 +115,7 @@ def voxels(image: NiftiImage, shape: tuple[int, int, int], name: str) -> NDArray
         InputError: a file that is cut off or damaged.
     """
     try:
-        with np.errstate(all="ignore"), _remarks():  # what overflows is infinite, and who uses it decides
+        with np.errstate(all="ignore"), _remarks():  # overflow becomes infinite, and the caller decides
             return _read(image).reshape(shape)
     except InputError:
         raise

@@ -70,7 +70,7 @@ class Planes:
 
     @property
     def pose(self) -> RigidPose:
-        """World from the planes' own frames."""
+        """Poses of the planes (world from plane)."""
         return RigidPose(self.rotation, self.center_mm)
 
     def plane_id(self) -> NDArray[np.int64]:
@@ -115,13 +115,13 @@ class Planes:
 
 @dataclass(frozen=True, kw_only=True)
 class FieldsOfView:
-    """What whole slices cover, of which `Slices` keep only the part around the mask.
+    """Extent of whole slices, of which `Slices` keep only the part around the mask.
 
     Args:
         extent_mm: [K, 2, 2] lowest and highest in-plane position along x and y, in the frame of the cropped plane.
         spacing_mm: [K] distance to the next slice of the stack along the normal, positive where numbers rise with it.
-        n_beyond: [K, 2] slices with signal before the first and after the last masked one of a stack, which were
-            looked at and hold no brain; zero for all other slices.
+        n_beyond: [K, 2] number of slices with signal before the first and after the last masked one of a stack, which
+            were acquired and hold no brain; zero for all other slices.
     """
 
     extent_mm: NDArray[np.float64]
@@ -130,19 +130,19 @@ class FieldsOfView:
 
     @classmethod
     def of_planes(cls, planes: Planes) -> FieldsOfView:
-        """The planes themselves, and nothing beyond them."""
+        """Fields of view that end with the planes, and no slices beyond them."""
         half = planes.shape * planes.spacing_mm / 2
         n = len(planes)
         return cls(extent_mm=np.stack([-half, half], axis=-1), spacing_mm=np.ones(n), n_beyond=np.zeros((n, 2), int))
 
     def take(self, index: Selection) -> FieldsOfView:
-        """Those of some of the slices."""
+        """The fields of view at an index array, a mask or a slice."""
         return FieldsOfView(**{field: getattr(self, field)[index] for field in self.__dataclass_fields__})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slices:
-    """The acquired slices of all stacks: planes with their pixels, permuted and taken as one record.
+    """The acquired slices of all stacks as one record: planes with their pixels.
 
     Args:
         planes: [K] planes, cropped to the mask.
@@ -152,7 +152,7 @@ class Slices:
         slice_index: [K] number of the slice in its stack.
         thickness_mm: [K].
         header_pose: [K] poses by the file's header.
-        view: what the whole slices cover; None where no more is known than the planes.
+        view: fields of view of the whole slices; None where only the planes are known.
     """
 
     planes: Planes
@@ -183,7 +183,7 @@ class Slices:
 
     @property
     def fields_of_view(self) -> FieldsOfView:
-        """What the whole slices cover."""
+        """The fields of view of the whole slices."""
         return FieldsOfView.of_planes(self.planes) if self.view is None else self.view
 
     @cached_property
@@ -231,7 +231,7 @@ class Slices:
         return replace(self, value=(self.value * np.float32(factor)).astype(np.float32))
 
     def world_from_header(self) -> RigidPose:
-        """Motion of each slice: takes a point by the file's header to where it is now estimated to be."""
+        """Motion of each slice: maps a point at its header position to its present one."""
         return self.planes.pose @ self.header_pose.inverse()
 
 

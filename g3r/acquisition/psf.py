@@ -1,4 +1,4 @@
-"""The slice profile: a Gaussian in the frame of the slice, written once."""
+"""The PSF of a slice (its slice profile): a Gaussian in the frame of the slice."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def psf_variance_mm2(
 def phase_fwhm_pixels(phase_resolution: float) -> float:
     """In-plane FWHM in pixels along the phase-encoding axis: 1.2 / p.
 
-    With pixels of d mm, k-space is filled up to p / (2 d) along this axis and zero beyond. So a point becomes
+    With pixels of d mm, k-space is filled up to p / (2 d) along this axis and zero beyond. So the image of a point is
     sin(pi p x / d) / (pi p x / d). Its main lobe is half as high at x = 0.603 d / p: its FWHM is 1.207 d / p. For
-    p = 1 these are the nominal 1.2 pixels, and the Gaussian of the same FWHM grows with 1 / p as the lobe does.
+    p = 1 these are the nominal 1.2 pixels, and the Gaussian's FWHM grows with 1 / p as that of the lobe does.
 
     Args:
         phase_resolution: p, the share of k-space that was filled, above 0 and up to 1.

@@ -9,20 +9,22 @@ SIGMA_PER_MAD = 1.4826
 """Standard deviation of normal residuals in units of their median absolute value."""
 
 MAX_DROPPED_SHARE, DROPPED_WEIGHT = 0.2, 0.1
-"""At most this share of the slices may weigh less than `DROPPED_WEIGHT`; where more fit badly, poses are at fault. Of a
-single stack none: nothing else saw what such a slice shows, so a volume without it fits it worse and worse. Ends of a
-stack, where little is seen, were lost so. A slice with a tenth of the weight decides where no other contradicts it."""
+"""At most this share of the slices may weigh less than `DROPPED_WEIGHT`; where more fit badly, poses are at fault. In a
+single stack no slice may: no other slice shows the same place, so a volume without it fits it worse and worse. This
+used to lose the ends of stacks, where slices hold few pixels. A slice with a tenth of the weight still decides where no
+other slice contradicts it."""
 
 DARK = 0.5
-"""Share of the usual gain below which a slice weighs less, by the square of it: its noise over its signal. A slice that
-lost its signal is explained by a gain near zero whatever the volume, so its residual does not give it away."""
+"""Share of the median gain below which a slice weighs less, by the square of gain over this limit, as its noise grows
+relative to its signal. A gain near zero explains a slice without signal whatever the volume, so the residual cannot
+detect it."""
 
 MIN_WEIGHT = 1e-3
-"""Of a slice: never zero."""
+"""Smallest weight of a slice, so that no weight is zero."""
 
 
 def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: float = 1e-6) -> float:
-    """A number of robust standard deviations (1.4826 MAD) of residuals with median zero, plus a floor.
+    """A multiple of the robust standard deviation (1.4826 MAD) of residuals with median zero, plus a floor.
 
     Args:
         residual: of any shape.
@@ -35,14 +37,14 @@ def robust_width(residual: NDArray[np.floating], n_sigma: float = 1.0, floor: fl
 def slice_weights(loss: NDArray[np.float64], gain: NDArray[np.float64], n_stacks: int) -> NDArray[np.float64]:
     """Weight of each slice [K], lower where its mean robust loss is unusually large, or where it is dark.
 
-    1 up to the median plus twice the robust spread, then the Geman-McClure form; never zero, and for its loss below
-    `DROPPED_WEIGHT` for at most `MAX_DROPPED_SHARE` of the slices, for none of a single stack. For dark slices see
-    `DARK`.
+    1 up to the median plus twice the robust spread, then the Geman-McClure form. A large loss takes at most
+    `MAX_DROPPED_SHARE` of the slices below `DROPPED_WEIGHT`, and none of a single stack. Dark slices weigh less still
+    (`DARK`). No weight is below `MIN_WEIGHT`.
 
     Args:
         loss: [K] of the slices.
         gain: [K] their intensity factors.
-        n_stacks: that they belong to.
+        n_stacks: number of stacks that they belong to.
     """
     median = np.median(loss)
     spread = robust_width(loss - median, floor=0.0) + 0.05 * median + 1e-12

@@ -1,7 +1,7 @@
-"""The JSON file beside an image, as dcm2niix and BIDS write it: what the scanner says about the slices.
+"""Sidecars: the JSON file beside an image, as dcm2niix and BIDS write it, with the slice geometry of the scanner.
 
-Only a few keys are read. One of them that makes no sense is refused: it would decide the PSF. All other keys are
-ignored; they may name the patient, and nothing of them is kept.
+Only a few keys are read. If the value of one makes no sense, the file is refused, since it would decide the PSF. All
+other keys are ignored; they may name the patient, and nothing of them is kept.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from g3r.errors import InputError
 MAX_SIDECAR_BYTES = 10_000_000
 
 SPACING_RANGE_MM = (0.01, 100.0)
-"""Wider than a stack may be: the distance of slices is compared with the image's header anyway."""
+"""Allowed slice spacing, wider than for a stack: the spacing is compared with the image's header anyway."""
 
 PHASE_RESOLUTION_RANGE = (0.1, 1.0)
-"""A tenth of k-space would be a PSF of 12 pixels; a percentage is above."""
+"""Allowed phase resolution. A tenth of k-space would be a PSF of 12 pixels; a percentage is above the range."""
 
 DIRECTION_KEYS = ("PhaseEncodingDirection", "PhaseEncodingAxis")
-"""Phase-encoding axis in the image file: i, j or k, perhaps with a sign (-) or its lack (?); the first one counts."""
+"""Keys of the phase-encoding axis of the image file: i, j or k, with a sign (-), an unknown sign (?) or none. The first
+key that is present counts."""
 
 DICOM_KEY = "InPlanePhaseEncodingDirectionDICOM"
 
 READ_KEYS = ("SliceThickness", "SpacingBetweenSlices", "PhaseResolution", *DIRECTION_KEYS, DICOM_KEY)
-"""All that is read."""
+"""All keys that are read."""
 
 Axis = Literal["i", "j", "k"]
 
 AXES: tuple[Axis, ...] = ("i", "j", "k")
-"""Of an image file, in order."""
+"""The axes of an image file, in order."""
 
 AXIS_OF_DICOM: dict[str, Axis] = {"ROW": "i", "COL": "j", "COLUMN": "j"}
-"""Along a row of the DICOM image (its columns count up) is the first axis of dcm2niix' file, which may flip the second
-axis but does not exchange them for a stack of slices."""
+"""Axis of dcm2niix' file for each word of DICOM. The direction along a row of the DICOM image (columns count up) is the
+first axis. dcm2niix may flip the second axis but does not exchange the two for a stack of slices."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sidecar:
-    """What a sidecar says; None where it says nothing.
+    """Contents of a sidecar; None for what it lacks.
 
     Attributes:
         name: of the file.
@@ -54,7 +55,8 @@ class Sidecar:
         spacing_mm: `SpacingBetweenSlices`, from centre to centre.
         phase_resolution: `PhaseResolution`, the share of k-space that was filled along the phase-encoding axis.
         phase_axis: of the image file.
-        dicom_phase_axis: the same, of a file whose slices are along the third axis, as the DICOM images were.
+        dicom_phase_axis: the same from `DICOM_KEY`, for a file whose slices are along the third axis, as dcm2niix
+            writes it.
     """
 
     name: str
@@ -65,10 +67,10 @@ class Sidecar:
     dicom_phase_axis: Axis | None = None
 
     def phase_axis_of(self, slice_axis: int) -> Axis | None:
-        """The phase-encoding axis of a file whose slices are along an axis (0 to 2).
+        """The phase-encoding axis of a file whose slices are along `slice_axis` (0 to 2).
 
-        `PhaseEncodingDirection` is about the file's axes. The word of DICOM is about the scanner's images: it says
-        nothing where the file is not as dcm2niix wrote it.
+        `PhaseEncodingDirection` refers to the file's axes. DICOM's word refers to the scanner's images, so it is used
+        only if the file has its axes as dcm2niix wrote them.
         """
         if self.phase_axis is not None:
             return self.phase_axis
@@ -157,7 +159,7 @@ def _number(found: dict[str, Any], key: str, allowed: tuple[float, float], unit:
         name: of the file, for messages.
 
     Raises:
-        InputError: something else, or outside.
+        InputError: not a number, or out of range.
     """
     value = found.get(key)
     if value is None:
@@ -193,7 +195,7 @@ def _phase_axis(found: dict[str, Any], name: str) -> Axis | None:
 
 
 def _dicom_phase_axis(found: dict[str, Any], name: str) -> Axis | None:
-    """The axis in a file as dcm2niix writes it.
+    """The axis that `DICOM_KEY` names, in a file as dcm2niix writes it.
 
     Raises:
         InputError: neither ROW nor COL.

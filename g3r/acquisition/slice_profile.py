@@ -1,4 +1,4 @@
-"""What the PSF of a stack is made of, and who says so: an option, the sidecar, or the header's spacing."""
+"""Thickness and PSF of a stack, and their source: an option, the sidecar, or the header's spacing."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from g3r.errors import InputError
 logger = logging.getLogger(__name__)
 
 LENGTHS_AGREE = 0.02
-"""Largest relative difference of two lengths that mean the same: sidecars round to a hundredth of a mm or so."""
+"""Largest relative difference of two lengths that count as equal: sidecars round to a hundredth of a mm or so."""
 
 NOMINAL_FWHM_PIXELS = (IN_PLANE_FWHM_PIXELS, IN_PLANE_FWHM_PIXELS)
 
 ThicknessSource = Literal["option", "sidecar", "header", "spacing"]
-"""Who gave the thickness: the user, the scanner, the headers of single slices, or nobody, so that it is the distance of
-slices."""
+"""Source of the thickness: the user, the scanner, the headers of single slices, or, if unknown, assumed equal to the
+slice spacing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileOrigin:
-    """Where the PSF of a stack comes from.
+    """Source of the PSF of a stack.
 
     Attributes:
-        thickness_from: who gave the thickness.
+        thickness_from: source of the thickness.
         phase_resolution: share of k-space that was filled along the phase-encoding axis; None: not known.
         phase_axis: the phase-encoding axis of the image file; None: not known.
     """
@@ -43,17 +43,17 @@ class ProfileOrigin:
 
 
 NOT_SAID = ProfileOrigin()
-"""Of a stack that was made with its thickness, and of which no scanner says anything."""
+"""Origin for a stack that is made with its thickness, without anything from a scanner."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceProfile:
-    """What the PSF of a stack follows from.
+    """Thickness and in-plane FWHM, which determine the PSF of a stack.
 
     Attributes:
         thickness_mm: of a slice.
         in_plane_fwhm_pixels: along the two axes of the slices' images.
-        origin: who says so.
+        origin: their source.
     """
 
     thickness_mm: float
@@ -61,7 +61,7 @@ class SliceProfile:
     origin: ProfileOrigin = NOT_SAID
 
     def line(self) -> str:
-        """For the terminal."""
+        """One line for the terminal."""
         text = f"thickness {self.thickness_mm:.4g} mm ({self.origin.thickness_from})"
         p, axis = self.origin.phase_resolution, self.origin.phase_axis
         if self.in_plane_fwhm_pixels != NOMINAL_FWHM_PIXELS:
@@ -84,11 +84,11 @@ def find_slice_profile(
         path: of the image; its sidecar is beside it.
         spacing_mm: [3] along the axes of the file.
         slice_axis: the axis of the file, 0 to 2, along which slices are counted.
-        thickness_mm: as the user gives it. It wins over everything else.
-        earlier: of the run that is to be repeated, in place of the sidecar's.
+        thickness_mm: the user's; it wins over everything else.
+        earlier: profile of the run that is repeated, in place of the sidecar's.
 
     Raises:
-        InputError: a sidecar that cannot be used, or that is about other slices than the image's.
+        InputError: a sidecar that cannot be used, or one with another slice spacing than the image's.
     """
     name = Path(path).name
     if earlier is None:
@@ -126,10 +126,10 @@ def _check_distance(sidecar: Sidecar, distance_mm: float, name: str) -> None:
 def _thickness(
     sidecar: Sidecar | None, distance_mm: float, given_mm: float | None, name: str
 ) -> tuple[float, ThicknessSource]:
-    """Thickness and who gave it.
+    """Thickness and its source.
 
     Args:
-        sidecar: None without.
+        sidecar: None if there is none.
         distance_mm: between slices by the header.
         given_mm: by the user.
         name: of the image, for messages.
@@ -154,14 +154,14 @@ def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | No
     Args:
         thickness_mm: of a slice.
         source: of the thickness.
-        sidecar: None without.
+        sidecar: None if there is none.
         slice_axis: of the file.
     """
     if sidecar is None:
         return SliceProfile(thickness_mm=thickness_mm, origin=ProfileOrigin(thickness_from=source))
     axis = sidecar.phase_axis_of(slice_axis)
     if axis is not None and AXES.index(axis) == slice_axis:
-        # slices that are excited one by one are encoded in their plane: the file is not as it was, or axes were changed
+        # slices that are excited one by one are encoded in their plane: the file or its axes were changed
         if sidecar.phase_resolution is not None:
             logger.warning("%s: phase encoding along %s, which counts the slices; it is not used", sidecar.name, axis)
         axis = None
@@ -177,5 +177,5 @@ def _profile(thickness_mm: float, source: ThicknessSource, sidecar: Sidecar | No
 
 
 def _agree(one_mm: float, other_mm: float) -> bool:
-    """Whether two lengths are the same; what is no length (a thickness of 0) agrees with nothing."""
+    """Whether two lengths are the same; an invalid length (a thickness of 0) agrees with nothing."""
     return abs(one_mm - other_mm) <= LENGTHS_AGREE * abs(other_mm)

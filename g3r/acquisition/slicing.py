@@ -1,4 +1,4 @@
-"""From stacks to slices: cut to the masks and normalised; slice spacing by the headers."""
+"""Cutting stacks into slices, cropped to the masks and normalised; slice spacing by the headers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from g3r.geometry import RigidPose
 from g3r.geometry.grid import bounding_box
 
 MIN_SLICE_PIXELS = 12
-"""Slices with fewer masked pixels carry no pose and little image; they are skipped and named in run.json. So are those
-without a positive masked pixel: they were not acquired, or were blanked, and saw nothing."""
+"""Fewest masked pixels of a slice. Slices with fewer determine no pose and show little; they are skipped and named in
+run.json. Slices without a positive masked pixel are skipped, too: they were not acquired, or were blanked."""
 
 
 def slices_from_stacks(stacks: Sequence[Stack]) -> Slices:
@@ -89,7 +89,7 @@ def _blank(stack: Stack) -> NDArray[np.bool_]:
 
 
 def _slices_beyond(stack: Stack, used: NDArray[np.int64]) -> tuple[int, int]:
-    """How many slices with signal follow each other beyond the first and the last used one, outwards."""
+    """Number of consecutive slices with signal before the first and after the last used one."""
     if not len(used):
         return 0, 0
     # a slice of one value was not acquired, or was blanked
@@ -116,7 +116,7 @@ def normalised_slices(stacks: Sequence[Stack]) -> tuple[Slices, float]:
 
 
 def by_headers(slices: Slices, stacks: Sequence[Stack]) -> Slices:
-    """The slices with the header poses of their files, to the last digit, which the stacks have rounded.
+    """The slices at the header poses of their files, to the last digit; the poses of stacks are rounded (`settled`).
 
     Args:
         slices: of the stacks.
@@ -136,7 +136,7 @@ def slice_spacing_mm(stack: Slices) -> float:
 
 
 def skipped_slice_notes(stacks: Sequence[Stack], slices: Slices) -> list[str]:
-    """A line for each stack some of whose slices are not used, for want of masked pixels or of an image.
+    """A line for each stack with skipped slices, which have too few masked pixels or no image.
 
     Args:
         stacks: as they were given.

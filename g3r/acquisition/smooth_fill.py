@@ -1,4 +1,4 @@
-"""A smooth continuation of a volume into what was not measured: what is known without any other brain."""
+"""Smooth continuation of a volume into what was not measured, without knowledge of other brains."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 SIGMA_VOXELS = 1.5
 LEAST_WEIGHT = 0.05
-"""Share of measured surroundings from which a mean is taken; with less, the next wider surroundings are asked."""
+"""Mean weight of the surroundings from which their mean is taken in full; below it, coarser grids fill in the rest."""
 
 SMALLEST = 4
 """Voxels along the longest edge of the coarsest grid."""
@@ -17,16 +17,16 @@ SMALLEST = 4
 def smooth_fill(
     values: NDArray[np.float32], weight: NDArray[np.float32], share: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Where the weight is low, the weighted mean of the nearest surroundings that were measured.
+    """The values where they were measured, elsewhere the weighted mean of the nearest measured surroundings.
 
-    Normalised convolution (Knutsson & Westin 1993) on grids of doubling voxels: the finest that finds measured voxels
-    is taken.
+    Normalised convolution (Knutsson & Westin 1993) on grids of doubling voxels: the finest grid on which measured
+    voxels are near is taken.
 
     Args:
         values: [I, J, K].
         weight: [I, J, K] from 0 (unknown) to 1 (measured).
-        share: [I, J, K] of each voxel in the means of its surroundings, 0 to 1: that of brain, so that what lies
-            outside of the head does not darken it; None takes all of it.
+        share: [I, J, K] weight of each voxel in the means of its surroundings, 0 to 1: its share of brain, so that
+            voxels outside the head do not darken it; 1 when None.
 
     Returns:
         [I, J, K]: `weight * values + (1 - weight) * surroundings`, zero where nothing is near.
@@ -52,13 +52,13 @@ def _surroundings(source: NDArray[np.float32], weighted: NDArray[np.float32]) ->
 
 
 def _halved(array: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means of two by two by two voxels; nothing lies beyond the last one."""
+    """Means of two by two by two voxels, with zeros beyond an odd end."""
     even = np.pad(array, [(0, n % 2) for n in array.shape])
     blocks = even.reshape([length for n in even.shape for length in (n // 2, 2)])
     return blocks.mean(axis=(1, 3, 5), dtype=np.float32)
 
 
 def _doubled(array: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The same on voxels of half the size, cut to a shape."""
+    """The array on voxels of half the size, cropped to a shape."""
     fine = zoom(array, 2, order=1, mode="nearest", grid_mode=True)
     return fine[tuple(slice(n) for n in shape)]

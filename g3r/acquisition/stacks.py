@@ -32,10 +32,10 @@ INTENSITY_RANGE = (1e-30, 1e30)
 """Allowed range of the largest value inside a mask, so that float32 can be divided by it."""
 
 MIN_POSITIVE_SHARE = 0.01
-"""Share of the masked values; intensities are normalised by their 99th percentile."""
+"""Smallest share of masked values that must be positive: intensities are normalised by their 99th percentile."""
 
 MaskOfStack = str | os.PathLike[str] | FoundMask | Callable[[Volume], FoundMask]
-"""The mask of a stack: its file, one that was found, or what finds it."""
+"""The mask of a stack: its file, a mask that was found, or a function that finds it."""
 
 FARTHEST_MM = 500.0
 """Largest distance between the heads of two stacks by their headers; scans of one session share a frame."""
@@ -54,10 +54,10 @@ class Stack:
         in_plane_fwhm_pixels: of the PSF along the first and the second axis of the image.
         origin: where the PSF comes from, for the record.
         axes: how the file's arrays became these.
-        file_affine: [4, 4] of the file, of which `affine` is the settled one; None where there is no file.
-        mask_source, mask_detail: who made the mask, and with what.
+        file_affine: [4, 4] of the file, before it was rounded to `affine` (`settled`); None where there is no file.
+        mask_source, mask_detail: see `FoundMask`.
         level: what the intensities of the file were multiplied by (`acquisition.intensity_levels`).
-        remarks: what is doubtful in its files, for the verdict.
+        remarks: doubts about its files, for the verdict.
 
     Raises:
         InputError: a shape that does not fit, fewer than two slices, sheared axes, an empty mask, values
@@ -182,22 +182,22 @@ def load_stack(
 ) -> Stack:
     """Read a stack and its mask, and its JSON sidecar where there is one.
 
-    The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third; image, mask
-    and affine are turned together so that it becomes the last and rows have one order (`FileAxes`). A slice keeps
-    its number. The affine is rounded to micrometres (`settled`).
+    The slice axis is the one whose spacing is clearly (a tenth) above the others, else the third. Image, mask and
+    affine are turned together so that it becomes the last axis and rows have one order (`FileAxes`). Slices keep their
+    numbers. The affine is rounded; no point within 120 mm of the middle moves by more than 0.02 mm (`settled`).
 
     Args:
         path: of the NIfTI image.
-        mask: of the brain: a file, one that was found, or what finds it, such as `whole_image`; without one the image
-            must show nothing but brain.
+        mask: of the brain: a file, a mask that was found, or a function that finds it, such as `whole_image`; without
+            one the image must show nothing but brain.
         thickness_mm: of the slices; without one that of the sidecar is taken, or else the slice spacing, with a
             warning, because a header does not show gaps.
-        profile: of a run that is to be repeated, in place of the sidecar's.
+        profile: of a run that is repeated, in place of the sidecar's.
         name: by which people know it; the file's when None.
 
     Raises:
         InputError: what `load_volume`, `load_mask`, `required_mask`, `read_sidecar` and `Stack` refuse, or a sidecar
-            that is about slices at another distance.
+            with another slice spacing than the image's.
     """
     volume = load_volume(path)
     volume = replace(volume, name=name or volume.name)
@@ -279,7 +279,7 @@ def _check_pair(stack: Stack, other: Stack, path: Path, other_path: Path) -> Non
     """Raise `InputError` for one image given twice, which would count twice, and for heads too far apart."""
     if path.resolve() == other_path.resolve():
         raise InputError(f"{stack.name}: is given twice; pass each stack once")
-    # as in the files: another header turns the rows
+    # compared with the axes of the files: with another header, the rows of a copy are turned
     if np.array_equal(stack.axes.to_file(stack.image), other.axes.to_file(other.image)):
         raise InputError(
             f"{stack.name}: holds the same image as {other.name}; pass each stack once, and copies not at all"

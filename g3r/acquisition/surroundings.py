@@ -1,8 +1,8 @@
-"""What lies just outside the brain, and its part in the pixels of the rim.
+"""Correction of rim pixels for what lies beside the brain.
 
-A pixel at the edge of the mask averages over its slice profile: partly brain, partly what lies beside it, which is
-black where the stacks were cut out, fluid and skull where they were not. The volume ends with the brain. If such a
-pixel is fitted as if it had seen brain alone, the rim takes the blame: too dark beside black, too bright beside fluid.
+A pixel at the edge of the mask averages over its slice profile, partly over brain and partly over what lies beside it:
+black where the stacks are brain-extracted, else fluid and skull. The volume ends with the brain. If such a pixel were
+fitted as if it had seen brain alone, the rim would become too dark next to black and too bright next to fluid.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from g3r.acquisition.voxel_operator import VoxelOperator
 from g3r.geometry import VolumeGrid
 
 LEAST_SHARE = 0.3
-"""Share of brain in a pixel that is at least assumed: below, noise is blown up for little."""
+"""Lower bound of the share of brain in a pixel: a smaller share would amplify noise for little gain."""
 
 OUTSIDE_SHARE = 0.5
-"""Unmasked pixels with less brain than this tell what is outside."""
+"""Unmasked pixels with a smaller share of brain than this determine the intensities outside."""
 
 KNOWN_SHARE = 0.05
-"""Voxels outside with less than this share of the usual sampling are unknown, and correct nothing."""
+"""Voxels outside that are sampled less than this share of the median are unknown, and correct nothing."""
 
 REACH_SIGMA = 2.5
-"""Pixels this far inside the brain, in sigmas of their profile, see brain alone."""
+"""Pixels this far inside the brain, in sigmas of their PSF, see brain alone."""
 
 NODES = (3, 3, 5)
 
@@ -35,11 +35,11 @@ NODES = (3, 3, 5)
 def without_surroundings(
     slices: Slices, brain: NDArray[np.bool_], grid: VolumeGrid, gain: NDArray[np.floating], weight: NDArray[np.floating]
 ) -> tuple[Slices, NDArray[np.float32]]:
-    """The slices as if nothing but brain lay beneath their masked pixels.
+    """The slices corrected as if nothing but brain lay beneath their masked pixels.
 
     y = s V + (1 - s) V_outside for a pixel with the share s of its profile in the brain, where V and V_outside are
-    means over the two parts; V_outside is what unmasked pixels saw there. The pixel becomes (y - (1 - s) V_outside) / s
-    and counts with the weight s, so that its noise counts as before.
+    means over the two parts; V_outside comes from unmasked pixels. The pixel becomes (y - (1 - s) V_outside) / s and
+    has the weight s, so that its noise counts as before.
 
     Args:
         slices: K slices in place, with the unmasked pixels of their boxes.
@@ -78,7 +78,7 @@ def _outside(
     gain: NDArray[np.floating],
     weight: NDArray[np.floating],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What unmasked pixels saw beside the brain [I, J, K], and where they saw anything."""
+    """Mean of unmasked pixels beside the brain [I, J, K], and where it is known."""
     none = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, bool)
     index = np.flatnonzero(~slices.mask)
     if not len(index):

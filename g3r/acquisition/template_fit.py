@@ -1,8 +1,8 @@
-"""An atlas template fitted to what slices saw of a head: what to expect where no slice looked.
+"""An atlas template fitted to the seen part of a head: the anatomy to expect where no slice looked.
 
 An affine map and a coarse smooth deformation (a cubic B-spline lattice, Rueckert et al. 1999) bring the template to
-the seen voxels; where nothing was seen the deformation's smoothness carries it on. The template's intensities are
-mapped by a polynomial without constant term, so that the background stays zero.
+the seen voxels; where nothing was seen, the deformation continues smoothly. The template's intensities are mapped by a
+polynomial without constant term, so that the background stays zero.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WORKING_VOXEL_MM = 3.0
 """Voxels in which template and head are compared."""
 
 BLUR_VOXELS = 0.4
-"""Of the working voxels: standard deviation of the blur of both before they are compared."""
+"""Standard deviation, in working voxels, of the blur of both before they are compared."""
 
 LATTICE_MM = 13.0
 """Distance of the control points of the deformation."""
@@ -80,7 +80,7 @@ def fit_template(
         n_steps: of the affine map alone, and of affine map and deformation.
     """
     n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # threads of small steps wait for each other longer than they work
+    torch.set_num_threads(1)  # steps are so small that more threads wait for each other longer than they work
     try:
         with torch.inference_mode(False), torch.enable_grad():
             return _fitted(template, template_grid, head * share, share, seen, grid, n_steps)
@@ -98,7 +98,7 @@ def _fitted(
     n_steps: tuple[int, int],
 ) -> TemplateFit:
     working = grid.respaced(WORKING_VOXEL_MM)
-    # means over what was seen alone: zeros of unseen voxels are no evidence
+    # means over seen voxels alone: the zeros of unseen ones are no evidence
     weight = _reduced(seen, grid, working)
     observed, outline = (_reduced(one * seen, grid, working) / weight.clamp_min(1e-3) for one in (head, share))
     weight = weight.clamp(0, 1)
@@ -136,7 +136,7 @@ class _Adam:
         self.mean, self.square = torch.zeros_like(leaf), torch.zeros_like(leaf)
 
     def step(self, size: float) -> None:
-        """Move against the gradient, which is taken away."""
+        """Move against the gradient, and clear it."""
         gradient = self.leaf.grad
         assert gradient is not None
         self.leaf.grad = None
@@ -208,7 +208,7 @@ class _Deformation:
 
 def _cubic_basis(position: NDArray[np.float64], n_spans: int) -> NDArray[np.float64]:
     """Values [n, n_spans + 3] of the uniform cubic B-splines at positions in units of their distance."""
-    from scipy.interpolate import BSpline  # it takes a tenth of a second, and a preview fits no template
+    from scipy.interpolate import BSpline  # the import takes a tenth of a second, and a preview fits no template
 
     knots = np.arange(-3, n_spans + 4, dtype=np.float64)
     inside = np.clip(position, 0, n_spans * (1 - 1e-12))

@@ -19,7 +19,7 @@ def diffusivity(volume: Array, tip: float) -> Array:
 
     Args:
         volume: [I, J, K].
-        tip: length of the gradient, from voxel to voxel, below which total variation is round.
+        tip: length of the gradient, from voxel to voxel, below which total variation is rounded off.
     """
     squares = np.zeros_like(volume)
     for axis in range(3):

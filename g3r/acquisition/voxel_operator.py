@@ -1,6 +1,6 @@
 """The voxel forward operator, a slice pixel as a PSF-weighted mean of a volume (G3R Eq. 2), and its exact adjoint.
 
-Both directions take the same trilinear weights (`acquisition.kernels`), one gathers and one scatters, so that
+Both directions use the same trilinear weights (`acquisition.kernels`): one gathers, the other scatters, so that
 <A x, y> = <x, A^T y> holds to rounding.
 """
 
@@ -64,7 +64,7 @@ class VoxelOperator:
         self.move(planes)
 
     def move(self, planes: Planes) -> None:
-        """Take the poses of these planes, the same pixel grids elsewhere."""
+        """Take the poses of these planes, which are the same pixel grids at other poses."""
         inverse = self.grid.index_from_world
         self.index_from_plane = np.ascontiguousarray(inverse[:3, :3] @ planes.rotation)  # [K, 3, 3]
         self.index_center = planes.center_mm @ inverse[:3, :3].T + inverse[:3, 3]

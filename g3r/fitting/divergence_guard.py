@@ -1,4 +1,4 @@
-"""Rollback of a fit whose loss rises: back to the best state so far, and on with shorter steps."""
+"""Divergence guard: when the loss of a fit rises, it restores the best state and goes on with shorter steps."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from g3r.fitting.parameters import FitParameters
 logger = logging.getLogger(__name__)
 
 RISE = 1.5
-"""A loss is too high when it is over this many times the best ..."""
+"""A loss is too high only if it is more than this many times the best one. `LEVEL_SHARE` must be exceeded, too."""
 
 LEVEL_SHARE = 0.15
-"""... and has risen by this share of the mean absolute pixel. Fits that go well rise by up to 0.05 of it (they begin at
-a least-squares optimum of the amplitudes, and the loss is L1), with ten times the step sizes by 0.4
-(docs/numerics.md)."""
+"""Rise above the best loss, over the mean absolute pixel, beyond which a loss is too high. Fits that go well rise by up
+to 0.05 of it (they begin at a least-squares optimum of the amplitudes, and the loss is L1), with ten times the step
+sizes by 0.4 (docs/numerics.md)."""
 
 SHORTER = 0.3
-"""Factor of all step sizes after each rollback, to the end."""
+"""Factor of all step sizes after each rollback, for the rest of the fit."""
 
 KEEP_EVERY = 5
-"""Steps between two copies of the parameters, if the loss is the lowest by then."""
+"""Fewest steps between two copies of the parameters; a copy is made only if the loss is the lowest so far."""
 
 
 class DivergenceGuard:
-    """Takes the steps of a fit, and rolls back when the loss rises or is not finite.
+    """Takes the steps of a fit, and rolls it back when the loss rises or is not finite.
 
     The parameters with the lowest loss are kept, in one copy that is renewed every few steps at most. A loss
-    that has risen too far, or a loss or gradient that is not finite, brings them back; step sizes go down and
+    that has risen too far, or a loss or gradient that is not finite, restores them; step sizes are reduced and
     Adam begins anew. A fit in which that does not happen takes the same steps as without the guard.
 
     Args:
@@ -50,7 +50,7 @@ class DivergenceGuard:
         self._age = KEEP_EVERY
 
     def step(self, loss: float, factor: float) -> bool:
-        """A step down the gradient of a loss, or back to the best state; returns whether it went forward.
+        """Take a step down the gradient of a loss, or roll back to the best state; returns whether it went forward.
 
         Args:
             loss: at the present parameters, whose gradient they hold.

@@ -1,9 +1,9 @@
-"""Where the volume ends, as the image shows it: in stacks that are black beside the brain.
+"""The edge of the volume by the image, in stacks that are black beside the brain.
 
 A mask says only which pixels have their middle in the brain, and the volume that is fitted to them goes on beyond it as
-if there were brain. Where nothing but black lies beside the brain, a pixel of the rim says itself how much brain is
-beneath it: its value over what it would have if all beneath were brain. Minimised over the share f of brain in a voxel
-is
+if there were brain. Where nothing but black lies beside the brain, a pixel of the rim shows how much brain is beneath
+it: its value over the value that it would have if all beneath it were brain. The share f of brain in the voxels
+minimises
 
     sum_p w_p (A V)_p^2 (A f - y / A V)_p^2  +  r s |grad f|
 
@@ -26,33 +26,35 @@ from g3r.geometry import VolumeGrid
 
 SHARES = (0.2, 0.5)
 """Shares of brain between which the volume fades in. On eight development cases (docs/method.md, "Mask") half of a
-voxel, where the edge lies, would be best on the whole grid; a voxel of the brain that is lost costs more."""
+voxel, where the edge lies, would be best on the whole grid; but a voxel of the brain that is lost costs more."""
 
 SETTINGS = VoxelProblemSettings(hold=0.01, total_variation=0.1, tip=0.05, n_rounds=3, n_iterations=10)
 
 FULL_MM = 1.5
-"""So far inside the support the volume is shown in full: dark there is fluid."""
+"""Deeper inside the support than this, the volume is shown in full: what is dark there is fluid."""
 
 CONTINUED_MM = 1.5
-"""Beyond the edge the volume is the mean of what lies around, by a Gaussian of this width."""
+"""Standard deviation of the Gaussian mean that continues the volume beyond its edge."""
 
 OUTSIDE_MM, INSIDE_MM = 5.0, 6.0
-"""From the edge, pixels that are asked."""
+"""Distances from the edge, outside and inside, up to which pixels are used."""
 
 BESIDE_MM = (3.0, 10.0)
-"""From the edge, pixels that tell whether there is anything beside the brain."""
+"""Distances from the edge: pixels between the two outside show whether anything lies beside the brain, and pixels
+deeper inside than the first show the brain."""
 
 BRIGHT_SHARE, MAX_BRIGHT = 0.3, 0.05
-"""Of the median in the brain, what is darker is noise; and the share of pixels beside the brain that may be brighter.
-Simulated stacks that were cut out have 0.00 to 0.01."""
+"""Share of the median in the brain below which a pixel is noise, and largest share of pixels beside the brain that may
+be brighter. Simulated brain-extracted stacks have 0.00 to 0.01."""
 
 NOISE_TOP, MAX_NOISE_TOP = 3.0 / 1.18, 0.65
-"""Noise in black has a Rayleigh distribution, whose median is 1.18 standard deviations: one pixel in a hundred is
-brighter than three of them, which may be more than `BRIGHT_SHARE` of the brain, at an SNR of 5 twice as much. What is
-brighter in the middle is no noise."""
+"""Top of the noise over the median beside the brain, and its largest share of the median in the brain. Noise in black
+has a Rayleigh distribution, whose median is 1.18 standard deviations: one pixel in a hundred is brighter than three
+standard deviations, which may be more than `BRIGHT_SHARE` of the brain, at an SNR of 5 twice as much. If the median
+beside the brain is brighter, it is not noise."""
 
 LEAST_PREDICTED = 0.1
-"""In normalised intensities: of pixels that would have less the share is not told."""
+"""Lower bound, in normalised intensities, of the prediction that a pixel is divided by: darker ones show no share."""
 
 
 def shown_by_image(
@@ -63,7 +65,7 @@ def shown_by_image(
     fit: SliceFit,
     acquired: Slices,
 ) -> Array | None:
-    """How much of the volume [I, J, K], of 1, is to be shown; None where something lies beside the brain.
+    """How much of the volume is to be shown [I, J, K]; None if something lies beside the brain, or voxels are too fine.
 
     Args:
         volume: [I, J, K] as it is, faded by `edge`.
@@ -71,7 +73,7 @@ def shown_by_image(
         support: [I, J, K] bool, where it was fitted.
         grid: of all these.
         fit: slices with profiles, poses, gains and fields.
-        acquired: the same slices with the values as they came, unmasked pixels of their boxes included.
+        acquired: the same slices with the values as acquired, unmasked pixels of their boxes included.
     """
     if too_fine(float(grid.spacing_mm.min()), acquired):
         return None
@@ -99,7 +101,7 @@ def _depth_mm(support: NDArray[np.bool_], grid: VolumeGrid) -> Array:
 
 
 def _around(fit: SliceFit, acquired: Slices, depth_mm: Array, grid: VolumeGrid) -> FitPixels | None:
-    """Pixels near the edge, masked or not; None where something lies beside the brain, or no pixel says."""
+    """Pixels near the edge, masked or not; None if something lies beside the brain, or if no pixel shows it."""
     slices = replace(fit.slices, value=acquired.value, mask=np.ones_like(acquired.mask))
     pixels = FitPixels.of(fit, slices, np.ones(len(slices.value), np.float32))
     place = grid.index(slices.planes.pixel_world_mm()).T

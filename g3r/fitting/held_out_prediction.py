@@ -1,7 +1,8 @@
-"""Slices that were held out of a short fit, how well it predicts them, and which of the stacks are wider or narrower.
+"""Held-out slices of a short fit: how well it predicts them, and the widths of stacks relative to each other.
 
 The cloud was fitted with one width for all stacks. If the slices of one stack are narrower than that, and the others
-are not, the cloud is as sharp as the others say, and slices of this stack are predicted best with a narrower profile.
+are not, the cloud is as sharp as the others require, and slices of this stack are predicted best with a narrower
+profile.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ STRETCHES = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)
 """Widths over that of the fit with which held-out slices are rendered."""
 
 MIN_CONTRAST = 0.003
-"""Smallest rise of the error within the widths tried by which a width counts as found."""
+"""Least rise of the error, relative to its minimum, over the widths tried, for the minimum to count."""
 
 MIN_HELD_OUT = 3
-"""Fewer held-out slices say nothing."""
+"""Fewest held-out slices that determine anything."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,8 @@ class HeldOutFit:
     """A short fit and the slices that were held out of it.
 
     Attributes:
-        cloud: that was fitted.
-        slices: that were held out, with the profile of the fit.
+        cloud: the fitted Gaussians.
+        slices: the held-out slices, with the profile of the fit.
         share: [P'] of brain in their masked pixels.
         field: [P'] bias field of their stacks there, as the fit found it.
     """
@@ -43,7 +44,7 @@ class HeldOutFit:
     field: NDArray[np.float32]
 
     def errors(self, stretch: float = 1.0) -> NDArray[np.float64]:
-        """[P'] absolute errors of masked pixels after one gain a slice, in the units of what was measured.
+        """[P'] absolute errors of masked pixels after one gain per slice, in the units of the measured pixels.
 
         Args:
             stretch: width of the slice profile, through the plane, over the one of the fit.
@@ -56,17 +57,17 @@ class HeldOutFit:
         across = np.bincount(number, self.share * predicted * measured)
         own = np.bincount(number, self.share * predicted * predicted)
         gain = np.divide(across, own, out=np.ones_like(own), where=own > 0)
-        # the share takes back what the pixel was divided by where its surroundings were taken out
+        # times the share, by which the pixel was divided when its surroundings were taken out
         off: NDArray[np.float64] = self.share * np.abs(gain[number] * predicted - measured)
         return off
 
     def relative_widths(self, stack_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Width of each stack's profile [N], through the plane, over that of the fit; their geometric mean is 1.
 
-        1 for all where one of the stacks has too few held-out slices, or no clear minimum.
+        1 for all if a stack has too few held-out slices, or no clear minimum.
 
         Args:
-            stack_ids: [N] of the run's stacks, ascending, whether slices of them were held out or not.
+            stack_ids: [N] of the run's stacks, ascending, with or without held-out slices.
         """
         stack = np.searchsorted(stack_ids, self.slices.stack_id)
         n_stacks = len(stack_ids)
@@ -82,7 +83,7 @@ class HeldOutFit:
 
 
 def lowest(widths: Sequence[float], error: Sequence[float] | NDArray[np.float64]) -> float | None:
-    """Width of the lowest error, by a parabola over the logarithm through its neighbours; None where all are alike.
+    """Width of the lowest error, by a parabola in the log width through its neighbours; None if all are alike.
 
     Args:
         widths: three or more, rising.

@@ -1,7 +1,7 @@
-"""How wide the slice profiles are, by slices that are held out.
+"""Widths of the slice profiles, estimated from held-out slices.
 
 Every few slices are held out of a short fit in a slab of the head, and predicted by it. The residual of slices that
-are fitted always prefers a narrower profile; that of slices that are not has a minimum.
+are fitted always prefers a narrower profile; that of held-out slices has a minimum.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from g3r.gaussians import GaussianCloud
 from g3r.run.on_demand import torch
 
 EVERY = 5
-"""One slice in so many is held out, from another start in each stack."""
+"""One slice in this many is held out, beginning with another slice in each stack."""
 
 WIDTHS = (0.85, 1.0)
-"""Widths that are tried first; then one beyond the better."""
+"""Widths that are tried first; the third is beyond the better one."""
 
 STEP = 1.18
 """Ratio of neighbouring widths."""
@@ -37,19 +37,19 @@ STEP = 1.18
 WIDTH_RANGE = (0.6, 1.35)
 
 WIDTH_TRUST = 0.5
-"""How far the mean width goes from the nominal one to the best on held-out slices (on the logarithm): the rim of the
-brain wants a wider profile than its inside, and counts for most of the error (docs/method.md)."""
+"""Exponent of the best width on held-out slices in the mean width: 0 is the nominal width, 1 the best one. The rim of
+the brain prefers a wider profile than its inside, and makes most of the error (docs/method.md)."""
 
 MIN_PIXELS = 100
-"""Held-out slices with fewer pixels in the slab do not count."""
+"""Held-out slices with fewer pixels in the slab are not used."""
 
 SLAB_MARGIN_MM = 7.0
-"""Gaussians so far outside the slab still reach its pixels."""
+"""Distance from the slab up to which Gaussians outside still reach its pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutSettings:
-    """How long held-out slices are asked.
+    """Size of the slab, and length of the fits without held-out slices.
 
     Args:
         slab: share of the head's voxels in the slab.
@@ -62,14 +62,14 @@ class HeldOutSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutChoice:
-    """What the held-out slices chose.
+    """Widths of the slice profiles that held-out slices chose.
 
     Attributes:
         mean_width: of all slice profiles, through the plane, over the nominal one; None where the error has no clear
             minimum.
-        widths: that are taken of each stack: the mean half way to the nominal one, times the stack's over the mean.
+        widths: of each stack, to be used: the mean half way to the nominal one, times the stack's over the mean.
         error: mean absolute error of held-out pixels by the width of all stacks, in normalised intensities.
-        n_slices: that were held out and counted.
+        n_slices: number of held-out slices that counted.
     """
 
     mean_width: float | None = None
@@ -92,7 +92,7 @@ def ask_held_out_slices(
 ) -> HeldOutChoice:
     """Widths of the slice profiles with which held-out slices are predicted best.
 
-    For several stacks: between slices of a single one a narrow profile and a smooth volume look alike.
+    For several stacks only: in a single stack a narrow profile and a smooth volume look alike.
 
     Args:
         cloud: of stage 1, fitted to V_prior.
@@ -100,8 +100,8 @@ def ask_held_out_slices(
         weight: [K] slice weights.
         distillation: whether the fits are held to V_prior.
         model: of the slices; its width through the plane is replaced by those that are tried.
-        stage: of the fit to the slices, of which these are short ones.
-        settings: how long.
+        stage: of the fit to the slices; the fits here take fewer steps.
+        settings: slab and number of steps.
         rng: draws what the fits draw.
         progress: called with (fits done, fits in all).
     """
@@ -112,7 +112,7 @@ def ask_held_out_slices(
     mean_mm = cloud.mean_mm.numpy() + cloud.origin_mm
     part = cloud.take(torch.from_numpy(slab.holds(mean_mm, SLAB_MARGIN_MM)))
     in_slab = slab.holds(slices.planes.pixel_world_mm())
-    # so few steps have to see every slice each
+    # in so few steps, each step has to see every slice
     short = replace(stage, n_steps=settings.n_steps, n_parts=1, optimise_poses=False)
 
     def fitted(width: float) -> HeldOutFit | None:
@@ -138,7 +138,7 @@ def ask_held_out_slices(
 def _try_widths(
     fitted: Callable[[float], HeldOutFit | None], progress: Callable[[int, int], None]
 ) -> dict[float, tuple[HeldOutFit, float]]:
-    """Fits and their errors by width: two, and one beyond the better; none where too few slices are held out."""
+    """Fits and their errors by width: two, and one beyond the better; none if too few slices are held out."""
     tried: dict[float, tuple[HeldOutFit, float]] = {}
     widths = list(WIDTHS)
     for number in range(3):
@@ -155,7 +155,7 @@ def _try_widths(
 
 
 def _widths(mean_width: float, relative: NDArray[np.float64]) -> list[float]:
-    """Widths to take of each stack.
+    """Widths to be used for each stack.
 
     Args:
         mean_width: best for all stacks alike.
@@ -165,7 +165,7 @@ def _widths(mean_width: float, relative: NDArray[np.float64]) -> list[float]:
 
 
 def held_out_rows(slices: Slices, weight: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of K slices are held out: one in `EVERY` of each stack, trusted ones alone."""
+    """Which of K slices are held out: one in `EVERY` of each stack, without slices of low weight."""
     held = np.zeros(len(slices), bool)
     for number, stack in enumerate(np.unique(slices.stack_id)):
         rows = np.flatnonzero(slices.stack_id == stack)
@@ -175,7 +175,7 @@ def held_out_rows(slices: Slices, weight: NDArray[np.float64]) -> NDArray[np.boo
 
 @dataclass(frozen=True)
 class _Slab:
-    """What lies between two planes, oblique to the usual stacks, so that it cuts slices of each of them."""
+    """The space between two planes that are oblique to the usual stacks, so that it cuts slices of each of them."""
 
     low_mm: float
     high_mm: float

@@ -31,14 +31,14 @@ class InitialVolumes:
     """Posed slices and the volumes that they give by themselves, in normalised intensities.
 
     Attributes:
-        slices: given intensities over `scale`.
+        slices: the given slices, with intensities divided by `scale`.
         coarse: V_coarse [I, J, K] (G3R Eq. 6).
         density: M_rho [I, J, K] (G3R Eq. 6), of whole slices.
         masked_density: [I, J, K], of the masked pixels alone, to which the fit is made.
         sharp: V_sharp [I, J, K], the least-squares volume.
-        foreground: what the slices' masks say of each voxel.
+        foreground: state of each voxel by the masks of the slices.
         grid: of all these.
-        scale: what intensities were divided by.
+        scale: intensity that slices and volumes were divided by.
         field_rms: root mean square over the brain of the logarithm of the bias field that was divided out of slices
             and volumes; 0 where none was.
     """
@@ -71,8 +71,8 @@ class InitialVolumes:
             gain: [K] intensity factors.
             weight: [K] slice weights.
             voxel_mm: voxel size of the grid.
-            expected_box_mm: lowest and highest corner [3] of where the whole head is expected; where that is far
-                beyond the masked pixels, the grid reaches there.
+            expected_box_mm: lowest and highest corner [3] of the box in which the whole head is expected; where it goes
+                far beyond the masked pixels, so does the grid.
             common_bias_field: whether the bias field that stacks share is estimated and divided out.
         """
         grid = _with_room(grid_around(slices, voxel_mm, margin_mm=MARGIN_MM), expected_box_mm)
@@ -81,7 +81,7 @@ class InitialVolumes:
         sharp = sharpened_volume(slices, grid, coarse, gain, slice_weight)
         votes = Votes.of(slices, grid, weight)
         field_rms = 0.0
-        with ThreadPoolExecutor(1) as pool:  # N4 has one thread, and releases Python's lock
+        with ThreadPoolExecutor(1) as pool:  # N4 runs on one thread and releases the GIL
             field = pool.submit(common_log_field, sharp, votes.core, grid) if common_bias_field else None
             seen = votes.foreground()
         if field is not None:
@@ -125,7 +125,7 @@ def _with_room(grid: VolumeGrid, box_mm: tuple[NDArray[np.float64], NDArray[np.f
 
 @dataclass(frozen=True, kw_only=True)
 class PriorVolume:
-    """Start and target of the fit.
+    """V_prior with its masks: start and target of the fit.
 
     Attributes:
         volumes: the slices as they are fitted, and the volumes that they give.
@@ -133,9 +133,9 @@ class PriorVolume:
         brain: probability [I, J, K] of each voxel being brain by its shape; None where no network is used.
         mask: [I, J, K] the brain: as seen, and by its shape where nothing was seen.
         support: [I, J, K] where Gaussians are fitted: the mask and its margin.
-        has_template: whether an atlas template was fitted, for V_prior to show where no slice looked.
+        has_template: whether an atlas template was fitted, which V_prior shows where no slice looked.
         gain: [K] intensity factors of the slices.
-        scale: what intensities were divided by since registration.
+        scale: intensity that slices were divided by since registration.
         accepted: whether slices of a single stack moved to the prior; None where that was not tried.
     """
 
@@ -151,7 +151,7 @@ class PriorVolume:
 
 
 def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
-    """A registration with the pixels of the slices to be fitted.
+    """A registration whose slices have the pixels of the slices to be fitted.
 
     Raises:
         InputError: the two are not about the same slices.
@@ -168,17 +168,17 @@ def with_pixels_of(slices: Slices, registration: Registration) -> Registration:
 
 @dataclass(frozen=True, kw_only=True)
 class LatticeSpacing:
-    """How far the Gaussians of the lattice are apart.
+    """Spacing of the lattice of Gaussians.
 
     Args:
         pixels: cell edge per Gaussian, in units of the cube root of what one pixel covers.
-        at_most_mm: the same in mm, whatever the pixels: the cortex is as thick in thick slices.
+        at_most_mm: upper bound of that edge in mm, whatever the pixels: the cortex is as thick in thick slices.
     """
 
     pixels: float
     at_most_mm: float
 
     def mm(self, slices: Slices) -> float:
-        """Cell edge per Gaussian for slices of a (typical) size of pixel."""
+        """Cell edge per Gaussian for the median pixel of some slices."""
         covered_mm3 = slices.planes.spacing_mm.prod(1) * slices.thickness_mm
         return min(self.pixels * float(np.median(covered_mm3)) ** (1 / 3), self.at_most_mm)

@@ -1,14 +1,14 @@
-"""Gains of slices and fields of stacks, as far as slices that cross each other determine them.
+"""Intensity matching: gains of slices and fields of stacks, as far as slices that cross determine them.
 
-Registration finds gains along with poses, from slices whose slow trends were divided out
-(`registration.bias_correction`), and with them slow changes of the anatomy. For what comes next they are found anew,
-from the slices as they are and in their poses: where slices of several stacks cross, their log-intensities differ by
-the gains of the slices and by the fields of their stacks.
+Registration finds gains along with poses, but from slices whose slow trends were divided out
+(`registration.bias_correction`), and with them slow changes of the anatomy. For the next stages gains are found anew,
+from the original slices in their poses: where slices of several stacks cross, their log-intensities differ by the gains
+of the slices and by the fields of their stacks.
 
-Not all of that is determined. With three orthogonal stacks a volume that is shaded along x or x^2, or the same in y or
-z, and gains and fields that make up for it, explain the same pixels. That part is set to zero after every round; a
-volume keeps such shading until `common_bias_field` takes it for what it is. Left alone it would grow round by round:
-a blurred volume is less dark than the slices where the head ends.
+Not all of that is determined. With three orthogonal stacks, a volume that is shaded along x or x^2, or the same in y or
+z, with gains and fields that compensate for it, explains the same pixels. That part is set to zero after every round;
+the volume keeps such shading until `common_bias_field` removes it. Otherwise it would grow round by round, because a
+blurred volume is less dark than the slices where the head ends.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from g3r.fitting.neighbour_gains import MIN_INTENSITY, neighbour_gains
 Array = NDArray[np.float64]
 
 VOXEL_MM = 2.5
-"""About as wide as slices are thick: what differs between slices that cross within a voxel is mostly gain and field."""
+"""About the slice thickness: what differs between slices that cross within a voxel is mostly gain and field."""
 
 MAX_PIXELS = 60_000
-"""Evenly spread; hundreds of each slice."""
+"""Number of evenly spread pixels in use; hundreds of each slice."""
 
 MIN_STACKS = 3
-"""Two stacks leave more open, and their poses are less certain: with matching eight simulated subjects lost 0.15 dB in
-the mean, and real stacks were predicted 0.1 to 0.2 dB worse by two others."""
+"""Fewest stacks that are matched. Two stacks leave more open, and their poses are less certain: with matching, eight
+simulated subjects lost 0.15 dB in the mean, and real stacks were predicted 0.1 to 0.2 dB worse by two others."""
 
 N_ROUNDS = 6
-"""Of volume, gains and fields. What crossing slices determine least comes slowly."""
+"""Rounds of volume, gains and fields. What crossing slices determine least converges slowly."""
 
 SHARED = 0.3
-"""Share of a quadratic shading that gains and fields cannot show, below which slices hardly determine it."""
+"""A quadratic shading is undetermined if gains and fields can show all but less than this share of it."""
 
 MIN_VARIANCE = 0.1
-"""Of a place, over the usual one: so that a few pixels that agree by chance do not count for all."""
+"""Lower bound of the variance at a place, over the usual one: a few pixels that agree by chance must not decide."""
 
 RIDGE = 1e-3
-"""Of the coefficients of a field, over what its pixels measure: a stack that is a line of pixels has no y."""
+"""Ridge of the coefficients of a field, over what its pixels measure: a line of pixels does not determine y."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +57,8 @@ class MatchedIntensities:
     """Slices whose intensities agree where they cross.
 
     Attributes:
-        slices: K slices without the fields of their stacks.
-        gain: [K] intensity factors, still in the slices.
+        slices: K slices, with the fields of their stacks divided out.
+        gain: [K] intensity factors, not divided out.
         coefficients: [N][5] of the fields that were divided out, see `StackBiasField`; empty where nothing was matched.
     """
 
@@ -71,8 +71,8 @@ def match_intensities(slices: Slices, gain: Array, weight: NDArray[np.floating])
     """Gains and fields from slices in place.
 
     Args:
-        slices: K slices; two stacks stay as they are, and one has its gains from `neighbour_gains` alone.
-        gain: [K] intensity factors to start with; of three stacks or more, slices without weight keep them.
+        slices: K slices; those of two stacks stay as they are, and one stack gets its gains from `neighbour_gains`.
+        gain: [K] intensity factors to start with; with three stacks or more, slices without weight keep them.
         weight: [K] slice weights.
     """
     counts = weight[slices.pixel_plane] > 0
@@ -144,20 +144,20 @@ class _Pixels:
         return np.asarray(terms @ mode[:, share < SHARED])
 
     def of(self, factors: _Factors) -> Array:
-        """Their sum [P'] at each pixel."""
+        """The sum of gains and fields [P'] at each pixel."""
         own = factors.coefficients[self.stack[self.plane]]
         return factors.log_gain[self.plane] + np.einsum("pi,pi->p", own, self.terms)
 
     def off(self, factors: _Factors) -> Array:
-        """Log-intensities [P'] over those of the volume that pixels give with these factors."""
+        """Log-intensities [P'] relative to the volume that pixels give with these factors."""
         volume = self.operator.adjoint((self.weight * (self.log_value - self.of(factors))).astype(np.float32))
         np.divide(volume, self.seen, out=volume, where=self.seen > 0)
         return self.log_value - self.operator.forward(volume)
 
     def agreement(self, left: Array) -> Array:
-        """Weight [P'] of pixels by their place: one over the mean square there of what is left, usually 1.
+        """Weight [P'] of pixels by their place: one over the mean square of residuals there, usually 1.
 
-        Slices disagree at edges, most of all in the rim of skull and fluid that masks of people have.
+        Slices disagree at edges, most of all in the rim of skull and fluid that manual masks include.
         """
         square = self.operator.adjoint((self.weight * np.minimum(left**2, 1)).astype(np.float32))
         np.divide(square, self.seen, out=square, where=self.seen > 0)
@@ -182,6 +182,6 @@ class _Pixels:
         return _Factors(mean_value - (mean_terms * coefficients[self.stack]).sum(1), coefficients)
 
     def without_shared(self, factors: _Factors) -> _Factors:
-        """The factors without what a shaded volume would explain as well."""
+        """The factors without the part that a shaded volume would explain as well."""
         shared = self.fitted(self.shading @ (self.shading.T @ (self.alike * self.of(factors))), self.alike)
         return _Factors(factors.log_gain - shared.log_gain, factors.coefficients - shared.coefficients)

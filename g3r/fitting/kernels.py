@@ -16,7 +16,7 @@ from g3r.gaussians.simd import N_LANES
 f32 = np.float32
 
 SUMS = {"contract", "arcp", "nsz", "reassoc"}
-"""Sums over a row may be taken in any order, so that they run in vectors; NaN keeps its meaning."""
+"""Fast-math flags: sums over a row in any order, so that they are vectorised; NaN is preserved."""
 
 
 class PixelArrays(NamedTuple):
@@ -53,7 +53,7 @@ class AdamRate(NamedTuple):
 
 @numba.njit(fastmath=SUMS)
 def _row(image, row, pixels, begin, n, factor):
-    """Weighted absolute residual of a row of pixels, whose gradient takes the place of the pixels."""
+    """Weighted absolute residual of a row of pixels; overwrites the pixels with its gradient."""
     target, weight = pixels.value, pixels.weight
     total = f32(0.0)
     for y in range(n):
@@ -133,7 +133,7 @@ def image_l1(
     Args:
         cloud: `CloudArrays`.
         planes: `PlaneArrays`.
-        chosen: [M] numbers of the planes that are looked at.
+        chosen: [M] numbers of the planes in use.
         overlaps: `OverlapArrays`.
         cut: square of the cut-off in sigma.
         work: `Workspace`.
@@ -143,9 +143,9 @@ def image_l1(
         factor: of the loss.
         with_pose: whether gradients of poses are wanted.
         buffers: [n_workers, N, 11], gradients of the Gaussians are added.
-        plane_gradient: [K, 7] is written for the chosen planes, columns as in `gaussians.kernels`.
-        field_gradient: [K, 5] is written for them.
-        residual: [K] is written for them.
+        plane_gradient: [K, 7], written for the chosen planes, columns as in `gaussians.kernels`.
+        field_gradient: [K, 5], written for the chosen planes.
+        residual: [K], written for the chosen planes.
     """
     n_workers = len(work.images)
     for worker in numba.prange(n_workers):
@@ -227,7 +227,7 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, mi
     """Bound of the change of any Gaussian's distance from a plane less its reach there, in units of its sigma.
 
     With n a unit vector, the distance along n changes by at most |mean - then| + common_mm, and
-    sigma_n = sqrt(n^T Sigma n + D) by at most max|s - s_then| + angle (s_max - s_min), the steepest that |S n| can be
+    sigma_n = sqrt(n^T Sigma n + D) by at most max|s - s_then| + angle (s_max - s_min), the largest slope of |S n|
     on the unit sphere. sigma_n is at least sqrt(s_min^2 + min_psf_mm2).
 
     Args:
@@ -236,7 +236,7 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, mi
         quaternion: [N, 4].
         then: [N, 12] of `remember`.
         cutoff_sigma: where a Gaussian ends.
-        common_mm: what planes have moved by.
+        common_mm: largest movement of a plane.
         min_psf_mm2: least variance of the PSF in any direction.
     """
     largest = 0.0
@@ -258,7 +258,7 @@ def farthest_move(mean, log_scale, quaternion, then, cutoff_sigma, common_mm, mi
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def remember(mean, log_scale, quaternion, then):
-    """Write what `farthest_move` measures movement from.
+    """Write the state that `farthest_move` compares with.
 
     Args:
         mean: [N, 3] mm.

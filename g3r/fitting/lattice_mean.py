@@ -1,8 +1,8 @@
 """The mean of several fits to the slices, each with Gaussians on a lattice of its own.
 
-What a fit gets wrong depends in part on where its Gaussians happened to lie. Fits on lattices that are shifted against
-each other, and a little closer or wider, err differently, and their mean errs less. It is a cloud as well: all
-Gaussians together, each as high as its share.
+The errors of a fit depend in part on where its Gaussians happened to lie. Fits on lattices that are shifted against
+each other, and a little closer or wider, err differently, and their mean errs less. The mean is a cloud as well: all
+Gaussians together, with amplitudes divided by the number of fits.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from g3r.run.deadline import Deadline, timed_steps
 from g3r.run.on_demand import torch
 
 SPACINGS = (1.0, 0.9, 1.1)
-"""Spacings of the lattices in turn, over that of the first."""
+"""Spacings of the lattices in turn, over the spacing of the first."""
 
 SHIFT = (0.8192, 0.6710, 0.5497)
-"""From one lattice to the next, in edges of its cell: multiples of these, without their whole parts, fill a cube evenly
+"""Shift from one lattice to the next, in edges of its cell: the fractional parts of its multiples fill a cube evenly
 (powers of the root of x^4 = x + 1; Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
 
 
@@ -46,11 +46,11 @@ def fit_lattices(
     deadline: Deadline | None = None,
     observer: FitObserver | None = None,
 ) -> SliceFit:
-    """The first fit to the slices, and beside its cloud those of the fits on further lattices.
+    """The first fit to the slices, together with the clouds of fits on further lattices.
 
     Args:
         first: Gaussians fitted to the prior volume, where the first fit starts.
-        prior: what the others are seeded in.
+        prior: volume in which the others are seeded.
         target: the slices.
         n_lattices: fits in all.
         weight: [K] slice weights, from registration.
@@ -59,9 +59,9 @@ def fit_lattices(
         slice_stage: how a fit to the slices runs.
         rng: draws what the fits draw.
         progress: called with (steps done, steps in all).
-        deadline: no further fit begins that would probably end after it. One in which the run is stopped counts for
-            nothing, except the first.
-        observer: sees the first fit.
+        deadline: no further fit begins that would probably end after it. A fit in which the run is stopped is dropped,
+            except the first.
+        observer: of the first fit.
 
     Raises:
         NumericalError: see `fit_slices`.
@@ -101,12 +101,12 @@ def fit_lattices(
         if fits and deadline is not None and deadline.is_stopped():
             break
         fits.append(made)
-    fits = fits or [fit(0)]  # stopped before: a fit of no step, which says so
+    fits = fits or [fit(0)]  # stopped before the first: a fit without steps, which records that
     return replace(fits[0], further=tuple(one.cloud for one in fits[1:]))
 
 
 def mean_cloud(fit: SliceFit) -> GaussianCloud:
-    """The mean of the clouds of a fit as one cloud: all Gaussians, each with its share of its height."""
+    """The mean of the clouds of a fit as one cloud: all Gaussians, with amplitudes divided by the number of clouds."""
     if not fit.further:
         return fit.cloud
     clouds = (fit.cloud, *fit.further)

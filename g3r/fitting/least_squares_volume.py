@@ -17,18 +17,18 @@ SETTINGS = VoxelProblemSettings(hold=0.0, total_variation=0.007, tip=0.02, n_rou
 """Chosen on development heads (docs/method.md, "A preview")."""
 
 BRIGHTEST, CONTRADICTED = 0.999, 1.2
-"""Quantile of the pixels that see brain alone, and how many times as bright brain may be: pixels at the rim that
-would need more are of slices beside their place, where others saw none. They made a crust 2.6 times as bright."""
+"""Quantile of the pixels that see brain alone, and how many times as bright brain may be. Pixels at the rim that would
+need more belong to slices beside their place, where others saw nothing. They made a crust 2.6 times as bright."""
 
 
 def least_squares_volume(
     volumes: InitialVolumes, support: NDArray[np.bool_], gain: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Minimise sum_p w_p (A V - y)_p^2 + s (|grad V| + q |grad V|^2), without what lies beside the brain in the pixels.
+    """Minimise sum_p w_p (A V - y)_p^2 + s (|grad V| + q |grad V|^2), for pixels without what lies beside the brain.
 
-    Slices have the profile of the fit. s follows their noise; how far slices of a single stack are off counts as noise,
-    since no other checks their poses. Voxels beyond the brain are free: what the profile of a pixel at the rim reaches
-    there is taken for brain.
+    Slices have the profile of the fit. s follows their noise; pose errors of a single stack count as noise, since no
+    other stack checks its poses. Voxels beyond the brain are free: what the profile of a rim pixel reaches there counts
+    as brain.
 
     Args:
         volumes: of the slices in their poses, in normalised intensities; V_sharp is the start.

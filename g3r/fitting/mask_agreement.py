@@ -1,7 +1,7 @@
-"""Masks that were found, once more with what registration knows: other stacks and the atlas template have a vote.
+"""Refinement of automatic masks after registration: other stacks and the atlas template have a vote.
 
 A network sees one stack, and in slices far from the middle of a head it sees little. The stacks that cross these slices
-show the same place better, and the template knows how large a head is. A pixel is brain where most of these say so.
+show the same place better, and the template shows how large a head is. A pixel is brain if most of these votes say so.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from g3r.registration.estimate import measured_again
 from g3r.registration.unseen import TemplateFill
 
 REFINED = "automatic"
-"""Masks of this source are refined; what a person drew, or a tool of the user's made, is not."""
+"""Masks of this source are refined; masks drawn by a person, or made by a tool of the user's, are not."""
 
 VOXEL_MM = 2.0
-"""Of the maps that carry the votes."""
+"""Voxel size of the maps of votes."""
 
 MARGIN_MM = 8.0
-"""How far beyond a mask brain may be that it missed."""
+"""How far beyond a mask it may have missed brain."""
 
 MAX_CHANGE = 0.4
-"""A mask that would lose or gain a larger share of itself is kept: then the poses are more likely to be wrong."""
+"""A mask that would lose or gain a larger share of itself is kept: the poses are then more likely to be wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +51,14 @@ class RefinedMasks:
 def refine_masks(
     stacks: Sequence[Stack], registration: Registration, intensity: float, template: PlacedTemplate | None
 ) -> RefinedMasks:
-    """Masks that were found, refined by the majority of the mask itself, each of the other stacks and the template.
+    """Automatic masks, refined by the majority of the mask itself, each of the other stacks and the template.
 
-    Where only two have a vote a mask stays as it is. Slices keep their poses, and no slice comes or goes.
+    With only two votes a mask stays as it is. Slices keep their poses, and none is added or removed.
 
     Args:
         stacks: as they were registered.
         registration: of their slices.
-        intensity: of 1 in these slices.
+        intensity: that these slices were divided by.
         template: in the frame of the slices; None where that is not the atlas frame.
     """
     slices = registration.slices
@@ -92,7 +92,7 @@ def refine_masks(
 
 
 def _fill(template: PlacedTemplate | None) -> TemplateFill | None:
-    """The template in place of what stacks do not show."""
+    """The template for what stacks do not show."""
     if template is None:
         return None
     center_mm = template.grid.world(np.argwhere(template.volume > 0)).mean(0)
@@ -100,7 +100,7 @@ def _fill(template: PlacedTemplate | None) -> TemplateFill | None:
 
 
 def _seen_and_brain(stack: Slices, grid: VolumeGrid) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Where the slices of a stack look [I, J, K], and the share of what they see there that is masked."""
+    """Where the slices of a stack look [I, J, K], and the masked share of what they see there."""
     density = coverage(stack, grid)
     operator = VoxelOperator(stack.planes, grid, stack.pixel_index)
     amount = stack.planes.spacing_mm.prod(1) * stack.thickness_mm / grid.voxel_volume_mm3

@@ -1,8 +1,8 @@
-"""Gains of the slices of a single stack, from what neighbours show at the same place in their plane.
+"""Gains of the slices of a single stack, from neighbouring slices at the same place in plane.
 
-No slice of another stack crosses these. But most of what a slice shows goes on in the next one, so the logarithm of
-their intensities differs by the same everywhere: by the gains. Only changes over a few slices can be found like this:
-over many, gains and slow changes of the anatomy look alike, and gains are held at 1.
+No slice of another stack crosses these. But most of what a slice shows continues in the next one, so their
+log-intensities differ by a constant, the difference of their gains. Only changes over a few slices can be found like
+this: over many, gains and slow changes of the anatomy look alike, and gains are held at 1.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from g3r.acquisition.planes import Slices
 Array = NDArray[np.float64]
 
 MIN_PIXELS = 50
-"""That two neighbours share, to compare them."""
+"""Fewest pixels that two neighbours must share to be compared."""
 
 SCALE = 0.1
-"""Of log-intensities: where neighbours differ by more than the usual difference and this, they show other tissue."""
+"""Log-intensity by which a pixel may deviate from the usual difference: beyond, neighbours show other tissue there."""
 
 DEVIATION, MIN_GAIN_DEVIATION = 0.02, 0.05
-"""Expected of a step between neighbours that anatomy makes up, and at least of log-gains."""
+"""Expected deviation of the part of a step that is anatomy, and lower bound of the deviation of log-gains."""
 
 MIN_INTENSITY = 0.1
-"""Darker pixels count with this share of the mean intensity, for the sake of the logarithm."""
+"""Lower bound of a pixel before the logarithm is taken, as a share of the mean intensity."""
 
 MAX_ROUNDS = 20
 
@@ -64,9 +64,10 @@ def neighbour_gains(slices: Slices) -> Array:
 
 
 def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
-    """Of each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities.
+    """For each slice the places of its masked pixels in the stack's plane, as numbers, and their log-intensities.
 
-    Slices of one file share a lattice of pixels. Others may lie half a pixel apart: neither is near the edge of a cell.
+    Slices of one file share a lattice of pixels. Others may lie half a pixel apart. With an offset of a quarter neither
+    is near the edge of a cell.
     """
     ((_, inside, world_mm, axes),) = stacks_by_header(slices)
     index = np.flatnonzero(inside)
@@ -80,7 +81,7 @@ def _by_place(slices: Slices) -> list[tuple[NDArray[np.int64], Array]]:
 
 
 def _usual(difference: Array) -> float:
-    """Where most of the differences lie: the centre of a Cauchy distribution of width `SCALE`."""
+    """The most frequent difference: the centre of a Cauchy distribution of width `SCALE`."""
     centre = float(np.median(difference))
     for _ in range(MAX_ROUNDS):
         weight = 1 / (1 + ((difference - centre) / SCALE) ** 2)

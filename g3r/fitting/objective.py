@@ -28,7 +28,7 @@ from g3r.gaussians.overlap import OverlapFinder, OverlapList
 from g3r.gaussians.render import CUTOFF_SIGMA
 
 OVERLAP_MARGIN_SIGMA = 1.0
-"""Overlap lists are made with a cut-off larger by this, and again before anything has moved by as much."""
+"""Overlap lists are made with a cut-off larger by this, and made again before anything has moved by as much."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -43,7 +43,7 @@ class ImageTerm:
     Attributes:
         planes: K planes.
         offset: [K] number of each plane's first pixel in `pixels`.
-        pixels: targets, weights and field terms, of more planes than these perhaps.
+        pixels: targets, weights and field terms, possibly of more planes than these.
         total_weight: [K] sum of the weights of each plane's pixels.
         with_pose: whether gradients of poses are wanted.
         cutoff_sigma: where a Gaussian ends.
@@ -129,7 +129,7 @@ class TermOverlaps:
 
 @dataclass(frozen=True)
 class TermLoss:
-    """An image term, and its gradients times the factor that it was added with.
+    """Value of an image term, and its gradients times the factor that it was added with.
 
     Attributes:
         mean: the term.
@@ -147,12 +147,12 @@ class TermLoss:
 
 
 class CloudObjective:
-    """The loss over a cloud: derived shapes, gradient buffers, and when overlap lists are made again.
+    """The loss over a cloud, with derived shapes, gradient buffers and overlap lists.
 
     Args:
         parameters: whose gradient is written.
-        scale_weight: of the scale regulariser, the mean squared logarithm of how far each sigma has gone from where it
-            is now; it keeps Gaussians that few pixels see from shrinking to needles or growing.
+        scale_weight: of the scale regulariser: the mean squared log-ratio of each sigma to its value at the start. It
+            keeps Gaussians that few pixels see from shrinking to needles or growing.
     """
 
     def __init__(self, parameters: FitParameters, scale_weight: float) -> None:
@@ -173,7 +173,7 @@ class CloudObjective:
         return value["mean_mm"], value["log_scale"], value["quaternion_wxyz"]
 
     def begin(self, terms: Terms) -> LossStep:
-        """A step at the present parameters; overlap lists are made again if they may miss a Gaussian by now."""
+        """A step at the present parameters; overlap lists are made again if they may miss a Gaussian by then."""
         derive_shapes(*self._geometry, self.shapes)  # type: ignore[call-arg]
         self.buffers[:] = 0.0
         known = self.overlaps
@@ -194,7 +194,7 @@ class CloudObjective:
         return TermOverlaps(term, state, overlaps, Workspace.of(term.planes, overlaps.most))
 
     def _moved(self, terms: Terms) -> bool:
-        # the largest movement of any plane goes with the narrowest PSF of all: too early rather than too late
+        # the largest movement of any plane, with the narrowest PSF of all: too early rather than too late
         farthest = kernels.farthest_move(  # type: ignore[call-arg]
             *self._geometry,
             self._then,

@@ -1,4 +1,4 @@
-"""Watching a fit from outside, step by step."""
+"""Observers, which are called with the state of a fit at its steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from g3r.geometry import RigidPose
 
 @dataclass(frozen=True)
 class SliceMoment:
-    """The slices at one moment of a fit: their state, and as they were when it began."""
+    """The slices at one moment of a fit: their present state, and the slices at its start."""
 
     state: PlaneState
     start: Slices
@@ -37,13 +37,13 @@ class SliceMoment:
 
 @dataclass(frozen=True, kw_only=True)
 class FitMoment:
-    """A fit after one of its steps; look at it now, for the optimiser goes on writing into it.
+    """A fit after one of its steps; to be read at once, because the optimiser goes on writing into it.
 
     Attributes:
         step: steps that are done.
         loss: terms of the loss of the last one.
         parameters: of the fit.
-        slices: None in the fit to the prior.
+        slices: state of the slices; None in the fit to the prior.
     """
 
     step: int
@@ -57,20 +57,20 @@ class FitMoment:
 
 
 class FitObserver(Protocol):
-    """Watches a fit from outside."""
+    """Called with the state of a fit."""
 
     every: int
-    """Steps between two calls; the last step always has one."""
+    """Steps between two calls; there is always one at the last step."""
 
     def __call__(self, moment: FitMoment) -> None:
         """Called when a step is done."""
 
 
 def is_due(observer: FitObserver | None, step: int, n_steps: int) -> TypeGuard[FitObserver]:
-    """Whether an observer wants to see this step.
+    """Whether an observer is to be called at this step.
 
     Args:
-        observer: None where nobody watches.
+        observer: None if there is none.
         step: steps that are done.
         n_steps: steps in all.
     """

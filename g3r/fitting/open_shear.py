@@ -1,10 +1,11 @@
-"""The shear of the head that slices of two orientations leave open, as one more parameter of a fit.
+"""The open shear of the head, which slices of two orientations do not determine, as a parameter of a fit.
 
 Let n and m be the normals of two stacks and E a multiple of n m^T + m n^T. The motion x -> x + a E x of the head keeps
-every slice of either stack a rigid plane, to first order: E has no part within a slice, where one of its two factors is
-zero. Slices shift along the other normal and tilt. So Gaussians and slices that move by it together explain the same
-pixels, but for how slices are turned against others of their stack. Steps of single slices are slow to find it, since a
-slice that moves alone leaves the volume that the others made. It was most of what two stacks had wrong at the end.
+every slice of either stack a rigid plane, to first order: E has no component within a slice, since one of its two
+factors is zero there. Slices shift along the other normal and tilt. So Gaussians and slices that move by it together
+explain the same pixels, except where slices are turned against others of their stack. Steps of single slices are slow
+to find it, since a slice that moves alone leaves the volume that the others made. Before it was a parameter, it was
+most of the error that was left with two stacks.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class OpenShear:
 
     Attributes:
         strain: [3, 3] symmetric, of Frobenius norm 1.
-        middle_mm: [3] what stays in place, from the cloud's origin.
-        rotation: [K, 3] rad, after the rotation of each slice.
+        middle_mm: [3] the point that stays in place, from the cloud's origin.
+        rotation: [K, 3] rad, applied after the rotation of each slice.
         translation_mm: [K, 3].
     """
 
@@ -37,7 +38,7 @@ class OpenShear:
 
     @classmethod
     def of(cls, slices: Slices, origin_mm: NDArray[np.float64]) -> OpenShear | None:
-        """The open shear of some slices; None where there is not exactly one.
+        """The open shear of some slices; None unless exactly one strain is open.
 
         Args:
             slices: K slices at the start of a fit.
@@ -57,7 +58,7 @@ class OpenShear:
         )
 
     def slope(self, parameters: FitParameters) -> float:
-        """The derivative of the loss in the shear.
+        """The derivative of the loss by the shear.
 
         Args:
             parameters: with the gradients of `mean_mm`, `rotation` and `translation`.
@@ -68,7 +69,7 @@ class OpenShear:
         return float(along + np.vdot(gradient["translation"].astype(np.float64), self.translation_mm))
 
     def fold(self, parameters: FitParameters) -> None:
-        """Move Gaussians and slices by the shear that the optimiser has arrived at, and set it to zero.
+        """Apply the shear that the optimiser has found to Gaussians and slices, and reset it to zero.
 
         Args:
             parameters: with a block `shear` [1].

@@ -39,8 +39,8 @@ class LearningRates:
         bias_field: of the coefficients of the stacks' log-fields.
         rotation_rad: of the slices' rotation vectors.
         translation_mm: of the slices' translations.
-        shear: of the strain that two stacks leave open (`fitting.open_shear`). Larger ones follow noise where slices do
-            not tell it, in still heads.
+        shear: of the open shear of two orientations (`fitting.open_shear`). Larger steps follow noise in still heads,
+            where slices do not determine it.
     """
 
     mean_share: float = 0.04
@@ -106,7 +106,7 @@ class FitParameters:
         return np.asarray(self._buffers[1])
 
     def restart(self, values: NDArray[np.float32]) -> None:
-        """Take other values, and begin Adam anew there."""
+        """Set other values, and begin Adam anew there."""
         self._buffers[0] = values
         self._buffers[2:] = 0.0
         self.n_steps = 0
@@ -115,7 +115,7 @@ class FitParameters:
         """A copy of the present cloud.
 
         Raises:
-            NumericalError: it has left the numbers that a cloud may have.
+            NumericalError: a value is outside the range that a cloud may have.
         """
         copies = [torch.from_numpy(self.value[name].copy()) for name in CLOUD_BLOCKS]
         try:

@@ -1,4 +1,4 @@
-"""Planes at one step of a fit: what an image term is evaluated at."""
+"""State of planes at one step of a fit, at which an image term is evaluated."""
 
 from __future__ import annotations
 

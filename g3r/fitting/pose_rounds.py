@@ -1,8 +1,8 @@
 """Poses and volume in rounds: slices registered to the fitted volume, and the volume made anew from them.
 
-Registration works on a least-squares volume that repeats the errors of its poses. The Gaussians are held to V_prior,
-which has learned what heads look like, and slices move with them: two stacks, which check each other only where they
-cross, come nearer to the truth with every round. A round is kept where stacks predict each other at least as well.
+Registration uses a least-squares volume that repeats the errors of its poses. The Gaussians are held to V_prior, whose
+network has learned what heads look like, and slices move with them: two stacks, which check each other only where they
+cross, come nearer to the truth with every round. A round is kept if stacks predict each other no worse (`MAX_LOSS`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from g3r.registration.stray_slices import find_strays
 logger = logging.getLogger(__name__)
 
 MAX_PIXELS = 200_000
-"""At most about so many pixels in a Gauss-Newton step."""
+"""Largest number of pixels, about, in a Gauss-Newton step."""
 
 MAX_LOSS = 0.002
 """A round whose mean held-out correlation is lower than before by more than this is undone."""
@@ -40,14 +40,14 @@ MAX_LOSS = 0.002
 
 @dataclass(frozen=True, kw_only=True)
 class PoseRoundSettings:
-    """How often poses and volume are found in turn.
+    """Numbers of rounds in which poses and volume are found in turn, and of their steps.
 
     Args:
         moves_to_prior: moves of the slices of one stack towards V_prior before its rounds, at most.
         single_stack: rounds with one stack, which nothing but the prior holds in place.
-        two_stacks: with two stacks.
-        more_stacks: with three or more, whose poses are nearer to the truth without one.
-        prior_steps, slice_steps: of both stages of the fit in a round.
+        two_stacks: rounds with two stacks.
+        more_stacks: rounds with three stacks or more, whose poses are nearer to the truth without one.
+        prior_steps, slice_steps: steps of both stages of the fit in a round.
         newton_steps: Gauss-Newton steps of all slices against the fitted volume.
     """
 
@@ -60,18 +60,18 @@ class PoseRoundSettings:
     newton_steps: int = 4
 
     def n_rounds(self, n_stacks: int) -> int:
-        """Most rounds with a number of stacks."""
+        """Largest number of rounds with a number of stacks."""
         return (self.single_stack, self.two_stacks, self.more_stacks)[min(n_stacks, 3) - 1]
 
     def at_most(self, n_rounds: int) -> PoseRoundSettings:
-        """The same with no more rounds than given."""
+        """The settings with no more rounds than given."""
         counts = {name: min(getattr(self, name), n_rounds) for name in ("single_stack", "two_stacks", "more_stacks")}
         return replace(self, **counts)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseRounds:
-    """What the rounds did, for the record.
+    """Record of the rounds.
 
     Attributes:
         n_kept: rounds that were kept.
@@ -87,7 +87,7 @@ class PoseRounds:
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedPoses:
-    """Poses after all rounds, the prior volume that was made of them, and what the rounds did."""
+    """Poses after all rounds, the prior volume that was made of them, and the record of the rounds."""
 
     registration: Registration
     prior: PriorVolume
@@ -100,8 +100,8 @@ class RoundFit:
 
     Args:
         settings: its number of steps.
-        lattice: how far its Gaussians are apart.
-        prior_stage, slice_stage: the whole fit, of which it is a short one.
+        lattice: spacing of its Gaussians.
+        prior_stage, slice_stage: settings of the whole fit, with other numbers of steps.
         slice_model: of the slices.
         distillation: whether it is held to V_prior.
     """
@@ -147,13 +147,14 @@ def refine_in_rounds(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = NO_PROGRESS,
 ) -> RefinedPoses:
-    """Poses and prior volume after up to `n_rounds` rounds; ends at the first one that does not help.
+    """Poses and prior volume after up to `n_rounds` rounds; the first round that does not help is the last.
 
     Args:
         registration: poses from the slices alone.
         prior: the prior volume made of them.
         n_rounds: at most.
-        prior_of: makes the prior volume of poses; told whether it is the last one, which is worth more time.
+        prior_of: makes the prior volume for poses; its second argument says whether it is the last one, which is worth
+            more time.
         fit: of each round.
         rng: draws what the fits draw.
         progress: called with (rounds done, rounds in all).
@@ -187,7 +188,7 @@ def _mean_held_out(registration: Registration) -> float:
 def _registered_to_fit(
     registration: Registration, prior: PriorVolume, fit: SliceFit, n_steps: int, rng: np.random.Generator
 ) -> tuple[Registration, int]:
-    """Slices registered to the fitted volume from the poses of the fit, and how many of them took another place."""
+    """Slices registered to the fitted volume from the poses of the fit, and how many of them changed place."""
     grid = prior.volumes.grid
     volume = volume_from_pixels(render(fit.cloud, volume_planes(grid)).numpy(), grid) * prior.support
     slices: Slices = prior.volumes.slices.with_pose(fit.slices.planes.pose)
@@ -196,7 +197,7 @@ def _registered_to_fit(
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     at_start = model.evaluate(slices.planes, gain, width)
     weight = slice_weights(at_start.loss, gain, slices.n_stacks)
-    # the slices of a single stack have no others to be found in
+    # there is no volume of other stacks in which strays of a single stack could be found
     n_found = 0
     if slices.n_stacks > 1:
         slices, n_found = find_strays(slices, gain, weight, at_start.ncc, rng)

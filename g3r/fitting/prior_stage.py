@@ -1,4 +1,4 @@
-"""Stage 1 (G3R Eq. 8): the Gaussians take the shape of the prior volume."""
+"""Stage 1, the fit to the prior (G3R Eq. 8): Gaussians take the shape of the prior volume."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NO_PROGRESS: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
 
 @dataclass(frozen=True, kw_only=True)
 class PriorStageSettings:
-    """How stage 1 runs.
+    """Settings of stage 1.
 
     Args:
         n_steps: optimiser steps after the amplitudes are solved for.
@@ -61,10 +61,10 @@ class PriorCloud:
 
 @dataclass(frozen=True)
 class VolumeTarget:
-    """A volume as planes with pixels: what stage 1 fits and what stage 2 is distilled towards.
+    """A volume as planes with pixels: the target of stage 1, and of the distillation in stage 2.
 
     Attributes:
-        planes: [K] of the bounding box of positive weight.
+        planes: [K] planes of the bounding box of positive weight.
         value: [P] the volume.
         weight: [P] not negative.
     """
@@ -114,17 +114,17 @@ def fit_prior(
 ) -> tuple[GaussianCloud, list[float]]:
     """Fit a seeded cloud to the prior volume (G3R Eq. 8).
 
-    Amplitudes first, by least squares on every second plane; then Adam on everything with the L1 loss on random planes
-    and the scale regulariser. A loss that rises is answered by a rollback with shorter steps (`DivergenceGuard`).
+    First the amplitudes, by least squares on every second plane; then Adam on all parameters with the L1 loss on random
+    planes and the scale regulariser. If the loss rises, the fit rolls back and takes shorter steps (`DivergenceGuard`).
 
     Args:
         cloud: seeded Gaussians.
         target: the prior volume.
-        settings: how long.
+        settings: numbers of steps, and weights.
         rng: draws the planes of each step.
         progress: called with (steps done, steps in all).
         deadline: fewer steps if they would end after it.
-        observer: sees the fit at its steps.
+        observer: called at steps of the fit.
 
     Returns:
         The fitted cloud, and the image loss of each step.

@@ -1,4 +1,4 @@
-"""The prior volume in both stages of the fit: what Gaussians are seeded in, and what they are held to."""
+"""The prior volume in both stages of the fit: Gaussians are seeded in it and fitted to it, and later held to it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from g3r.gaussians.seeding import seed_cloud
 from g3r.run.deadline import Deadline
 
 MIN_DISTILLATION = 1e-3
-"""Weight of the prior where slices are dense; above zero so that every voxel of the head has one."""
+"""Smallest weight of the prior, where slices are dense; above zero so that every voxel of the head has a weight."""
 
 
 def fit_to_prior(
@@ -38,7 +38,7 @@ def fit_to_prior(
         rng: draws the planes of each step.
         progress: called with (steps done, steps in all).
         deadline: when the fit has to end.
-        observer: sees the fit at its steps.
+        observer: called at steps of the fit.
         shift: [3] of the lattice; see `seed_cloud`.
     """
     grid = prior.volumes.grid
@@ -51,9 +51,9 @@ def fit_to_prior(
 def distillation_target(prior: PriorVolume) -> VolumeTarget:
     """The prior volume with the weight of each voxel in the fit to the slices (the last term of G3R Eq. 9).
 
-    The prior counts where slices are sparse; where they are dense they know better. It was made of the same slices:
-    from several stacks only 1 - c of what it says there is its own. The density is that of the masked pixels, which
-    are all that the fit sees.
+    The prior counts where slices are sparse; where they are dense, they determine the volume better. It was made of the
+    same slices: with several stacks only 1 - c of what it shows in a voxel is its own, so the weight is (1 - c)^2. The
+    density is that of the masked pixels, the only ones that the fit sees.
     """
     volumes = prior.volumes
     power = 1 if volumes.slices.n_stacks == 1 else 2

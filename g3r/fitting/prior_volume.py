@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from g3r.prior.model import Prior
 
 KNOWN_DENSITY = 2 * UNSEEN_BELOW
-"""Density from which on the slices' volume is taken as it is where no template fills what is missing."""
+"""Density from which on the slices' volume is taken unchanged, if no template fills what is missing."""
 
 
 def placed_template(prior: Prior | None, orientation: Orientation | None) -> PlacedTemplate | None:
-    """The prior's template in the frame of the slices; None without a prior, or where that is not the atlas frame."""
+    """The prior's template in the frame of the slices; None without a prior, or if the slices have another frame."""
     if prior is None or orientation is None or not prior.network.config.use_template:
         return None
     return PlacedTemplate.of(prior.template, orientation.weeks, orientation.scale)
@@ -40,17 +40,17 @@ def prior_volume(
     tiling: Tiling,
     least_squares: bool = False,
 ) -> PriorVolume:
-    """V_prior (G3R Eq. 7) and the brain mask, in which the unseen part of the head is what its shape suggests.
+    """V_prior (G3R Eq. 7) and the brain mask; shape decides on the unseen part of the head.
 
     Args:
-        volumes: what the slices give by themselves.
+        volumes: volumes of the slices alone.
         gain: [K] of the slices.
         weight: [K] of the slices.
         prior: None takes V_sharp, smoothly continued into what was not seen.
-        placed: its atlas template; None where there is none, and the smooth continuation takes its place.
+        placed: its atlas template; if None, a smooth continuation takes its place.
         n_views: see `estimate_prior`.
         tiling: see `estimate_prior`.
-        least_squares: takes the least-squares volume for V_sharp where there is no prior: no fit will follow.
+        least_squares: takes the least-squares volume in place of V_sharp if there is no prior: no fit will follow.
     """
     share, seen = volumes.share, volumes.foreground
     if placed is not None:

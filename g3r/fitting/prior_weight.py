@@ -1,4 +1,4 @@
-"""How much of V_prior is in the written volume where slices are dense."""
+"""Weight of V_prior in the written volume, where slices are dense."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from g3r.fitting.slice_stage import SliceFit
 from g3r.fitting.voxel_problem import QUIET
 
 SINGLE_STACK_WEIGHT = 0.75
-"""Of V_prior with one stack, whose poses nothing but V_prior checks."""
+"""Weight of V_prior with one stack, whose poses only V_prior checks."""
 
 MAX_WEIGHT = 0.75
-"""However large the pixels are."""
+"""Upper bound of the weight, however large the pixels are."""
 
 FEWEST_STEPS = 16
-"""After fewer steps of the fit, where time or the user ended it, V_prior alone is better than any mixture."""
+"""Fewest steps of a fit whose Gaussians are shown: after fewer, if time or the user ended it, V_prior alone is better
+than any mixture."""
 
 LAST_STEPS = 5
-"""Of the fit, whose residuals say how noisy slices are."""
+"""Number of last steps of the fit whose residuals give the noise of the slices."""
 
 NORMAL_OVER_MEAN = math.sqrt(math.pi / 2)
 """Standard deviation of a normal distribution over its mean absolute value."""
 
 
 def noise_of(fit: SliceFit) -> float:
-    """Standard deviation of what the Gaussians left unexplained, in normalised intensities; 0 before the fit."""
+    """Standard deviation of the residuals of the Gaussians, in normalised intensities; 0 before the fit."""
     last = [entry["image"] for entry in fit.history[-LAST_STEPS:]]
     return NORMAL_OVER_MEAN * float(np.mean(last)) if last else 0.0
 
@@ -38,10 +39,10 @@ def prior_weight(
 ) -> float:
     """Least weight of V_prior in the volume, from 0 to 1.
 
-    Noise of the fit and errors of the network are different, so a mixture beats both. The fewer pixels there are for a
-    volume, and the noisier they are, the less they determine it and the better V_prior is beside them; the weight that
-    was best in simulated subjects falls with the root of their number and rises with that of their noise
-    (docs/method.md).
+    The noise of the fit and the errors of the network differ, so a mixture is better than either. The fewer
+    pixels there are for a volume, and the noisier they are, the less they determine it and the better V_prior is beside
+    them. The weight that was best in simulated subjects falls with the root of their number and rises with the root of
+    their noise (docs/method.md).
 
     Args:
         at_one_pixel: weight with one pixel per mm3; 0 leaves V_prior out.
@@ -57,10 +58,10 @@ def prior_weight(
 
 
 def ended_early(n_steps: int, n_asked: int) -> bool:
-    """Whether a fit made too few of its steps for its Gaussians to be shown.
+    """Whether a fit made too few steps for its Gaussians to be shown.
 
     Args:
-        n_steps: made.
+        n_steps: steps made.
         n_asked: by the settings; a fit that is meant to be shorter than `FEWEST_STEPS` is shown.
     """
     return n_steps < min(FEWEST_STEPS, n_asked)

@@ -1,4 +1,4 @@
-"""How weights and step sizes change during a fit."""
+"""Schedules of weights and step sizes during a fit."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ def cosine_decay(fraction: float, hold: float = 0.4, floor: float = 0.05) -> flo
 
 
 def prior_strength(schedule: AnnealedWeight, prior_error: float, fraction: float, residual: float) -> float:
-    """w(i) of G3R Eq. 9: annealed as there, but not below what the slices' residual and the prior's error ask for.
+    """w(i) of G3R Eq. 9: annealed, but not below what the slices' residual and the prior's error require.
 
     A voxel with confidence c counts as if 1 - c missing pixels had been read off the prior. Under L1 (Laplace
-    distributions) a pixel weighs one over its mean absolute error, so one read off the prior weighs
-    residual / prior_error times one that was measured: little where slices fit much better than the prior is
-    known to, much where noise or motion spoil them.
+    distributions) the weight of a pixel is one over its mean absolute error, so a pixel read off the prior weighs
+    residual / prior_error times a measured one: little where slices fit much better than the prior's error, much where
+    noise or motion spoil them.
 
     Args:
         schedule: the annealed weight.
-        prior_error: mean absolute error of the prior; 0 leaves the schedule alone.
+        prior_error: mean absolute error of the prior; with 0 the schedule alone decides.
         fraction: of the fit that is done.
         residual: mean absolute residual of the slices at present.
     """

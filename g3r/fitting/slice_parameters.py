@@ -51,8 +51,8 @@ class SliceParameters:
     """The state of the slices at the present parameters, and the gradients back.
 
     Blocks: rotation [K, 3] (rad) and translation [K, 3] (mm), R <- R exp(rotation), t <- t + translation;
-    log_gain [K], of which the mean is taken off; bias_field [n_stacks, 5]; shear [1], zero between steps (`OpenShear`).
-    What has no block stays as it is.
+    log_gain [K], whose mean is subtracted; bias_field [n_stacks, 5]; shear [1], zero between steps (`OpenShear`).
+    A quantity without a block stays constant.
 
     Args:
         slices: K slices.
@@ -95,7 +95,7 @@ class SliceParameters:
         )
 
     def finish(self, image: TermLoss, pose_prior_mm: float, bias_field_ridge: float) -> float:
-        """Write the gradients of poses, gains and fields; returns the terms of those alone.
+        """Write the gradients of poses, gains and fields; returns the loss terms of these alone.
 
         Args:
             image: the slices' image term. Its mean scales the pose prior, which is that mean times the mean square
@@ -110,14 +110,14 @@ class SliceParameters:
             radius2, n = self.radius_mm**2, max(1, len(rotation))
             loss += image.mean * (np.sum(translation**2) + radius2 * np.sum(rotation**2)) / n / pose_prior_mm**2
             pull = 2 * image.mean / n / pose_prior_mm**2
-            # the kernels differentiate in a rotation after the present one
+            # the kernels differentiate by a rotation after the present one
             after = np.einsum("kji,kj->ki", right_jacobian(rotation), image.plane_gradient[:, :3])
             gradient["rotation"][...] = after + pull * radius2 * rotation
             gradient["translation"][...] = image.plane_gradient[:, 3:6] + pull * translation
-            if self.open_shear is not None:  # after all that moves by it
+            if self.open_shear is not None:  # last, since it follows from the gradients of all that moves by it
                 gradient["shear"][0] = self.open_shear.slope(self.parameters)
         if "log_gain" in value:
-            slope = image.plane_gradient[image.chosen, 6]  # the mean of slices that were not seen is not known
+            slope = image.plane_gradient[image.chosen, 6]  # only slices that were seen have a known mean
             gradient["log_gain"][...] = 0.0
             gradient["log_gain"][image.chosen] = slope - slope.mean()
         if "bias_field" in value:
@@ -129,6 +129,6 @@ class SliceParameters:
         return loss
 
     def fold(self) -> None:
-        """Take the shear of the last step into what it moves."""
+        """Apply the shear of the last step to Gaussians and slices."""
         if self.open_shear is not None:
             self.open_shear.fold(self.parameters)

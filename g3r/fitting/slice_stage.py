@@ -1,4 +1,4 @@
-"""Stage 2 (G3R Eq. 9): Gaussians, poses and gains against the slices, the prior fading as a constraint."""
+"""Stage 2, the fit to the slices (G3R Eq. 9): Gaussians, poses and gains, with the prior as a fading constraint."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.run.deadline import Deadline, timed_steps
 
 AMPLITUDE_DAMPING = 0.05
-"""Pull of the first amplitudes towards stage 1 (relative): slices leave those of Gaussians between them open."""
+"""Pull of the first amplitudes towards stage 1 (relative): slices do not determine Gaussians that lie between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceStageSettings:
-    """How stage 2 runs.
+    """Settings of stage 2.
 
     Args:
         n_steps: optimiser steps.
-        n_parts: steps in which every slice is seen once; two steps on halves do more than one on all slices.
+        n_parts: steps in which every slice is seen once; two steps on half of the slices do more than one on all.
         amplitude_iterations: conjugate-gradient steps for the amplitudes at the start; 0 keeps those of stage 1.
         scale_weight: weight of the scale regulariser.
-        distillation: w(i), weight of the distance to the prior, unless `prior_error` asks for more.
+        distillation: w(i), weight of the distance to the prior, unless `prior_error` requires more.
         prior_error: mean absolute error of the prior, in normalised intensities (0.054 from one, 0.043 from three
             stacks on the validation subjects of the shipped weights); see `prior_strength`. With 0 the schedule
             alone decides.
@@ -80,7 +80,7 @@ class SliceFit:
         slices: in their last poses.
         gain: [K] intensity factors.
         weight: [K] slice weights.
-        history: terms of the loss of each step, with `rollback` where the divergence guard went back.
+        history: terms of the loss of each step, with `rollback` where the divergence guard rolled back.
         bias_field: [n_stacks][5] coefficients (see `StackBiasField`); empty where it was not estimated.
         further: clouds of fits on other lattices, whose mean with `cloud` is the volume (`fitting.lattice_mean`).
     """
@@ -117,12 +117,12 @@ def fit_slices(
         weight: [K] slice weights, from registration.
         prior: target of the distillation, with a weight from 0 (measured) to 1 (not measured) for each voxel; None
             without distillation.
-        settings: how long and how hard.
+        settings: numbers of steps, and weights.
         rng: draws the prior's planes.
         pixel_weight: [P] not negative; the slices' masks when None.
         progress: called with (steps done, steps in all).
-        deadline: fewer steps if they would end after it; schedules run to their ends even so.
-        observer: sees the fit at its steps.
+        deadline: fewer steps if they would end after it; schedules still run to their ends.
+        observer: called at steps of the fit.
 
     Raises:
         NumericalError: a loss that is not finite from the start.
@@ -230,8 +230,8 @@ class SliceLoss:
         self.prior: ImageTerm | None = None
         if prior is not None:
             self.prior = ImageTerm.of(prior.planes, prior.value, prior.weight, cutoff_sigma=settings.cutoff_sigma)
-            # the distance is a weighted mean, so this makes the term the mean over the head of weight times
-            # difference: well-measured heads feel little of it, sparsely measured ones much
+            # the distance is a weighted mean, so this factor makes the term the mean over the head of weight times
+            # difference: it is small in well-measured heads and large in sparsely measured ones
             self.prior_share = float(prior.weight[prior.weight > 0].mean())
             self._distil(self.prior)
 
@@ -239,7 +239,7 @@ class SliceLoss:
         self.distilled, self.distilled_state = term, PlaneState.of(term.planes, self.origin_mm)
 
     def draw(self, rng: np.random.Generator) -> None:
-        """Take other planes of the prior, at random."""
+        """Draw other planes of the prior at random."""
         if self.prior is not None:
             n = len(self.prior.planes)
             n_planes = max(1, round(self.settings.distillation_planes * n))
@@ -252,7 +252,7 @@ class SliceLoss:
     def evaluate(self, fraction: float) -> tuple[float, dict[str, float]]:
         """The loss at the present parameters and a fraction of the fit, and its terms by name.
 
-        The gradient is that of the part of the slices whose turn it is; the loss is that of all (`SliceTurns`).
+        The gradient is that of the slices whose turn it is; the loss is that of all slices (`SliceTurns`).
         """
         settings, terms = self.settings, {"slices": (self.term, self.state())}
         if self.prior is not None:
@@ -272,7 +272,7 @@ class SliceLoss:
         return loss, entry
 
     def reweight(self) -> float:
-        """Slice weights from the last residual of every slice; returns the image term over what it was."""
+        """Compute slice weights from the last residual of every slice; returns the new image term over the old."""
         if not self.turns.is_complete:  # after a rollback
             return 1.0
         residual = self.turns.residual

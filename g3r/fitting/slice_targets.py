@@ -1,4 +1,4 @@
-"""The slices as the fit sees them: their profile, and their rim without what lies beside the brain."""
+"""The slices as target of the fit: with their profile, and with what lies beside the brain taken out of their rim."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from g3r.fitting.initial_volumes import PriorVolume
 
 @dataclass(frozen=True, kw_only=True)
 class SliceModel:
-    """How a slice follows from the volume.
+    """Forward model of a slice: width of its profile, and treatment of its rim.
 
     Args:
         through_plane, in_plane: width of the profile over the nominal one (`psf_variance_mm2`). Slices that share a
-            blur in plane say nothing about it (the volume takes it up), so that width is set, not measured.
-        surroundings: whether what lies beside the brain is taken out of the pixels of its rim.
+            blur in plane do not determine it (the volume takes it up), so that width is set, not measured.
+        surroundings: whether what lies beside the brain is taken out of the pixels of the rim.
     """
 
     through_plane: float = 0.95
@@ -32,7 +32,7 @@ class SliceModel:
 
         Args:
             slices: K slices with the nominal profile.
-            widths: of each stack's profile through the plane, where the data say them, in place of the model's.
+            widths: of each stack's profile through the plane, if estimated, in place of the model's.
         """
         _, stack = np.unique(slices.stack_id, return_inverse=True)
         through = np.broadcast_to(self.through_plane if widths is None else np.asarray(widths), slices.n_stacks)[stack]
@@ -43,7 +43,7 @@ class SliceModel:
 
 @dataclass(frozen=True)
 class SliceTarget:
-    """What the fit is made to: the slices, and the weight [P] of each pixel."""
+    """Target of the fit: the slices, and the weight [P] of each pixel."""
 
     slices: Slices
     pixel_weight: NDArray[np.float32]
@@ -58,7 +58,7 @@ def slice_target(
         prior: with the slices and the support of the volume.
         weight: [K] slice weights.
         model: of the slices.
-        widths: of each stack's profile through the plane, where the data say them, in place of the model's.
+        widths: of each stack's profile through the plane, if estimated, in place of the model's.
     """
     slices = model.applied(prior.volumes.slices, widths)
     if not model.surroundings:

@@ -1,4 +1,4 @@
-"""Which slices a step of stage 2 looks at: a part of each stack, all slices within one cycle."""
+"""Parts of the slices for the steps of stage 2: each has slices of every stack, and a cycle of parts has all."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from g3r.fitting.objective import ImageTerm, TermLoss
 
 FEWEST_SLICES = 4
-"""A part has at least so many slices; fewer slices are split into fewer parts."""
+"""Fewest slices of a part; fewer slices are split into fewer parts."""
 
 
 def slice_parts(stack_id: NDArray[np.integer], n_parts: int) -> list[NDArray[np.intp]]:
@@ -31,9 +31,9 @@ def slice_parts(stack_id: NDArray[np.integer], n_parts: int) -> list[NDArray[np.
 
 
 class SliceTurns:
-    """The parts of the slices in turn, and what is known of all slices between their turns.
+    """The parts of the slices in turn, with the last residual of every slice.
 
-    A part fits better or worse than another. What is compared from step to step is therefore the mean over all
+    One part fits better or worse than another. So the loss that is compared from step to step is the mean over all
     slices, each with the residual of its last turn.
 
     Args:
@@ -54,7 +54,7 @@ class SliceTurns:
         return self.parts[(self._turn - 1) % len(self.parts)]
 
     def put(self, slices: TermLoss) -> None:
-        """Note the residuals of the slices that were looked at."""
+        """Store the residuals of the slices that a step has seen."""
         self.residual[slices.chosen] = slices.residual[slices.chosen]
         self._known[slices.chosen] = True
 

@@ -1,4 +1,4 @@
-"""From posed slices to V_prior of a subject: the volumes that slices give by themselves, and what the network adds."""
+"""V_prior of a subject from its posed slices: first the volumes of the slices alone, then the network's estimate."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NOTE_ON_SINGLE = {  # by whether they moved to the prior; None where that was no
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectPrior:
-    """Makes the volumes of a subject from its slices, as often as these move.
+    """Makes the volumes of a subject from its slices, again whenever they have moved.
 
     Args:
         network: None takes V_sharp, smoothly continued, for V_prior.
@@ -47,17 +47,17 @@ class SubjectPrior:
     least_squares: bool = False
 
     def refined_masks(self, stacks: Sequence[Stack], poses: Registration, intensity: float) -> RefinedMasks:
-        """Masks that were found, refined with the network's atlas template; see `refine_masks`.
+        """Automatic masks, refined with the network's atlas template; see `refine_masks`.
 
         Args:
             stacks: as they were registered.
             poses: of their slices.
-            intensity: of 1 in these slices.
+            intensity: that these slices were divided by.
         """
         return refine_masks(stacks, poses, intensity, placed_template(self.network, poses.orientation))
 
     def matched(self, poses: Registration) -> tuple[Registration, list[list[float]]]:
-        """Poses with slices and gains that match, and the fields that were divided out; see `match_intensities`."""
+        """Poses with matched slices and gains, and the fields that were divided out; see `match_intensities`."""
         found = match_intensities(poses.slices, poses.gain, poses.weight)
         return replace(poses, slices=found.slices, gain=found.gain), found.coefficients
 
@@ -69,7 +69,7 @@ class SubjectPrior:
         """V_prior (Eq. 7).
 
         Args:
-            volumes: that `volumes` gave.
+            volumes: result of `volumes`.
             poses: of their slices.
             n_views: see `estimate_prior`; 0 leaves the network out.
             tiling: see `estimate_prior`.
@@ -86,11 +86,11 @@ class SubjectPrior:
             tiling=tiling,
             least_squares=self.least_squares and placed is None and network is None,
         )
-        release_memory()  # the most that is ever freed at a time
+        release_memory()  # the largest amount that is freed at one time
         return found
 
     def again(self, poses: Registration, before: PriorVolume, n_views: int, tiling: Tiling) -> PriorVolume:
-        """V_prior of other poses.
+        """V_prior for other poses.
 
         Args:
             poses: with gains and weights that belong to them.
@@ -103,12 +103,12 @@ class SubjectPrior:
     def with_slices_moved(
         self, prior: PriorVolume, poses: Registration, n_moves: int, n_views: int, tiling: Tiling
     ) -> PriorVolume:
-        """The slices of a single stack registered to the prior volume, and the prior volume that they give there.
+        """The slices of a single stack registered to the prior volume, and the prior volume that is made of them there.
 
         Args:
-            prior: of the stack; its own slices come back where they do not fit it better after moving.
+            prior: of the stack; returned with its own slices if these do not fit it better after a move.
             poses: that it was made with.
-            n_moves: how often at most; the first that does not bring slices much nearer to their volume is not made.
+            n_moves: largest number of moves; a move that does not bring slices much nearer to their volume is not made.
             n_views: see `estimate_prior`.
             tiling: see `estimate_prior`.
         """

@@ -1,4 +1,4 @@
-"""Whether a finished volume explains the slices at least as well as the volumes that it was made from."""
+"""Check that a finished volume explains the slices at least as well as the volumes that it was made from."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from g3r.fitting.bias_field import StackBiasField
 from g3r.geometry import VolumeGrid
 
 INSIDE = 0.99
-"""Share of a pixel in the brain from which on it counts."""
+"""Share of a pixel in the brain from which on the pixel counts."""
 MAX_PIXELS = 100_000
-"""Pixels that are asked at most; more change a residual by less than 0.0005."""
+"""Largest number of pixels in use; more change a residual by less than 0.0005."""
 EQUAL = 0.03
-"""Residuals of which the smaller is less by no more than this share of the larger are equal. V_prior shows more of the
-slices' noise, which explains them, too: at an SNR of 4 to 6 its residual was smaller by up to 0.015 of the volume's on
-heads on which the volume was nearer to the truth by 0.7 to -0.3 dB (seven heads, by hand)."""
+"""Two residuals are equal if the smaller is less than the larger by no more than this share of it. V_prior shows more
+of the slices' noise, which also explains them: at an SNR of 4 to 6 its residual was smaller by up to 0.015 of the
+volume's on heads on which the volume was nearer to the truth by 0.7 to -0.3 dB (seven heads, by hand)."""
 N_ROUNDS = 2
-"""Gains of slices and fields of stacks are found in turn; a third round does not change the third digit."""
+"""Rounds in which gains of slices and fields of stacks are found in turn; a third does not change the third digit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class VolumeCheck:
         return self.prior < (1 - EQUAL) * self.volume
 
     def line(self) -> str:
-        """What a user reads where the fit made things worse; empty where it did not."""
+        """The line for a user if the fit made things worse; else empty."""
         if self.falls_back:
             return (
                 f"the fit made the volume worse: it explains the slices with a residual of {self.volume:.3f}, the "
@@ -71,15 +71,15 @@ def check_volume(
     slices_before: Slices,
     weight: NDArray[np.float64],
 ) -> VolumeCheck:
-    """Compare the finished volume with those that it started from, by the slices that all of them have seen.
+    """Compare the finished volume with the volumes that it started from, by slices that all of them have seen.
 
-    Slices that were held out of the fit alone would not be fair to it: V_prior and V_coarse have seen them.
+    Slices held out of the fit alone would not be fair to the fit: V_prior and V_coarse have seen them.
 
     Args:
         volume: the finished one [I, J, K].
         prior: V_prior as it would be written [I, J, K].
         coarse: V_coarse [I, J, K].
-        support: [I, J, K] of the brain; pixels that reach out of it do not count, since what lies there is not shown.
+        support: [I, J, K] of the brain; pixels that reach beyond it do not count, since the volume ends there.
         grid: of all these.
         slices: K slices in their last poses.
         slices_before: in the poses that V_prior and V_coarse were made with.
@@ -99,8 +99,9 @@ def _residuals(
 ) -> list[float]:
     """Weighted errors after a gain for each slice and a bias field for each stack, relative to the intensities.
 
-    Slices show the bias fields of their stacks. V_coarse and V_prior are means over them, and still hold what stacks
-    share; the finished volume is free of them. Without fields of their own the purest volume would explain least.
+    Slices show the bias fields of their stacks. V_coarse and V_prior are means over the stacks and still contain the
+    part that stacks share; the finished volume does not. Without fields fitted to each volume, the one that is freest
+    of them would explain least.
 
     Args:
         volumes: [I, J, K] each.
@@ -110,7 +111,7 @@ def _residuals(
         weight: [K].
 
     Returns:
-        The share of each volume, 0 where no pixel counts. See `check_volume`.
+        The relative error of each volume, 0 where no pixel counts. See `check_volume`.
     """
     index = slices.pixel_index[:: 1 + len(slices.pixel_index) // MAX_PIXELS]
     operator = VoxelOperator(slices.planes, grid, index)

@@ -1,10 +1,10 @@
-"""What slices still say of a volume that its Gaussians cannot show, as a correction of the volume on voxels.
+"""Correction of a volume on voxels, by detail in the slices that its Gaussians cannot show.
 
     minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s |grad V| ]_v
 
 V_0 is the mixture of Gaussians and V_prior, A the voxel operator with the profiles of the fit, y the pixels without
-gains and fields, r the mean coverage of a voxel. Gaussians stand further apart than voxels: an edge between two of them
-comes out too soft. The correction D = V - V_0 sharpens it as far as the slices ask for it against h and s.
+gains and fields, r the mean coverage of a voxel. Gaussians lie further apart than voxels, so an edge between two of
+them comes out too soft. The correction D = V - V_0 sharpens it as far as the slices require it against h and s.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from g3r.fitting.voxel_problem import Array, FitPixels, VoxelProblem, VoxelProbl
 from g3r.geometry import VolumeGrid
 
 PROBE_SIGMA_MM, KEPT_SIGMA_MM = 0.4, 3.2
-"""Width of the random change by which it is found how much of V_0 stays, and of the neighbourhoods in which answers are
-compared (as in `uncertainty.prior_share`). Of wider changes less stays; of this one about as much as of V_prior - V_G,
-or a little less: 0.51 and 0.63 of 0.53 and 0.69 in a simulated and a real subject."""
+"""Width of the random change that measures how much of V_0 stays, and of the neighbourhoods in which responses are
+compared (as in `uncertainty.prior_share`). Of wider changes less stays; of this one about as much as of V_prior - V_G
+(V_G: the Gaussians alone), or a little less: 0.51 and 0.63 of 0.53 and 0.69 in a simulated and a real subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelCorrectionSettings(VoxelProblemSettings):
-    """How the volume is corrected; intensities are normalised."""
+    """Settings of the correction; intensities are normalised."""
 
     hold: float = 0.6
     total_variation: float = 0.015
@@ -38,10 +38,10 @@ class VoxelCorrectionSettings(VoxelProblemSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelCorrectionRecord:
-    """What was corrected.
+    """Record of the correction.
 
     Attributes:
-        hold: that was taken, by the noise of the slices.
+        hold: the hold in use, adapted to the noise of the slices.
         size: root mean square of the correction in the brain, in normalised intensities.
     """
 
@@ -54,7 +54,7 @@ class VoxelCorrection:
     """The correction of a volume.
 
     Attributes:
-        values: D [I, J, K], to be added to V_0. Rounded to float16, as which it is kept.
+        values: D [I, J, K], to be added to V_0. Rounded to float16, in which it is stored.
         kept: share [I, J, K] of a small change of V_0 that would stay in V.
         record: for run.json.
     """
@@ -81,11 +81,11 @@ def correct_on_voxels(
         pixel_weight: [P] of the fit.
         grid: of the volume.
         reach: [I, J, K] from 0 to 1, how much of the correction counts: 0 where there are no Gaussians or slices.
-        settings: how strong.
-        rng: draws the change by which `kept` is found.
+        settings: hold, strength of total variation, and numbers of steps.
+        rng: draws the change that measures `kept`.
     """
     whole = FitPixels.of(fit, fit.slices, pixel_weight)
-    # how far slices of a single stack are off counts as noise: no other stack checks their poses
+    # pose errors of a single stack count as noise: no other stack checks its poses
     chosen = settings.for_noise((whole.error if fit.slices.n_stacks == 1 else whole.noise)(volume, grid))
     problem = VoxelProblem(whole, grid, chosen)
     found = problem.solved(volume)

@@ -1,4 +1,4 @@
-"""A volume on voxels that explains pixels of a fit, held near another volume and kept smooth between edges.
+"""A volume on voxels that explains the pixels of a fit, held near another volume and kept smooth between edges.
 
     minimise over V:  sum_p w_p (A V - y)_p^2  +  r sum_v [ h (V - V_0)^2 + s (|grad V| + q |grad V|^2) ]_v
 
@@ -26,28 +26,28 @@ from g3r.geometry import VolumeGrid
 Array = NDArray[np.float32]
 
 FINE_VOXEL, TOO_FINE_VOXEL = 0.6, 0.5
-"""Share of a pixel below which a voxel may lie between pixels that are read along their normals alone, so that they get
-nodes in plane as well; and below which these leave holes, too, and nothing is asked of the pixels."""
+"""Voxel over pixel size, twice. Below the first, voxels may lie between pixels that are read along their normals alone,
+so pixels get nodes in plane as well. Below the second these leave holes, too, and the pixels are not used."""
 
 
 QUIET = 0.03
 """Standard deviation of noise, in normalised intensities, up to which the settings hold as they are: a little more than
-that of stacks with a signal-to-noise ratio of 20 (0.024), since what a volume lacks in detail is counted, too. The word
-of noisier slices counts less, by the square of it, as in a MAP estimate: with a ratio of 5 and two stacks of a
+that of stacks with a signal-to-noise ratio of 20 (0.024), since detail that a volume lacks counts as noise, too.
+Noisier slices count less, by the square of their noise, as in a MAP estimate: with a ratio of 5 and two stacks of a
 simulated subject an unchanged hold cost 0.6 dB against no correction."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelProblemSettings:
-    """How a volume is found.
+    """Settings of the minimisation.
 
     Args:
-        hold: h, pull towards V_0, over what slices measure in a voxel.
+        hold: h, pull towards V_0, relative to what slices measure in a voxel.
         total_variation: s.
-        tip: change from voxel to voxel below which total variation is a square.
-        n_rounds: solutions, each with the edges of the one before.
+        tip: change from voxel to voxel below which total variation is quadratic.
+        n_rounds: number of solutions, each with the edges of the one before.
         n_iterations: conjugate-gradient steps of each.
-        squares: q, against voxels that stand out by themselves, which total variation lets stand.
+        squares: q, against isolated voxels that stand out, which total variation lets stand.
     """
 
     hold: float
@@ -64,7 +64,7 @@ class VoxelProblemSettings:
 
 
 def too_fine(voxel_mm: float, slices: Slices) -> bool:
-    """Whether voxels are too small for the pixels of slices to say what is in each."""
+    """Whether voxels are too small for the pixels of slices to determine each."""
     return voxel_mm / float(np.median(slices.planes.spacing_mm)) < TOO_FINE_VOXEL
 
 
@@ -91,7 +91,7 @@ class FitPixels:
         """The masked pixels of slices of a fit, or of the same slices with other values or masks.
 
         Args:
-            fit: its gains, fields and slice weights are taken.
+            fit: its gains, fields and slice weights are used.
             slices: in the poses of the fit.
             pixel_weight: [P].
         """
@@ -103,7 +103,7 @@ class FitPixels:
         return cls(slices=slices, index=index, plane=plane, value=value.astype(np.float32), weight=weight.astype("f4"))
 
     def take(self, chosen: NDArray[np.bool_]) -> FitPixels:
-        """Some of them: bool [P']."""
+        """The pixels at a mask [P']."""
         kept = {name: getattr(self, name)[chosen] for name in ("index", "plane", "value", "weight")}
         return replace(self, **kept)
 
@@ -119,7 +119,7 @@ class FitPixels:
         return float(np.sqrt((self.weight * off**2).sum() / max(float(self.weight.sum()), 1e-30)))
 
     def noise(self, volume: Array, grid: VolumeGrid) -> float:
-        """Standard deviation of the same from its median, so that edges that the volume shows too soft hardly count."""
+        """Robust standard deviation of these errors, in which edges that the volume shows too soft hardly count."""
         counts = self.weight > 0.5 * self.weight.max(initial=0)
         return robust_width(self._off(volume, grid)[counts]) if counts.any() else 0.0
 
@@ -134,7 +134,7 @@ class VoxelProblem:
     """The minimisation for some pixels and a hold.
 
     Args:
-        pixels: that are explained.
+        pixels: to be explained.
         grid: of the volumes.
         settings: hold, strength of total variation, and how long.
     """
@@ -147,7 +147,7 @@ class VoxelProblem:
         self.hold, self.strength = (np.float32(typical * one) for one in (settings.hold, settings.total_variation))
 
     def solved(self, volume: Array) -> Array:
-        """V [I, J, K] of V_0."""
+        """V [I, J, K] for V_0 [I, J, K]."""
         target = self.operator.adjoint(self.pixels.weight * self.pixels.value) + self.hold * volume
         found = volume
         for _ in range(self.settings.n_rounds):
@@ -155,15 +155,15 @@ class VoxelProblem:
         return found
 
     def edges(self, volume: Array) -> Array:
-        """What `solve` takes for the edges of a volume [I, J, K]."""
+        """Weights of total variation by the edges of a volume [I, J, K], for `solve`."""
         return diffusivity(volume, self.settings.tip) + np.float32(self.settings.squares)
 
     def solve(self, target: Array, start: Array, edges: Array) -> Array:
-        """One solution of the normal equations with edges that are known.
+        """One solution of the normal equations with given weights of total variation.
 
         Args:
-            target: [I, J, K] their right side.
-            start: [I, J, K] where it begins.
+            target: [I, J, K] right-hand side.
+            start: [I, J, K] where the iteration begins.
             edges: [I, J, K] of `edges`.
         """
 

@@ -18,7 +18,7 @@ from g3r.gaussians.render import CUTOFF_SIGMA
 from g3r.run.on_demand import torch
 
 MAX_PROJECTION_BYTES = 400_000_000
-"""Gaussians are projected once for all products if the projections take no more than this."""
+"""Gaussians are projected once for all products if their projections take no more than this."""
 
 
 class AmplitudeSystem:
@@ -30,7 +30,7 @@ class AmplitudeSystem:
         gain: [K] intensity factors; 1 when None.
         overlaps: list from `find_overlaps`; made here when None.
         cutoff_sigma: where a Gaussian ends.
-        projection_bytes: memory for projections; with less than they need they are made again in every product.
+        projection_bytes: memory for projections; if they need more, they are made again in every product.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ def solve_amplitudes(
         weight: [P] non-negative; zero leaves a pixel out.
         gain: [K] intensity factor of each plane.
         n_iterations: largest number of products with A and A^T.
-        damping: relative; above zero keeps Gaussians that no pixel sees where they were.
+        damping: relative; above zero, Gaussians that no pixel sees stay at their amplitudes.
         overlaps: list from `find_overlaps`.
         cutoff_sigma: as in `render`.
         projection_bytes: see `AmplitudeSystem`; less memory, more seconds, the same result.
@@ -142,7 +142,7 @@ def solve_amplitudes(
             break
         image = system.forward(direction).astype(np.float64)
         curvature = float(weight @ image**2) + shift * float(direction @ direction)
-        if not curvature > 0:  # what is left of the gradient is rounding, in a direction that changes nothing
+        if not curvature > 0:  # the rest of the gradient is rounding, in a direction that changes nothing
             break
         length = norm / curvature
         step += length * direction

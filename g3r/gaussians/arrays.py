@@ -1,4 +1,4 @@
-"""Arguments of the kernels in groups: numba takes a named tuple of arrays as it takes single arrays.
+"""Groups of kernel arguments: numba takes a named tuple of arrays as it takes single arrays.
 
 What a parallel kernel writes is an argument of its own: numba does not see that an array from a tuple is the caller's,
 and drops a loop that writes nothing else. Scratch space may be grouped, since what is written there is read again.
@@ -39,7 +39,7 @@ class CloudArrays(NamedTuple):
 
 
 class PlaneArrays(NamedTuple):
-    """K planes as they are at the moment.
+    """K planes at their present poses.
 
     Attributes:
         rotation: [K, 3, 3].
@@ -86,8 +86,8 @@ class Workspace(NamedTuple):
     """Scratch space, a row for each worker.
 
     Attributes:
-        images: [n_workers, padded pixels] of the plane that a worker is at.
-        projections: [n_workers, pairs] of that plane.
+        images: [n_workers, padded pixels] image of the plane that a worker is at.
+        projections: [n_workers, pairs] projections onto that plane.
     """
 
     images: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""The scene: a cloud of 3D Gaussians, without optimiser state and without appearance models."""
+"""The cloud of 3D Gaussians that represents the head, without optimiser state and without appearance models."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SIGMA_RANGE_MM = (1e-6, 1e6)
-"""No structure of a head is outside this range; beyond it the kernels' integers and float32 overflow."""
+"""Allowed sigma: no structure of a head is outside, where the kernels' integers and float32 overflow."""
 
 MAX_LOG_SCALE = 13.816
 """Logarithm of the largest sigma, and of one over the smallest."""
 
 MIN_QUATERNION = 1e-15
-"""Shorter ones have no direction, and gradients grow as one over their length."""
+"""Length below which a quaternion has no direction; gradients grow as one over the length."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from g3r.gaussians.simd import N_LANES, add_strip
 f32 = np.float32
 
 LOOSE = {"contract", "arcp", "nsz"}
-"""How the compiler may transform sums; NaN keeps its meaning, because comparisons guard against it."""
+"""Fast-math flags of the compiler; NaN is preserved, because comparisons guard against it."""
 
 SHAPE_COLUMNS = 10
 """Columns of a Gaussian's derived shape: mean (3), covariance xx xy xz yy yz zz, s1 s2 s3."""
@@ -51,7 +51,7 @@ PROJECTION = np.dtype(
         ("gaussian", np.int32),
     ]
 )
-"""The 2D Gaussian that a 3D Gaussian is on a plane, in pixels.
+"""A projection: the 2D Gaussian that a 3D Gaussian leaves on a plane, in pixels.
 
 Height over the amplitude (with gain); exponent as in `simd`; centre at (row + x, column + y); half the sides of the box
 around the ellipse at the cut-off; number of the Gaussian.
@@ -136,7 +136,7 @@ def project(shapes, planes, overlaps, k, cut, exact, projections):
 def strip_rows(record, cut, first, last, n_x):
     """First row and number of rows of the ellipse between two columns (given from its centre).
 
-    The row furthest out is the ellipse's own if its column is in the strip, else where a border cuts it.
+    The outermost row is that of the ellipse if its column is in the strip; else it is where a border cuts the ellipse.
     """
     hx, hy, slope = record.half_x, record.half_y, record.slope
     up, down = slope * hx, -slope * hx
@@ -199,7 +199,7 @@ def load(image, pixels, offset, n_x, n_y):
     pitch = n_y + N_LANES
     for x in range(n_x):
         begin, row = offset + x * n_y, x * pitch
-        for y in range(n_y):  # slices would compile numba's message about shapes, for seconds
+        for y in range(n_y):  # an assignment of slices would compile numba's message about shapes, for seconds
             image[row + y] = pixels[begin + y]
         image[row + n_y : row + pitch] = f32(0.0)
     image[n_x * pitch : n_x * pitch + N_LANES] = f32(0.0)

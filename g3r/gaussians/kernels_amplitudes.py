@@ -23,8 +23,8 @@ class HeldProjections(NamedTuple):
 
     Attributes:
         start: [K + 1] of the overlap list; plane k begins at `start[k] - start[first]`.
-        projections: room for those of the whole range.
-        n_touching: [K] how many of them touch each plane.
+        projections: room for the projections of the whole range.
+        n_touching: [K] number of projections on each plane.
     """
 
     start: NDArray[np.int64]
@@ -34,7 +34,7 @@ class HeldProjections(NamedTuple):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def set_up(part, shapes, planes, overlaps, cut, projections, n_touching):
-    """Project the Gaussians onto the planes of a part; writes the last two, which are those of `held`."""
+    """Project the Gaussians onto the planes of a part; writes `projections` and `n_touching`, the arrays of `held`."""
     first, last = part
     start = overlaps.start
     for k in numba.prange(first, last):

@@ -141,7 +141,7 @@ def backward(cloud, planes, overlaps, cut, exact, work, weight, buffers, plane_g
 
 @numba.njit(forceinline=True)
 def _quaternion_gradient(quaternion, j, rows, out):
-    """Gradient in quaternion j of sum(rows * R), which the normalisation keeps at right angles to it."""
+    """Gradient by quaternion j of sum(rows * R), at right angles to the quaternion, since R normalises it."""
     w, x, y, z = (float(quaternion[j, 0]), float(quaternion[j, 1]), float(quaternion[j, 2]), float(quaternion[j, 3]))
     length = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length

@@ -13,10 +13,10 @@ from g3r.gaussians.kernels import LOOSE
 f32 = np.float32
 
 SLACK_MM = 1e-4
-"""Error of float32 in the distance of a Gaussian from a plane of the same scene."""
+"""Bound of the float32 error in the distance of a Gaussian from a plane of the same scene."""
 
 VARIANCE_SLACK = 1e-6
-"""Error of float32 in a variance along an axis, over the trace; in a flat Gaussian it is all of the variance."""
+"""Bound of the float32 error in a variance along an axis, over the trace; for a flat Gaussian it is all of it."""
 
 
 class PlaneExtents(NamedTuple):
@@ -72,9 +72,9 @@ def _mark(columns, r, t, psf, half, cut, marks):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def find(columns, planes, cut, marks, start, order):
-    """Numbers of the Gaussians of each plane, ascending, into `order`; of none into an empty `order`.
+    """Write the numbers of the Gaussians of each plane, ascending, into `order`; an empty `order` counts them only.
 
-    Called twice: first start [K + 1] is made, then order [start[K]] is filled.
+    Called twice: the first call makes start [K + 1], the second fills order [start[K]].
 
     Args:
         columns: [9, N] float32 of `columns_of`.

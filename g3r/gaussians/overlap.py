@@ -52,7 +52,7 @@ def find_overlaps(cloud: GaussianCloud, planes: Planes, cutoff_sigma: float) -> 
 
 
 class OverlapFinder:
-    """Makes overlap lists again and again, in memory taken once."""
+    """Makes overlap lists repeatedly, in memory taken once."""
 
     def __init__(self, n_gaussians: int) -> None:
         self.columns = np.empty((9, n_gaussians), np.float32)
@@ -78,7 +78,7 @@ class OverlapFinder:
         """
         half = np.zeros((len(planes), 3), np.float32)
         half[:, :2] = (planes.shape - 1) / 2 * planes.spacing_mm
-        # float32 is enough from the middle of the planes, wherever the cloud's origin is
+        # relative to the middle of the planes, float32 is enough, wherever the cloud's origin is
         middle = center_mm.mean(0) if len(center_mm) else np.zeros(3)
         single = [array.astype(np.float32) for array in (rotation, center_mm - middle, planes.psf_var_mm2)]
         extents = PlaneExtents(single[0], single[1], single[2], half)

@@ -23,7 +23,7 @@ CUTOFF_SIGMA = 3.2
 """Gaussians end here by default; at 3.2 sigma a Gaussian has fallen to 0.6 % of its amplitude."""
 
 MAX_CUTOFF_SIGMA = 6.0
-"""The polynomial exponential holds to here (e = -18)."""
+"""Largest cut-off: the polynomial exponential is accurate to here (e = -18)."""
 
 ATTENUATIONS = ("exact", "printed")
 
@@ -85,7 +85,7 @@ def render(
     if overlaps is None:
         overlaps = find_overlaps(cloud, moved_planes(planes, twist), cutoff_sigma)
     exact = attenuation == "exact"
-    from g3r.gaussians.render_function import RenderFunction  # its class derives from one of torch
+    from g3r.gaussians.render_function import RenderFunction  # imports torch, since it derives from one of its classes
 
     pixels: Tensor = RenderFunction.apply(
         *cloud.parameters, twist, log_gain, cloud.origin_mm, planes, overlaps, cutoff_sigma, exact

@@ -18,7 +18,7 @@ from g3r.gaussians.render import moved_planes, right_jacobian
 
 
 class RenderFunction(torch.autograd.Function):
-    """Pixels of planes, and the gradients of a loss in the Gaussians, poses and gains; see `render`."""
+    """Pixels of planes, and the gradients of a loss by Gaussians, poses and gains; see `render`."""
 
     @staticmethod
     def forward(
@@ -61,7 +61,7 @@ class RenderFunction(torch.autograd.Function):
         kernels_backward.shape_gradients(log_scale, quaternion, buffers, *found)
         pose = plane_gradient[:, :6]
         if twist is not None:
-            # the kernels differentiate in a rotation after the present one: exp(w + dw) = exp(w) exp(J_r dw)
+            # the kernels differentiate by a rotation after the present one: exp(w + dw) = exp(w) exp(J_r dw)
             jacobian = right_jacobian(twist.detach().double().numpy()[:, :3])
             pose = np.concatenate([np.einsum("kji,kj->ki", jacobian, pose[:, :3]), pose[:, 3:]], axis=1)
         arrays = (*found, pose, plane_gradient[:, 6])

@@ -10,8 +10,8 @@ at dx = dx_0 + n (in pixels from the Gaussian's centre), pixel l has u = u_0 + l
 
     e = e_0 + q_x dx^2 + q_u u^2
 
-which is a sum of terms that are not positive: nothing cancels, however flat the ellipse. It counts where
-e >= limit. exp(e) is a polynomial of e/16, squared four times: within 2e-7 absolutely for e in [-18, 0].
+which is a sum of terms that are not positive: nothing cancels, however flat the ellipse. Pixels with e >= limit
+count. exp(e) is a polynomial of e/16, squared four times: within 2e-7 absolutely for e in [-18, 0].
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def strip_moments(typing_context, image, first, pitch, n_rows, e_0, q_x, q_u, sl
 
     def emit(context, builder, signature, values):
         strip = _Strip(context, builder, values[:-1])
-        # dy belongs to the lane and not to the row: three sums in the loop, the others at its end
+        # dy depends on the lane and not on the row: three sums in the loop, the others at its end
         sums = [cgutils.alloca_once_value(builder, strip.zero) for _ in range(3)]
         with cgutils.for_range(builder, strip.given["n_rows"]) as loop:
             dx = strip.scalar_dx(loop.index)

@@ -1,4 +1,4 @@
-"""Voxel grids (a shape and an affine, RAS+ mm from index), bounding boxes, and maps read on another grid."""
+"""Voxel grids (a shape and an affine, RAS+ mm from index), bounding boxes, and maps resampled on another grid."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.ndimage import affine_transform
 from g3r.geometry.rigid import RigidPose
 
 SLAB = 32
-"""Planes of a map that are read at once; their number does not depend on that of threads, and so no rounding does."""
+"""Planes of a map that are read at once. It does not depend on the number of threads, so neither does rounding."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class VolumeGrid:
         if affine.shape != (4, 4) or not np.isfinite(affine).all():
             raise ValueError("grid affine must be a finite 4x4 matrix")
         spacing = np.linalg.norm(affine[:3, :3], axis=0)
-        # relative to the voxel's own size, so that it has no hidden unit
+        # relative to the voxel's own size, so that the limit has no unit
         if spacing.min() == 0 or abs(np.linalg.det(affine[:3, :3] / spacing)) < 1e-6:
             raise ValueError("grid affine is singular")
         object.__setattr__(self, "shape", shape)
@@ -76,7 +76,7 @@ class VolumeGrid:
         return cls((shape[0], shape[1], shape[2]), affine)
 
     def respaced(self, spacing_mm: float) -> VolumeGrid:
-        """The axis-aligned grid of cubic voxels of another size over the same box; this one if its voxels have it."""
+        """The axis-aligned grid of cubic voxels of another size over the same box; this grid if it has that size."""
         if np.isclose(self.spacing_mm[0], spacing_mm, rtol=1e-6):
             return self
         return VolumeGrid.isotropic(self.world([0, 0, 0]), self.world(np.array(self.shape) - 1), spacing_mm)
@@ -148,7 +148,7 @@ def bounding_box(mask: NDArray[np.bool_], margin: ArrayLike = 0) -> tuple[slice,
 
 
 def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, outside: float) -> NDArray[np.float32]:
-    """A map read on another grid by trilinear interpolation.
+    """A map resampled on another grid by trilinear interpolation.
 
     Args:
         data: [I, J, K] on `source`.
@@ -165,6 +165,6 @@ def on_grid(data: NDArray[np.floating], source: VolumeGrid, target: VolumeGrid, 
         shift, part = index[:3, 3] + index[:3, 0] * first, found[first : first + SLAB]
         affine_transform(data, index[:3, :3], shift, part.shape, part, order=1, mode="constant", cval=outside)
 
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:  # scipy takes one thread, and releases Python's lock
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:  # scipy uses one thread and releases the GIL
         list(pool.map(fill, range(0, len(found), SLAB)))
     return found

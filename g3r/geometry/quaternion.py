@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def rotation_from_quaternion(quaternion_wxyz: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions [N, 4] of any length but zero."""
-    # by the largest entry first: squares of 1e-30 are zero in float32, and no epsilon fits every length
+    # scaled by the largest entry first: squares of 1e-30 are zero in float32, and no epsilon fits every length
     largest = quaternion_wxyz.detach().abs().amax(1, keepdim=True)
     scaled = quaternion_wxyz / largest
     return rotation_from_unit_quaternion(scaled / scaled.norm(dim=1, keepdim=True))

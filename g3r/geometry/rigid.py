@@ -118,7 +118,7 @@ def orthonormal(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def fit_rigid(
     source_mm: NDArray[np.float64], target_mm: NDArray[np.float64], weight: NDArray[np.float64] | None = None
 ) -> RigidPose:
-    """The one motion that takes points nearest to others in (weighted) least squares.
+    """The one motion that brings points nearest to their targets in (weighted) least squares.
 
     Args:
         source_mm: [P, 3].

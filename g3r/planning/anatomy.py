@@ -1,4 +1,4 @@
-"""What the stacks show, and what it is called where people are told of it."""
+"""The anatomy that stacks show, and its name in messages."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ GENERIC: Final = "generic"
 ANATOMIES: tuple[Anatomy, ...] = (FETAL_BRAIN, GENERIC)
 
 NAME_OF: dict[Anatomy, str] = {FETAL_BRAIN: "brain", GENERIC: "object"}
-"""In sentences on a volume."""
+"""Names in sentences about a volume."""
 
 NOTE_ON_OTHERS: Final = (
     "anatomy generic: no atlas, pose network or prior was used; the volume stays in scanner space, and its uncertainty "
     "was calibrated on fetal brains"
 )
-"""For run.json."""
+"""Note for run.json."""

@@ -1,4 +1,4 @@
-"""How much memory each stage of a reconstruction takes, stated before it starts.
+"""Estimate of the memory that each stage of a reconstruction takes, stated before it starts.
 
 Bytes follow from sizes that are known beforehand: pixels, the grid that the masks need at their header poses,
 the voxels of the output, the Gaussians that the head holds. The factors are measured (`python -m
@@ -24,10 +24,10 @@ from g3r.run.kernel_cache import needs_compiling
 from g3r.run.machine import held_bytes
 
 GRID_SLACK = 1.1
-"""Voxels over those of the box at header poses: heads that were turned into the atlas frame."""
+"""Factor on the voxels of the box at header poses, for heads that are turned into the atlas frame."""
 
 PROJECTION_BYTES = 48
-"""A kept projection of a Gaussian on a plane (`gaussians.kernels.PROJECTION`)."""
+"""Bytes of a stored projection of a Gaussian on a plane (`gaussians.kernels.PROJECTION`)."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class MemoryEstimate:
 
     @property
     def stage(self) -> Stage:
-        """Which one needs most."""
+        """The stage that needs most."""
         return max(self.stages, key=lambda name: self.stages[name])
 
     @property
@@ -47,13 +47,13 @@ class MemoryEstimate:
         return self.stages[self.stage]
 
     def line(self) -> str:
-        """The statement for people."""
+        """The line for the terminal."""
         return f"needs about {gigabytes(self.peak)} of memory, most of it in {self.stage}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSizes:
-    """Counts that the estimate is made from."""
+    """Counts that the estimate is made from: pixels, voxels, Gaussians, and pairs of Gaussian and plane."""
 
     n_pixels: int
     prior_shape: tuple[int, ...]
@@ -78,7 +78,7 @@ def estimate_memory(
         slices: at their header poses.
         settings: of the reconstruction.
         n_threads: of the kernels.
-        process_bytes: what the process holds before; as it is now when None.
+        process_bytes: memory of the process before; its present memory when None.
         prior_voxel_mm: voxel size of the prior; that of the output when None.
         at_once: with `release_memory_eagerly`.
     """
@@ -135,13 +135,13 @@ def estimate_memory(
 
 
 # Bytes, measured; see the module's docstring.
-# Part of what the compiler holds in a run that finds no kernel compiled counts as a library. By the peaks of a small
-# run with NUMBA_CACHE_DIR at an empty folder and again at the same one it is 250 MB with a fit, 150 MB without one; the
-# rest of the first is added where there is nothing compiled. SimpleITK takes 80 MB.
+# The memory of the compiler, in a run that finds no kernel compiled, is 250 MB with a fit and 150 MB without one, by
+# the peaks of a small run with NUMBA_CACHE_DIR at an empty folder and again at the same one. Part of it counts as a
+# library; the rest of the 250 MB is added where nothing is compiled. SimpleITK takes 80 MB.
 LIBRARIES_LATER, LIBRARIES_LATER_AT_ONCE = 315_000_000, 275_000_000
 COMPILER_BYTES = 80_000_000
 FIT_LIBRARIES = 90_000_000  # the part of these, beside torch, that a run without Gaussians does not load or compile
-READ_MASKS_PER_VOXEL, WRITING_ALONE_PER_VOXEL = 12, 14  # of such a run
+READ_MASKS_PER_VOXEL, WRITING_ALONE_PER_VOXEL = 12, 14  # of a run without Gaussians
 SLICES_PER_PIXEL = 45
 VOLUMES_PER_VOXEL = 20
 REGISTRATION_PER_PIXEL = 150
@@ -158,7 +158,7 @@ SHARE_PER_PIXEL, SHARE_PER_VOXEL, PREDICTORS_PER_VOXEL, WRITING_PER_VOXEL = 60, 
 
 
 def _libraries_to_come(settings: ReconstructionSettings) -> int:
-    """What the libraries will hold that are imported on demand, and the compiler where it has work to do."""
+    """Memory of the libraries that will be imported on demand, and of the compiler if it has work to do."""
     torch = TORCH_BYTES if settings.n_lattices and "torch" not in sys.modules else 0
     monai = MONAI_BYTES if settings.use_prior and "monai" not in sys.modules else 0
     compiler = COMPILER_BYTES if settings.n_lattices and needs_compiling("gaussians") else 0
@@ -199,7 +199,7 @@ def sizes_of(slices: Slices, settings: ReconstructionSettings, prior_voxel_mm: f
 
 
 def _seen_voxels(shape: tuple[int, ...], settings: ReconstructionSettings) -> float:
-    """Voxels that the prior network sees at a time."""
+    """Voxels that the prior network processes at a time."""
     n_voxels = GRID_SLACK * math.prod(shape)
     if n_voxels <= settings.prior_whole_voxels:
         return n_voxels

@@ -1,4 +1,4 @@
-"""Settings that stay below a limit of memory, and what is given up for it."""
+"""Settings that stay below a memory limit, and what they give up for it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MIN_PROJECTION_BYTES = 20_000_000
 STAGES_WITH_PROJECTIONS = (Stage.FIT_TO_PRIOR, Stage.HELD_OUT, Stage.FIT_TO_SLICES, Stage.PRIOR_SHARE)
 PLANNED_HALO_VOXELS = 48
 PLANNED_TILES = (128, 96, 64, 48, 32, 16)
-"""Edges of tiles that are tried, and how far they look beyond: within 1e-3 of the whole (tests)."""
+"""Edges of tiles that are tried, with a halo of `PLANNED_HALO_VOXELS`: within 1e-3 of the whole volume (tests)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +32,8 @@ class MemoryPlan:
     """Settings that stay below a limit.
 
     Attributes:
-        settings: with what was given up for the limit.
-        estimate: their memory.
+        settings: changed as far as the limit requires.
+        estimate: memory that they need.
         limit_bytes: None without a limit.
         changes: what was given up, as sentences for run.json.
         at_once: whether freed memory has to be returned to the system at once (`release_memory_eagerly`).
@@ -55,8 +55,8 @@ class MemoryRecord:
     """Memory as it was stated before the run.
 
     Attributes:
-        stated_bytes: the most that any stage takes.
-        stage: which one.
+        stated_bytes: largest memory of any stage.
+        stage: that stage.
         limit_bytes: None without a limit.
         changes: what was given up for it.
     """
@@ -76,18 +76,18 @@ def plan_memory(
     *,
     prior_voxel_mm: float | None = None,
 ) -> MemoryPlan:
-    """Settings that need no more than a limit: what costs seconds goes first, then what costs rounding.
+    """Settings that need no more than a limit: first what costs time is given up, then what costs rounding errors.
 
     Args:
         slices: at their header poses.
         settings: as they would be without a limit.
         limit_bytes: None leaves them as they are.
         n_threads: of the kernels.
-        process_bytes: what the process holds before; as it is now when None.
+        process_bytes: memory of the process before; its present memory when None.
         prior_voxel_mm: voxel size of the prior; that of the output when None.
 
     Raises:
-        InputError: nothing that may be given up brings it below the limit.
+        InputError: nothing that may be given up brings the memory below the limit.
     """
 
     def estimate(of: ReconstructionSettings, at_once: bool = False) -> MemoryEstimate:
@@ -121,12 +121,12 @@ def plan_for_stacks(
 
     Args:
         stacks: that will be reconstructed.
-        settings: unconstrained.
+        settings: as they would be without a limit.
         limit_bytes: None leaves them as they are.
         prior_voxel_mm: voxel size of the prior; that of the output when None.
 
     Raises:
-        InputError: it does not fit, or the stacks cannot be used.
+        InputError: the limit is too low, or the stacks cannot be used.
     """
     import numba
 

@@ -22,5 +22,5 @@ def parsed_size(text: str) -> int:
 
 
 def gigabytes(n_bytes: float) -> str:
-    """For people, rounded up: 1.15 GB."""
+    """A size in messages, rounded up: 1.15 GB."""
     return f"{math.ceil(n_bytes / 1e7) / 100:.2f} GB"

@@ -12,10 +12,10 @@ from g3r.run.deadline import Deadline, LoopRecord
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetRecord:
-    """Choices of a time budget; fields are None where the run ended before the choice.
+    """Choices of a time budget; None for a choice that the run did not reach.
 
     Attributes:
-        seconds: that were given.
+        seconds: of the budget.
         registration, fit: names of the presets that registration and the fit follow; "none" without a fit.
         prior_views: views of the prior; 0 where there was no time for its network.
         pose_rounds: most rounds of poses and volume.
@@ -98,11 +98,11 @@ class FixedPlan:
 
 
 class RepeatedBudget(FixedPlan):
-    """A run with a time budget once more, without a clock: settings are known, loops do what they did.
+    """A repeat of a run with a time budget, without a clock: settings are known, and loops take the recorded steps.
 
     Args:
-        settings: as they were used in that run.
-        earlier: what it recorded.
+        settings: of the earlier run.
+        earlier: its record.
     """
 
     def __init__(self, settings: ReconstructionSettings, earlier: BudgetRecord) -> None:

@@ -27,28 +27,28 @@ class ReconstructionSettings:
 
     Args:
         resolution_mm: voxel size of the volume.
-        gaussian_spacing_pixels: cell edge per Gaussian of the lattice, in units of the cube root of what one pixel
+        gaussian_spacing_pixels: edge of the lattice cell per Gaussian, in units of the cube root of what one pixel
             covers (its area times the slice thickness): thicker slices and larger pixels determine fewer Gaussians.
-        max_gaussian_spacing_mm: the same at most, in mm.
+        max_gaussian_spacing_mm: upper bound of that edge in mm.
         registration: poses from the slices.
         pose_rounds: poses from the slices and V_prior, in turn with the volume.
         prior_stage: stage 1.
-        slice_model: how a slice follows from the volume, in stage 2.
+        slice_model: forward model of a slice in stage 2.
         slice_stage: stage 2.
-        n_lattices: fits of stage 2 on lattices of their own, whose mean is the volume; 0 shows V_prior alone, or the
-            least-squares volume of the slices.
-        held_out: how held-out slices are asked for the widths of the profiles; None takes that of `slice_model`.
+        n_lattices: number of fits of stage 2, each on a lattice of its own, whose mean is the volume; 0 shows V_prior
+            alone, or the least-squares volume of the slices.
+        held_out: how held-out slices decide the widths of the profiles; None takes the width of `slice_model`.
         prior_weight: least weight of V_prior in the volume with one pixel per mm3; see `fitting.prior_weight`.
-        voxel_correction: how the volume is corrected by what slices say and Gaussians cannot show; None leaves that
-            out.
+        voxel_correction: how the volume is corrected by detail in the slices that Gaussians cannot show; None leaves
+            that out.
         prior_views: mirror images over which the prior is averaged; see `estimate_prior`. 0 leaves its network out.
         prior_whole_voxels, prior_tile_voxels, prior_halo_voxels: when and how the prior network works in
             tiles; see `estimate_prior`.
-        share_probes: random changes by which the prior's share is found; see `estimate_prior_share`.
+        share_probes: number of random changes that measure the prior share; see `estimate_prior_share`.
         least_squares_voxel_mm: without a network and a fit, the least-squares volume is written, with voxels of at
             least this size, since its noise grows as they shrink; 0 takes V_sharp.
         use_prior: False seeds from V_sharp and leaves distillation out.
-        distillation: False uses the prior for the start alone.
+        distillation: False uses the prior only as the start of the fit.
         common_bias_field: divide out the bias field that stacks share (N4).
         fill_unseen: show an estimate where no slice looked; False leaves zeros there.
         anatomy: what the stacks show; see `for_anatomy`.
@@ -82,7 +82,7 @@ class ReconstructionSettings:
 
     @property
     def lattice(self) -> LatticeSpacing:
-        """How far the Gaussians are apart."""
+        """Spacing of the lattice of Gaussians."""
         return LatticeSpacing(pixels=self.gaussian_spacing_pixels, at_most_mm=self.max_gaussian_spacing_mm)
 
     @property
@@ -169,7 +169,7 @@ def preset(name: str) -> ReconstructionSettings:
 
 
 def keeping_poses(settings: ReconstructionSettings) -> ReconstructionSettings:
-    """The settings without any step that moves slices against each other."""
+    """The settings without any step that moves slices relative to each other."""
     return replace(
         settings,
         registration=replace(settings.registration, segments=False),
@@ -192,7 +192,7 @@ def settings_of(given: ReconstructionSettings | str) -> ReconstructionSettings:
 
 
 def for_anatomy(settings: ReconstructionSettings, anatomy: Anatomy) -> ReconstructionSettings:
-    """The settings without what knows fetal brains alone, where the stacks show something else.
+    """The settings without what is specific to fetal brains, if the stacks show something else.
 
     Without template, pose network and standard orientation the search starts from the stacks' headers, and V_sharp
     stands for the prior volume.
@@ -216,7 +216,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
     """
     stage = settings.slice_stage
     if n_stacks == 1:
-        # registered to a volume made of themselves, slices of a single stack drift; the prior holds them
+        # slices of a single stack drift if they are registered to a volume made of themselves; the prior holds them
         held = settings.use_prior and settings.distillation and settings.registration.segments
         return replace(
             settings,
@@ -230,7 +230,7 @@ def adapted(settings: ReconstructionSettings, n_stacks: int) -> ReconstructionSe
 
 
 def changed(settings: Any, options: Mapping[str, Any]) -> Any:
-    """Settings with some fields replaced; `motion.n_rounds` names a field of a record inside.
+    """Settings with some fields replaced; `registration.n_rounds` names a field of a record inside.
 
     Raises:
         ValueError: no such field.

@@ -1,9 +1,8 @@
 """Settings for a time budget: what fits into the seconds that are left, decided stage by stage by the clock.
 
-Before registration only the budget is known, so that it alone decides how registration searches; its loops
-end by the clock. After it the slices are in place, one optimiser step has been timed, and the most careful
-preset is taken whose steps fit. Every loop also has a deadline, so that an estimate that was wrong costs
-steps and not the time that was promised.
+Before registration only the budget is known, so it alone decides how registration searches; the loops of registration
+end by the clock. After it the slices are in place, one optimiser step is timed, and the most careful preset whose steps
+fit is taken. Every loop also has a deadline, so that a wrong estimate costs steps and not the promised time.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from g3r.run.kernel_cache import COMPILING_FIT_S, needs_compiling
 logger = logging.getLogger(__name__)
 
 REGISTRATION_FROM_S = {"preview": 0.0, "fast": 18.0, "balanced": 36.0, "accurate": 120.0}
-"""Budget from which on registration searches as in a preset: about the whole command's own seconds on two
-cores, from one preset to the next."""
+"""Budget from which on registration searches as in a preset: about the seconds of the whole command on two cores, from
+one preset to the next."""
 
 PRIOR_FROM_S = 13.0
 """Seconds left at the start from which on the prior network is used. The import of its libraries takes two of them, and
@@ -61,7 +60,7 @@ ROUNDS_SHARE = 0.3
 """Largest share of the remaining time that these rounds may take."""
 
 COARSE_AT_END = 0.9
-"""Seconds of what follows the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
+"""Seconds of the steps after the fit (volume, uncertainty, writing) over those of V_coarse and V_sharp, for an
 output of as many voxels; the picture and the files take another `WRITING_S`."""
 
 WRITING_S = 1.5
@@ -70,27 +69,27 @@ CORRECTION_OVER_COARSE, EDGE_OVER_COARSE = 0.8, 0.4
 """Seconds of the correction on voxels, and of the edge by the image, over those of V_coarse and V_sharp."""
 
 VOLUME_AT_END = 0.15
-"""The same of a run without a fit, which has no maps of uncertainty."""
+"""`COARSE_AT_END` of a run without a fit, which has no maps of uncertainty."""
 
 TOO_LITTLE, NO_FIT = 4.0, 2.2
-"""With less time left for the fit, in the seconds of V_coarse and V_sharp, no step is timed first, or there is none."""
+"""Time left for the fit, over the seconds of V_coarse and V_sharp, below which no step is timed, or no fit is made."""
 
 QUICKEST_FIT = "fast"
-"""Preset whose fit is made where no other fits; the deadline ends it."""
+"""Preset whose fit is made if no other fits; the deadline ends it."""
 
 SHARE_STEPS = 36
-"""Optimiser steps that take as long as one probe for the map of the prior share."""
+"""Number of optimiser steps that take as long as one probe of the prior share."""
 
 PROBE_EVERY = 4
 """One in this many slices is rendered to time a step."""
 
 COST_EXPONENT = 0.6
-"""A step takes seconds as this power of the number of Gaussians in a head: smaller ones have fewer pixels."""
+"""Exponent of the seconds of a step in the number of Gaussians of a head: smaller Gaussians have fewer pixels."""
 
 
 @dataclass(kw_only=True)
 class TimeBudget:
-    """Settings that follow the seconds that are left.
+    """A plan whose settings follow the seconds that are left.
 
     Args:
         settings: what the budget does not decide; changed with each decision.
@@ -106,12 +105,12 @@ class TimeBudget:
 
     @classmethod
     def of(cls, settings: ReconstructionSettings, seconds: float, spent_s: float = 0.0) -> TimeBudget:
-        """A budget of which some seconds are spent already.
+        """A budget of which some seconds were spent already.
 
         Args:
             settings: what the budget does not decide.
             seconds: of the whole command.
-            spent_s: of them, before this call.
+            spent_s: seconds of the budget before this call.
 
         Raises:
             ValueError: not a positive number.
@@ -125,11 +124,11 @@ class TimeBudget:
 
     @property
     def missed(self) -> bool:
-        """Whether more was taken than promised: a tenth and two seconds over the budget."""
+        """Whether the run took more than a tenth and two seconds over the budget."""
         return self.deadline.remaining_s < -(0.1 * self.given_s + 2.0)
 
     def for_registration(self) -> Deadline:
-        """Search as the preset does that the budget allows."""
+        """Search as in the most careful preset that the budget allows."""
         left = self.deadline.remaining_s
         allowed = [name for name, min_s in REGISTRATION_FROM_S.items() if self.given_s >= min_s]
         name = max(allowed, key=lambda name: REGISTRATION_FROM_S[name])
@@ -221,8 +220,8 @@ class TimeBudget:
             settings,
             gaussian_spacing_pixels=preset.gaussian_spacing_pixels,
             max_gaussian_spacing_mm=preset.max_gaussian_spacing_mm,
-            held_out=None,  # three fits whose seconds nobody has timed
-            n_lattices=PRESETS["accurate"].n_lattices,  # as many as time is left for
+            held_out=None,  # three fits whose time is not estimated
+            n_lattices=PRESETS["accurate"].n_lattices,  # as many as there is time for
             share_probes=probes,
             voxel_correction=preset.voxel_correction if settings.voxel_correction else None,
             prior_stage=replace(preset.prior_stage, projection_bytes=settings.prior_stage.projection_bytes),
@@ -244,7 +243,7 @@ def _by_least_squares(settings: ReconstructionSettings) -> ReconstructionSetting
 
 
 def compiling_s() -> float:
-    """Seconds by which the first fit is longer where none of its kernels is compiled."""
+    """Seconds that compiling adds to the first fit; 0 where its kernels are compiled."""
     return COMPILING_FIT_S if needs_compiling("gaussians") else 0.0
 
 

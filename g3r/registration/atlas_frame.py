@@ -21,14 +21,14 @@ from g3r.registration.thresholds import MIN_ATLAS_CORRELATION, MIN_RIVAL_MARGIN
 logger = logging.getLogger(__name__)
 
 HEADER_REACH_MM = 2.0
-"""Distance from the common motion at which a slice counts half in finding it."""
+"""Distance from the common motion at which a slice has half its weight in the estimate of that motion."""
 
 ROUNDS = ((10.0, 4.0), (5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 """Random rotations (degrees) and translations (mm) of the whole head, round by round."""
 N_CANDIDATES = 1000
 
 RIVAL_DEG = 30.0
-"""An orientation at least this far from the one that was taken is another one."""
+"""An orientation at least this far from the chosen one counts as another one."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Orientation:
         pose: [K] world from plane.
         correlation: with the atlas template, outline included.
         weeks: age of the template.
-        scale: by which it was enlarged to fit.
-        rival: correlation in the best of all orientations at least `RIVAL_DEG` away; None where none comes near, and
-            with several stacks, for which none is looked for: their headers hold them together.
+        scale: factor by which it was enlarged to fit.
+        rival: correlation in the best of all orientations at least `RIVAL_DEG` away; None if no candidate is that far
+            away, and with several stacks, whose headers hold them together, so that no other orientation is tried.
     """
 
     pose: RigidPose
@@ -61,8 +61,8 @@ def standard_orientation(
 ) -> Orientation | None:
     """Move all slices together so that the head is oriented as an atlas template.
 
-    A single stack is a few parallel slices, which may fit elsewhere as well. So all orientations are tried once more
-    with its slices where they are now.
+    A single stack consists of parallel slices, which may fit in several orientations. So all orientations are searched
+    once more, with its slices as they now lie to each other.
 
     Args:
         slices: at their final poses, in any frame.
@@ -98,7 +98,7 @@ def standard_orientation(
 
 
 def present_orientation(slices: Slices, templates: Sequence[FittedTemplate]) -> Orientation:
-    """How well slices fit the atlas templates where they are.
+    """How well slices fit the atlas templates at their present poses.
 
     Args:
         slices: at their poses.
@@ -122,7 +122,7 @@ class _Fit:
 def _in_all_orientations(
     templates: Sequence[FittedTemplate], pixels: SearchPixels, rng: np.random.Generator
 ) -> list[_Fit]:
-    """The orientations in which the slices fit best, to each template."""
+    """Fits of the slices to each template, from the orientations in which they correlate best."""
     rotation = uniform_rotations(N_ORIENTATIONS)
     found = []
     for template in templates:
@@ -141,7 +141,7 @@ def _moved_to(
     rounds: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> _Fit:
-    """The best of all slices with a template, after some of `ROUNDS`."""
+    """The best fit of all slices to a template, after some of `ROUNDS`."""
     agreement = np.zeros(1)
     for rotation_deg, translation_mm in rounds:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
@@ -160,7 +160,7 @@ def centred_on_headers(slices: Slices) -> Slices:
 
 
 def motion_to_headers(slices: Slices) -> RigidPose:
-    """The one motion that takes all slices back to their headers, on robust average: few strays hardly count."""
+    """The one motion that takes all slices back to their headers, by a robust mean in which few strays hardly count."""
     corners = slices.planes.corners_mm()
     here = slices.planes.pose.apply(corners).reshape(-1, 3)
     header = slices.header_pose.apply(corners).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Pose of an unknown head, from its stacks against atlas templates in all orientations.
+"""Pose of an unknown head: its stacks are matched with atlas templates in all orientations.
 
 The search is exhaustive and cheap: a few thousand orientations of a few thousand pixels. It gives capture
 range (a head in any orientation, motion segments 25 degrees apart) and the standard orientation of the result.
@@ -35,13 +35,13 @@ REFINEMENT = ((12.0, 5.0), (8.0, 4.0), (8.0, 4.0), (5.0, 3.0), (5.0, 3.0))
 """Random rotations (degrees) and translations (mm) of the rounds of placing segments in the template."""
 
 SAME_DEG = 30.0
-"""Orientations nearer to each other than this are searched together."""
+"""Orientations nearer to each other than this are searched as one."""
 
 N_PLACEMENTS = 4
 """Placements of each stack that are refined."""
 
 HEADER_PENALTY, HEADER_DEG = 8.0, 25.0
-"""Penalty of two stacks at another angle than by their headers: the first times log(1 + (angle / second)^2)."""
+"""Penalty of two stacks whose angle differs from that of their headers: the first times log(1 + (angle / second)^2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ def place_in_atlas(
 ) -> AtlasPlacement:
     """Motions of all slices into the atlas frame.
 
-    First one orientation for the whole head, with its stacks as the headers hold them together; then the
+    First one orientation is found for the whole head, with its stacks as the headers place them to each other; then the
     motion segments of each stack around it. Several orientations are followed, and the cheapest is taken.
 
     Args:
@@ -103,7 +103,7 @@ def place_in_atlas(
     few = uniform_rotations(N_ORIENTATIONS // 4)
     fitted = max(templates, key=lambda one: float(_head_correlation(samples, one, few).max()))
     bases = template_orientations(samples, fitted)
-    # where several orientations fit about as well, the headers do not hold the stacks together
+    # several orientations that fit about as well are a sign that the headers do not hold the stacks together
     by_stack = len(bases) > 1
     candidates = [_stack_placements(sample, fitted, bases, by_stack, rng) for sample in samples]
     placement = _consistent(samples, candidates)
@@ -116,7 +116,7 @@ def place_in_atlas(
 
 
 def template_fits(slices: Slices, template: AtlasTemplate) -> bool:
-    """Whether some template has about the masked volume; without brain masks none has."""
+    """Whether some template has about the masked volume; none has if the masks are not brain masks."""
     volume_mm3 = head_volume_mm3(slices)
     scale = [fitted_template(template, n, volume_mm3).scale for n in range(len(template))]
     fits = any(SCALE_RANGE[0] <= s <= SCALE_RANGE[1] for s in scale)
@@ -207,7 +207,7 @@ def _stack_placements(
 
 
 def _consistent(samples: list[StackSamples], candidates: list[list[tuple[float, Placement]]]) -> list[Placement]:
-    """One candidate for each stack: the least sum of their costs and of penalties for disagreeing headers."""
+    """One candidate for each stack: the least sum of their costs and of penalties for disagreement with headers."""
     mean = [[Rotation.from_matrix(one.motion.rotation).mean().as_matrix() for _, one in c] for c in candidates]
     best: tuple[float, list[int]] | None = None
     for first, stack in [(n, k) for k, c in enumerate(candidates) for n in range(len(c))]:
@@ -229,7 +229,7 @@ def _consistent(samples: list[StackSamples], candidates: list[list[tuple[float, 
 
 
 def _header_penalty(mean: list[list[NDArray[np.float64]]], choice: list[int], stack: int, candidate: int) -> float:
-    """Penalty of a stack's candidate for its angles to the other stacks' choices, by the headers."""
+    """Penalty of a stack's candidate for its angles to the other stacks' choices, relative to the headers."""
     angles = np.array(
         [float(angle_deg(mean[stack][candidate], mean[k][n])) for k, n in enumerate(choice) if k != stack]
     )

@@ -18,15 +18,15 @@ from g3r.acquisition.planes import Slices
 from g3r.acquisition.robust import robust_width
 
 MIN_INTENSITY = 0.1
-"""Darker pixels count with this share of the stack's mean intensity, for the sake of the logarithm."""
+"""Lower bound of a pixel before the logarithm is taken, as a share of the stack's mean intensity."""
 
 FIELD_RANGE = (0.4, 2.5)
-"""A field outside this range is an extrapolation of the fit, not a coil."""
+"""A field outside this range is an extrapolation of the fit, not the field of a coil."""
 
 N_ROUNDS = 10
 
 FITTED_PIXELS = 20_000
-"""Evenly spread pixels of a stack; five coefficients need no more."""
+"""Number of evenly spread pixels of a stack that are fitted; five coefficients need no more."""
 
 
 def bias_corrected(slices: Slices) -> Slices:
@@ -55,7 +55,7 @@ def _robust_fit(terms: NDArray[np.float64], log_value: NDArray[np.float64]) -> N
     """Coefficients [5] of the terms [P, 5], fitted with a free constant."""
     basis = np.c_[terms, np.ones(len(terms))]
     weight = np.ones(len(basis))
-    ridge = 1e-6 * len(basis) * np.eye(basis.shape[1])  # a stack that is a line of pixels has no y
+    ridge = 1e-6 * len(basis) * np.eye(basis.shape[1])  # a stack that is a line of pixels does not determine y
     for _ in range(N_ROUNDS):
         weighted = basis * weight[:, None]
         found = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ log_value)

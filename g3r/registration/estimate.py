@@ -1,4 +1,4 @@
-"""Poses of all slices: global search of motion segments, then each slice for itself, coarse to fine."""
+"""Registration of all slices: global search of motion segments, then each slice by itself, coarse to fine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from g3r.run.deadline import Deadline
 logger = logging.getLogger(__name__)
 
 SEARCH_SHARE, ROUNDS_SHARE = 0.6, 0.7
-"""Share of the available time for the search, and of the rest for the rounds of slices. What remains is for
+"""Share of the available time for the search, and share of the rest for the rounds of slices. The remainder is for
 scoring the rigid stacks and for the orientation."""
 
 
@@ -49,19 +49,19 @@ class Registration:
         weight: [K] slice weights in (0, 1].
         ncc: [K] correlation of each slice with the volume.
         held_out: for each stack the correlation with a volume made of the other stacks, outline included, without
-            the few slices that do not count (`Prediction.agreement`); None for a single stack.
-        initialisation: name of the one that the search started from.
+            its down-weighted slices if these are few (`Prediction.agreement`); None for a single stack.
+        initialisation: name of the initialisation that the search started from.
         initialisations: held-out correlation of every initialisation, stack by stack.
         interleave: of each stack, as its motion suggests; None for a rigid stack.
         n_segments: motion segments of each stack; 1 for a rigid stack.
         orientation: the standard orientation; None where the result stays in the scanner frame.
         history: figures of each round.
         profiles: of each stack, missing slices included.
-        overlap: what stacks saw in common; None for a single stack, and where nothing is missing.
-        handedness: of each stack, see `registration.handedness`; None where it was not asked for.
-        misfit_without: for each stack see `registration.intruder`; None where nobody asked.
-        left_out: numbers of stacks that are not among the slices since they do not fit the others, and their quality
-            beside these.
+        overlap: what stacks saw in common; None for a single stack, and if no stack lacks slices.
+        handedness: of each stack, see `registration.handedness`; None if it was not computed.
+        misfit_without: of each stack, see `registration.intruder`; None if it was not computed.
+        left_out: stacks that do not fit the others, and so have no slices here: their numbers, and their quality when
+            they were registered with the others.
     """
 
     slices: Slices
@@ -161,11 +161,11 @@ def register(
 
 
 def measured_again(registration: Registration, fill: TemplateFill | None = None) -> Registration:
-    """The registration with what it says of the quality of its poses found anew, for slices with other masks.
+    """The registration with its measures of quality computed anew, for slices with other masks.
 
     Args:
-        registration: whose slices have masks that registration did not have.
-        fill: stands for what stacks do not show of the head.
+        registration: whose slices have other masks than they were registered with.
+        fill: template for what stacks do not show of the head.
     """
     slices = bias_corrected(registration.slices)
     samples = StackSamples.of_all(slices)
@@ -189,10 +189,10 @@ def _with_rigid_stacks(
     fitted: FittedSlices,
     settings: RegistrationSettings,
 ) -> tuple[FittedSlices, list[float]]:
-    """Make stacks rigid again that gained nothing from slice poses of their own; agreement of all with the others.
+    """Reset stacks to rigid that gained nothing from poses per slice; also the agreement of each stack with the others.
 
     Small and thick slices fit noise, and without motion there is nothing to gain. Stacks with several segments
-    are not asked: a few slices that went astray lower their correlation, while all others gain.
+    are not tested: a few slices astray lower their correlation, while all others gain.
     """
     motion, fill, before = found.motion, found.fill, found.score
     assert before is not None
@@ -215,7 +215,7 @@ def _with_rigid_stacks(
     ]
     if not reverted:
         return fitted, after.agreements(samples, fitted.weight)
-    # the refined slices as a whole may have drifted from the segments; stacks that revert must follow
+    # the refined slices as a whole may have drifted from the segments; stacks that are reset must follow
     motion = aligned_to(slices, refined, motion)
     gain, weight = fitted.gain.copy(), fitted.weight.copy()
     for sample in reverted:
@@ -236,12 +236,12 @@ def _with_rigid_stacks(
 def segments_of(
     samples: list[StackSamples], motion: RigidPose, same_mm: float = SAME_PLACE_MM
 ) -> tuple[list[int], list[int | None]]:
-    """Number of motion segments of each stack, and the interleave under which they are fewest.
+    """Number of motion segments of each stack, and the interleave under which its motions change least.
 
     Args:
         samples: the thinned pixels of each stack.
         motion: [K] world from header of all slices.
-        same_mm: slices that motions move apart by less are of one segment.
+        same_mm: movements between consecutive slices up to this do not start a new segment.
     """
     n_segments, interleave = [], list[int | None]()
     for sample in samples:

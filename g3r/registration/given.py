@@ -1,4 +1,4 @@
-"""Poses that were found elsewhere: nothing is searched but the way to the standard orientation, and all is measured."""
+"""Registration by given poses: only the motion to the standard orientation is searched, and the quality is measured."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ from g3r.registration.unseen import TemplateFill
 logger = logging.getLogger(__name__)
 
 GIVEN = "given poses"
-"""In place of the name of an initialisation."""
+"""Stands in place of the name of an initialisation."""
 
 JUMP_MM = 3.0
-"""Neighbours whose poses differ by more are of two motion segments; every slice has a pose of its own."""
+"""Consecutive slices whose poses differ by more are in two motion segments; a lower limit would separate all slices,
+since each has a pose of its own."""
 
 SAME_CORRELATION = 0.01
-"""Slices that correlate with the template by no less than this below the best are in standard orientation: it is known
-no better, and poses of a run in standard space keep their frame."""
+"""Slices are in standard orientation already if their correlation with the template is no more than this below the
+best: the orientation is known no better, and so poses of a run in standard space keep their frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GivenPoses:
-    """Poses of slices that are not to be searched.
+    """Poses of slices, given instead of searched.
 
     Args:
         stack_id: [K] number of the stack.
         slice_index: [K] number of the slice in its stack.
-        motion: [K] (world from header) from where the stack's affine puts a point to where it is.
-        notes: on where they come from, for the record.
+        motion: [K] (world from header), from where the stack's affine puts a point to where it is.
+        notes: on the source of the poses, for the record.
     """
 
     stack_id: NDArray[np.int64]
@@ -85,7 +86,7 @@ def measure(
     progress: Callable[[int, int], None] = lambda done, total: None,
     template: AtlasTemplate | None = None,
 ) -> Registration:
-    """A registration of given poses: their gains, weights and agreement, and the head in standard orientation.
+    """A registration by given poses: gains, weights and agreement, with the head in standard orientation.
 
     Args:
         slices: normalised, at their header poses.
@@ -132,7 +133,7 @@ def measure(
 def _orientation(
     posed: Slices, settings: RegistrationSettings, template: AtlasTemplate
 ) -> tuple[AtlasPlacement | None, Orientation | None]:
-    """The one motion of all slices to the template; none where they are there already."""
+    """Placement in the atlas, and the slices in standard orientation: at their present poses if these are standard."""
     as_headers = replace(posed, header_pose=posed.planes.pose)
     if not template_fits(as_headers, template):
         return None, None
@@ -148,7 +149,7 @@ def _orientation(
 
 
 def _fill(placed: AtlasPlacement | None, orientation: Orientation | None) -> TemplateFill | None:
-    """The template, where the slices are in its frame."""
+    """The template that stands for what stacks lack, if the slices are in its frame."""
     if placed is None or orientation is None:
         return None
     head = next(one for one in placed.templates if one.weeks == orientation.weeks)

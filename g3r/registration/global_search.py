@@ -1,4 +1,4 @@
-"""The global search: several initialisations are scored by held-out stacks, the best is refined by segments."""
+"""The global search: initialisations are scored by held-out stacks, and the best one is refined by motion segments."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class SearchResult:
 
     Args:
         motion: [K] world from header.
-        initialisation: the name of the one it started from.
+        initialisation: name of the initialisation that it started from.
         initialisations: held-out correlation of every initialisation, stack by stack.
         placed: the slices in the atlas template; None without one.
-        fill: what stands for the parts of the head that stacks lack; None where nothing is missing.
-        score: of these motions; None for a single stack.
+        fill: template for the parts of the head that stacks lack; None where nothing is missing.
+        score: held-out score of these motions; None for a single stack.
     """
 
     motion: RigidPose
@@ -101,7 +101,7 @@ class GlobalSearch:
             placed = place_in_atlas(slices, samples, self.template, rng)
             in_atlas = placed.motion(len(slices), samples)
             if any(sample.profile.has_missing for sample in samples):
-                # the template stands for what is missing, so every start has to be in its frame
+                # the template stands for what is missing, so every initialisation has to be in its frame
                 fill = TemplateFill(placed.template.volume, placed.template.grid, placed.template.center_mm)
                 initialisations = {
                     name: aligned_to(slices, in_atlas, motion) for name, motion in initialisations.items()
@@ -115,7 +115,8 @@ class GlobalSearch:
             interleave = [placement.segments.interleave for placement in placements]
             segmented = collapse_to_rigid(slices, samples, segmented, interleave, fill)
             after = held_out_score(slices, samples, segmented, fill)
-            # in parts of a head, segments gain less; what the template alone placed has nothing to lose by the others
+            # with parts missing, segments gain less; a start from the template alone was not fitted to the other
+            # stacks, so any gain counts
             needed = 0.0 if fill is not None and name == "template" else MIN_COST_GAIN
             if after.cost <= score.cost - needed:
                 motion, score = segmented, after
@@ -131,7 +132,7 @@ def _score(found: SearchResult) -> HeldOutScore:
 def search_single(
     slices: Slices, sample: StackSamples, settings: RegistrationSettings, template: AtlasTemplate | None
 ) -> SearchResult:
-    """Motions of the slices of one stack, which only the atlas template holds together, and roughly.
+    """Motions of the slices of a single stack, whose only and rough reference is the atlas template.
 
     Args:
         slices: of one stack.

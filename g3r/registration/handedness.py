@@ -1,9 +1,9 @@
-"""Whether each stack shows the head as the others do, or its mirror image.
+"""Handedness of stacks: whether each shows the head as the others do, or its mirror image.
 
-Slices that are stored in reverse order, or a header that swaps two sides, make a mirrored head. Heads are nearly
-symmetric, so registration finds a place for it, and no other check notices: the volume mixes left and right. What
-gives it away is the part of the head that changes its sign at the mid-sagittal plane. It is found as the difference of
-a volume of the other stacks and its mirror image.
+Slices that are stored in reverse order, or a header that swaps two sides, mirror the head. Heads are nearly symmetric,
+so registration finds a place for the mirrored stack, and no other check notices: the volume mixes left and right. The
+part of the head that changes its sign at the mid-sagittal plane reveals it. It is estimated as the difference of a
+volume of the other stacks and its mirror image.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from g3r.registration.thresholds import MIRROR_SUSPECTED_BELOW, MIRRORED_BELOW, 
 logger = logging.getLogger(__name__)
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
-"""In the atlas frame: swaps left and right."""
+"""Swaps left and right in the atlas frame."""
 
 ROUNDS = ((5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 """Random rotations (degrees) and translations (mm) of a stack in the mirrored volume, round by round."""
@@ -38,18 +38,18 @@ ROUNDS = ((5.0, 2.0), (2.5, 1.0), (1.2, 0.5), (0.6, 0.3))
 N_CANDIDATES, PIXELS_PER_SLICE, MIN_PIXELS, MAX_PIXELS = 300, 200, 1_000, 60_000
 
 N_STEPS = 5
-"""Gauss-Newton steps of each slice, in the volume and in its mirror image, where a stack is suspected."""
+"""Gauss-Newton steps of each slice of a suspected stack, in the volume and in its mirror image."""
 
 SEEN_SHARE = 0.5
-"""Of the usual coverage by the other stacks, there and on the other side, from which on a pixel counts."""
+"""Coverage by the other stacks, over the usual one, that a pixel needs in the volume and in the mirror image."""
 
 MIN_CORRELATION = 0.5
-"""Of pixels with the symmetric part of the volume; below, the stack shows something else, and nothing is said."""
+"""Correlation with the symmetric part of the volume below which a stack shows something else and cannot be judged."""
 
 
 @dataclass(frozen=True)
 class Asymmetry:
-    """How far a stack shows what is not symmetric in the head as the other stacks show it.
+    """Correlation of a stack with the antisymmetric part of the head, as the other stacks show it.
 
     Args:
         correlation: of its pixels with the antisymmetric part of the head.
@@ -61,12 +61,12 @@ class Asymmetry:
 
     @property
     def highest(self) -> float:
-        """What the correlation may be: one standard error more."""
+        """Upper bound of the correlation: one standard error more."""
         return self.correlation + self.error
 
 
 def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list[float | None]:
-    """Whether each stack shows the asymmetry of the head as the others do.
+    """Handedness of each stack: whether it shows the asymmetry of the head as the others do.
 
     Args:
         slices: of two or more stacks, in the atlas frame (`Orientation`).
@@ -76,9 +76,9 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
     Returns:
         For each stack the correlation of its masked pixels with the antisymmetric part of the head, after the symmetric
         part was taken out of both, plus its standard error: above zero for the same head, near zero for a symmetric
-        one, and below `thresholds.MIRRORED_BELOW` for a mirror image. None where it cannot be said. Of three or more
-        stacks one is called a mirror image only where the others show that the head has sides (`_stands_out`); two
-        have nobody to ask, and a symmetric head may be below the limit by shading alone.
+        one, and below `thresholds.MIRRORED_BELOW` for a mirror image. None where it is unknown. With three or more
+        stacks, one is called a mirror image only if the others show that the head is asymmetric (`_stands_out`). With
+        two stacks there is no such check, and a symmetric head may be below the limit by shading alone.
     """
     value = (slices.value / gain[slices.planes.plane_id()]).astype(np.float32)
     evened, rng = replace(slices, value=value), np.random.default_rng(seed)
@@ -88,7 +88,7 @@ def handedness(slices: Slices, gain: NDArray[np.float64], seed: int = 0) -> list
 
 
 def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, Asymmetry | None]:
-    """By number of the stack; where one of more than two may be mirrored, the others are asked again without it."""
+    """Asymmetry by stack number; if one of three or more may be mirrored, the others are measured again without it."""
     stacks = np.unique(slices.stack_id).tolist()
     found = {stack: _of_stack(slices, stack, rng) for stack in stacks}
     low = {stack: one for stack, one in found.items() if one is not None and one.highest < MIRRORED_BELOW}
@@ -102,7 +102,7 @@ def _of_all(slices: Slices, rng: np.random.Generator) -> dict[int, Asymmetry | N
 
 
 def _stands_out(one: Asymmetry, others: Sequence[Asymmetry | None]) -> bool:
-    """Whether all other stacks show without it that the head has sides, and it shows them the other way round."""
+    """Whether all other stacks, measured without this one, show an asymmetric head, and this one shows it mirrored."""
     known = [other for other in others if other is not None]
     if len(known) < len(others):
         return False
@@ -119,7 +119,7 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry
     moved = _moved_as_one(own, volume, mirrored, rng)
     stride = max(1, len(own.pixel_index) // MAX_PIXELS)
     here, there = SampledSlices(own, volume, grid, stride=stride), SampledSlices(moved, volume, mirrored, stride=stride)
-    # where the others saw one side alone, the stack is like the side that is not zero
+    # where the others saw one side alone, the difference is that side, and the stack resembles it
     seen = np.minimum(here.operator.forward(share), there.operator.forward(share)) > SEEN_SHARE
     value, plane = here.value[seen], here.operator.plane[seen]
     first = antisymmetric_correlation(
@@ -131,7 +131,7 @@ def _of_stack(slices: Slices, stack: int, rng: np.random.Generator) -> Asymmetry
 
 
 def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator) -> Slices:
-    """The slices of a stack after the one motion that fits a volume best."""
+    """The slices of a stack after the one rigid motion that fits them best to a volume."""
     pixels, motion = SearchPixels.of(own, PIXELS_PER_SLICE), RigidPose.identity(1)
     for rotation_deg, translation_mm in ROUNDS:
         candidate = perturbed(motion, pixels.center_mm, N_CANDIDATES, rotation_deg, translation_mm, rng)
@@ -140,7 +140,7 @@ def _moved_as_one(own: Slices, volume: NDArray[np.float32], grid: VolumeGrid, rn
 
 
 def _registered(model: SampledSlices, slices: Slices) -> NDArray[np.float32]:
-    """What a volume says of the pixels after each slice was registered to it."""
+    """Pixels as a volume predicts them after each slice was registered to it."""
     gain = np.ones(len(slices))
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
     placed, gain, _ = register_slices(model, slices, gain, n_steps=N_STEPS, width=width)
@@ -154,16 +154,16 @@ def antisymmetric_correlation(
 ) -> Asymmetry | None:
     """Correlation of pixels with here - mirrored, after here + mirrored and a constant were taken out of both.
 
-    The standard error is that of the jackknife over slices: a stack is not called mirrored for what a few slices say.
+    The standard error is that of the jackknife over slices, so that a few slices do not make a stack mirrored.
 
     Args:
         value: [P] pixels.
-        here: [P] what a volume of the other stacks says of them.
-        mirrored: [P] what its mirror image says.
+        here: [P] their prediction by a volume of the other stacks.
+        mirrored: [P] their prediction by its mirror image.
         plane: [P] slice of each pixel.
 
     Returns:
-        None where there is too little to correlate, or the pixels show something else.
+        None where there are too few pixels, or where they show something else.
     """
     both = np.stack([np.ones_like(here), here + mirrored], 1).astype(np.float64)
     targets = np.stack([value, here - mirrored], 1).astype(np.float64)

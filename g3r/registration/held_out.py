@@ -31,20 +31,20 @@ logger = logging.getLogger(__name__)
 HELD_OUT_VOXEL_MM = 3.2
 
 FINE_VOXEL_MM, FINE_PIXELS_OF_VOLUME = 1.6, 200_000
-"""Of the finer comparison, see `fine_held_out_correlations`."""
+"""Voxel size and number of pixels of the finer comparison, see `fine_held_out_correlations`."""
 
 MIN_SHARE = 0.8
-"""Share of the slices of a stack that have to count for the others to be left out of its agreement. A phantom in place
-with 12 % of strays rose from 0.65 to 0.75 by it. Of 17 simulated subjects, most in severe motion, stacks with many
-slices out of place rose by 0.03 at most, except one from 0.63 to 0.71, of which 23 % were off by more than 2 mm; one
-with a third of strays, half of which were off, would have risen from 0.55 to 0.71."""
+"""Share of the slices of a stack that must not be down-weighted for the others to be left out of its agreement. This
+raised the agreement of a phantom in place with 12 % of strays from 0.65 to 0.75. Of 17 simulated subjects, most in
+severe motion, stacks with many slices out of place rose by 0.03 at most, except one from 0.63 to 0.71, in which 23 %
+were off by more than 2 mm; one with a third of strays, half of which were off, would have risen from 0.55 to 0.71."""
 
 THIN_VARIANCE = 1 / 6
-"""Variance of a slice's profile, over the square of a voxel, below which it is left out: that of linear interpolation
-between voxels is as large."""
+"""Variance of a slice's profile, over the square of a voxel, below which the profile is ignored: linear interpolation
+between voxels blurs as much."""
 
 PIXELS_OF_VOLUME = 100_000
-"""At most about this many pixels make a volume of the search."""
+"""A volume of the search is made of at most about this many pixels."""
 
 
 def volume_without(
@@ -52,13 +52,13 @@ def volume_without(
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
     """A volume from all slices except those of one stack, zero outside the masks; and its grid.
 
-    A slice would register to its own blur if it had helped to make the volume.
+    With the stack in it, slices would register to their own blur.
 
     Args:
         slices: all slices at their present poses.
         stack: the one to hold out.
         spacing_mm: voxel size.
-        fill: what to take for voxels that no other stack saw; zero without it.
+        fill: template for voxels that no other stack saw; these are zero without it.
     """
     operator, value, grid = _of_others(slices, stack, spacing_mm, fill)
     weight = np.ones(len(value), np.float32)
@@ -69,7 +69,7 @@ def volume_without(
 
 
 def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDArray[np.float32], VolumeGrid]:
-    """How far voxels were seen by all slices except those of one stack, from 0 (not) to 1; and the grid.
+    """Coverage of voxels by all slices except those of one stack, from 0 (unseen) to 1; and the grid.
 
     Args:
         slices: all slices at their present poses.
@@ -83,7 +83,7 @@ def coverage_without(slices: Slices, stack: int, spacing_mm: float) -> tuple[NDA
 def _of_others(
     slices: Slices, stack: int, spacing_mm: float, fill: TemplateFill | None, n_pixels: int = PIXELS_OF_VOLUME
 ) -> tuple[VoxelOperator, NDArray[np.float32], VolumeGrid]:
-    """Operator and values of some pixels, those outside the masks included, of all other stacks."""
+    """Operator and values of some pixels of all other stacks, pixels outside the masks included."""
     others = slices.take(slices.stack_id != stack)
     grid = grid_around(others, spacing_mm, margin_mm=20.0)
     if fill is not None:
@@ -102,7 +102,7 @@ the faint values that other stacks show there would then be compared with zero, 
 
 @dataclass(frozen=True)
 class Prediction:
-    """How well a volume predicts the slices of a stack that it was made without.
+    """Fit of the slices of a stack to a volume that was made without it.
 
     Args:
         cost: of the slices (n log residual, the noise being unknown) plus the transition penalty of their
@@ -115,14 +115,14 @@ class Prediction:
 
     @property
     def correlation(self) -> float:
-        """Over all pixels, outline included."""
+        """Correlation over all pixels, outline included."""
         return float(correlation(self.moments.sum(0)))
 
     def agreement(self, weight: NDArray[np.float64]) -> float:
-        """Correlation over the pixels of the slices that count, where those that do not are few; else over all.
+        """Correlation without the down-weighted slices, if these are few; else over all slices.
 
-        Slices that went astray in a stack that is in place count for nothing in the volume, and are reported by
-        themselves (`StackQuality.downweighted_share`).
+        Slices that went astray in a stack that is in place count for nothing in the volume, and are reported
+        separately (`StackQuality.downweighted_share`).
 
         Args:
             weight: [K] slice weights.
@@ -194,7 +194,7 @@ def held_out_score(
 
 
 def fine_volume_without(slices: Slices, stack: int) -> tuple[NDArray[np.float32], NDArray[np.float32], VolumeGrid]:
-    """A volume from all slices except those of one stack, finer than that of the search; where it was seen; the grid.
+    """A volume from all slices except those of one stack, finer than in the search; its coverage; and the grid.
 
     Args:
         slices: all slices at their present poses, gains divided out.
@@ -207,10 +207,10 @@ def fine_volume_without(slices: Slices, stack: int) -> tuple[NDArray[np.float32]
 
 
 def fine_held_out_correlations(slices: Slices, gain: NDArray[np.float64]) -> list[float]:
-    """How well the masked pixels of each stack are predicted by the others, finely enough to tell poses 0.3 mm apart.
+    """Correlation of each stack's masked pixels with the volume of the others, fine enough to tell poses 0.3 mm apart.
 
-    Only pixels that others saw count: their volume is zero elsewhere, and the smaller the hole, the better would
-    be what closes it.
+    Only pixels that others saw count: their volume is zero elsewhere, so that poses which make the holes smaller would
+    seem better.
 
     Args:
         slices: of two or more stacks, at their present poses.

@@ -1,8 +1,8 @@
-"""How much better the slices of all other stacks fit a volume that one stack is left out of.
+"""Intruders: how much better the slices of all other stacks fit a volume without one stack.
 
 A stack of another head of the same age finds a place among the others, and the volume becomes a mean of both heads.
-All stacks then agree with it about equally, and less than they would with their own head; no comparison of one stack
-with the others tells which one is to blame. What tells is what the others gain by its absence.
+All stacks then agree with it about equally, and less than they would with their own head, so no comparison of one stack
+with the others tells which one is to blame. It is found by what the others gain without it.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from g3r.registration.thresholds import IN_PLACE_NCC
 
 
 def misfit_without_each(fitted: FittedSlices, voxel_mm: float, max_pixels: int) -> list[float | None] | None:
-    """How much of the misfit of all others is left without a stack, for the stack without which least is left.
+    """Share of the misfit of all others that is left without a stack, for the stack without which least is left.
 
-    The misfit of a slice is what its correlation with the volume lacks to 1. It is smaller in a volume of fewer stacks
-    in any case, since each slice then is a larger part of it.
+    The misfit of a slice is 1 minus its correlation with the volume. It always falls in a volume of fewer stacks, since
+    each slice then is a larger part of the volume.
 
     Args:
         fitted: slices of three or more stacks, in place.
         voxel_mm: of the volumes.
-        max_pixels: about as many are looked at, at most.
+        max_pixels: number of pixels in use, about, at most.
 
     Returns:
-        The median over the slices of the other stacks, at the place of that stack, and None at the others: without one
-        of those the slices of the rest gain, too, as long as it stays. None for fewer than three stacks, of which those
-        left have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
+        The median over the slices of the other stacks, at the place of that stack, and None for the others: without a
+        sound stack the rest gain, too, as long as an intruder stays. None for fewer than three stacks, where those left
+        have nothing to agree with, and where the slices of every stack fit as those of stacks in place do.
     """
     slices: Slices = fitted.slices
     stacks = np.unique(slices.stack_id).tolist()

@@ -1,4 +1,4 @@
-"""Stacks that do not fit the others: found once all are registered, left out, and the others registered anew."""
+"""Misfits: stacks that do not fit the others. They are left out after registration, and the rest is registered anew."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def register_robustly(
     """Poses of all slices as `register` finds them, without stacks that do not fit the others.
 
     A stack of another head or contrast, or one whose slices went astray, draws its errors into the volume, and the
-    slices of good stacks towards them. It is left out where most stacks fit, and all of these once they are registered
-    without it. Where half of the stacks or more fail, one may have drawn the others with it: each is left out in its
-    turn, and the one without which all others agree beyond doubt stays out, if there is only one such. Otherwise all
-    stay: it cannot be said which ones are right.
+    slices of good stacks towards them. If most stacks fit, the misfits are left out, provided that all others fit once
+    they are registered without them. If half of the stacks or more fail, one may have drawn the others with it: each is
+    left out in turn. If there is exactly one without which all others agree beyond doubt, it stays out. Otherwise all
+    stay, because it is unknown which ones are right.
 
     Args:
         slices: see `register`.
-        settings: see `register`; `leave_out_misfits` is asked here.
-        progress: see `register`; called once more from the start for each registration without stacks.
+        settings: see `register`; `leave_out_misfits` is used here.
+        progress: see `register`; called anew from the start for each further registration.
         template: see `register`.
         proposals: see `register`.
-        deadline: see `register`; stacks are left out in turn only while there is time for what the first one took.
+        deadline: see `register`; stacks are left out in turn only while there is time for one more registration.
     """
 
     def without(out: Sequence[int]) -> Registration:
@@ -86,13 +86,13 @@ def register_robustly(
 
 
 def misfits(qualities: Sequence[StackQuality]) -> list[int]:
-    """Places of stacks that failed or are unlike the others; none where half of all or more are."""
+    """Indices of stacks that failed or are unlike the others; none if these are half of all or more."""
     found = sorted(_failed(qualities) + unlike_others(qualities))
     return found if 2 * len(found) < len(qualities) else []
 
 
 def most_failed(qualities: Sequence[StackQuality]) -> bool:
-    """Whether half of the stacks or more failed, of enough that others are left to agree without one."""
+    """Whether half of the stacks or more failed, with at least three, so that others are left to agree without one."""
     return len(qualities) > 2 and 2 * len(_failed(qualities)) >= len(qualities)
 
 
@@ -101,7 +101,7 @@ def _failed(qualities: Sequence[StackQuality]) -> list[int]:
 
 
 def _fits(registration: Registration, *, beyond_doubt: bool = False) -> bool:
-    """Whether all stacks fit each other, and cross enough to check that.
+    """Whether all stacks fit each other, and cross at angles large enough to check that.
 
     Args:
         registration: of these stacks.

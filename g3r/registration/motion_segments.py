@@ -18,7 +18,7 @@ from g3r.acquisition.interleave import acquisition_order
 from g3r.geometry import RigidPose
 
 INTERLEAVES = (1, 2, 3)
-"""Acquisition orders to try; the first of equals is taken."""
+"""Interleaves to try; the first of equally good ones is taken."""
 
 HEAD_RADIUS_MM = 30.0
 """Half the diameter of a typical head, by which rotations are compared with translations."""
@@ -28,13 +28,13 @@ CHANGE_PENALTY = 6.0
 DISTANCE_PENALTY = 8.0
 """Further cost of a change by d mm: this times log(1 + (d / STEADY_MM)^2); heavy-tailed, as jerks are."""
 STEADY_MM = 4.0
-"""Below about this, movement between slices is ordinary."""
+"""Movement between slices of up to about this is ordinary."""
 
 SAME_PLACE_MM = 1e-3
-"""Motions nearer to each other than this are one."""
+"""Motions closer to each other than this are the same."""
 
 WINDOW = 5
-"""Consecutive slices in time that candidates are preselected for."""
+"""Number of consecutive slices in time whose joint cost preselects candidates."""
 BEST_PER_WINDOW = 6
 
 
@@ -56,7 +56,7 @@ class Segments:
 
 
 def time_orders(slice_index: NDArray[np.int64]) -> dict[int, NDArray[np.int64]]:
-    """For each interleave the slices [K] of one stack in the order of their acquisition.
+    """The slices [K] of one stack in the order of their acquisition, for each interleave.
 
     Args:
         slice_index: [K] numbers of the slices in their stack; some may be missing.
@@ -100,7 +100,7 @@ def best_segments(
         motion: J candidate motions of the world.
         slice_index: [K] numbers of the slices in their stack.
         center_mm: [3] centre of the head before the motions.
-        keep: candidates to consider in addition to those that `promising` picks.
+        keep: candidates to consider besides those that `promising` picks.
     """
     orders = time_orders(slice_index)
     chosen = promising(cost, orders)
@@ -120,7 +120,7 @@ def best_segments(
 
 
 def transition_penalties(motion: RigidPose, center_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Penalty [J, J] of a change from each motion to each other; none of staying.
+    """Penalty [J, J] of a change from each motion to each other; zero for staying.
 
     Args:
         motion: J motions of the world.
@@ -158,7 +158,7 @@ def transition_penalty(distance_mm: NDArray[np.float64]) -> float:
 
 
 def promising(cost: NDArray[np.float64], orders: dict[int, NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Candidates among the best of some window of slices in time, or of some single slice.
+    """Candidates among the best of some window of slices in time, or the best of a single slice.
 
     Args:
         cost: [K, J] of slice k under candidate j.

@@ -1,11 +1,12 @@
-"""The shear that two orientations leave open, as far as motion is not likely to have it.
+"""The open shear in the estimated motion, reduced to what motion is likely to contain.
 
-Slices that shift along the other stack's normal in proportion to their place, and tilt, explain the same pixels of a
-sheared head (`registration.open_strain`), so where registration ends along that strain is a matter of noise. Motion
-says more. It has the strain in it only where the head happens to drift along with the place of slices. Interleaved
-slices that are neighbours in place are not neighbours in time, so that a random walk in time has next to none of it;
-slices that are taken in the order of their places have more. The amount in the motion that was found is taken for a
-measurement with the error `SHEAR_ERROR`, the one that such a walk would have for what is known before it.
+With slices of two orientations, shifts along the other stack's normal in proportion to the place of a slice, and tilts,
+give the same pixels of a sheared head (`registration.open_strain`). So the amount of this strain in the result of a
+registration is a matter of noise. A model of motion says more: motion contains the strain only if the head happens to
+drift along with the place of slices. Interleaved slices that are neighbours in place are not neighbours in time, so a
+random walk in time contains next to none of it; slices that are taken in the order of their places contain more. The
+amount in the estimated motion is treated as a measurement with the error `SHEAR_ERROR`, and the amount in such a random
+walk as its prior.
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ SHEAR_ERROR = 0.01
 little and moderate motion, from 0.002 to 0.020."""
 
 LEVER_MM = 30.0
-"""A turn counts as the shift that it gives a point at this distance, about that of a pixel from its slice's middle."""
+"""A rotation counts as the shift of a point at this distance, about that of a pixel from the middle of its slice."""
 
 ROBUST_SCALE_MM = 2.0
-"""Slices that are further than this from what most do count less (Cauchy), since a jerk is no drift."""
+"""Slices that are further than this from the common fit count less (Cauchy), since a jerk is no drift."""
 
 N_ROUNDS = 10
 
 LAGS = (1, 2, 3, 4)
-"""Slices in time between which changes of motion are compared."""
+"""Distances, in slices in time, over which changes of motion are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionShear:
-    """How much of the open strain is in the motion of slices.
+    """Amount of the open strain in the motion of slices.
 
     Attributes:
         amount: in units of the strain.
-        likely: its standard deviation in a random walk with steps as large as those of this motion.
+        likely: standard deviation of the amount in a random walk with steps as large as those of this motion.
         strain: [3, 3] in world axes.
     """
 
@@ -59,15 +60,15 @@ class MotionShear:
 
     @property
     def excess(self) -> float:
-        """What of the amount is error, in the mean."""
+        """The part of the amount that is error, on average."""
         return self.amount * SHEAR_ERROR**2 / (SHEAR_ERROR**2 + self.likely**2)
 
 
 def without_excess_shear(slices: Slices, interleave: Sequence[int | None]) -> Slices:
-    """The slices in poses whose motion has no more of the open strain than is likely.
+    """The slices without the part of the open strain in their motion that is error.
 
     Args:
-        slices: K slices, of which header poses are known.
+        slices: K slices with header poses.
         interleave: of each stack; None where it is not known.
     """
     found = motion_shear(slices, interleave)
@@ -81,13 +82,13 @@ def without_excess_shear(slices: Slices, interleave: Sequence[int | None]) -> Sl
 
 
 def motion_shear(slices: Slices, interleave: Sequence[int | None]) -> MotionShear | None:
-    """The open strain in the motion of slices; None where there is not exactly one.
+    """The open strain in the motion of slices; None unless exactly one strain is open.
 
     It is the robust least-squares fit of a rigid motion for each stack and one strain for all to the motions of slices.
 
     Args:
-        slices: K slices, of which header poses are known.
-        interleave: of each stack; None where it is not known, which is taken for the order of places.
+        slices: K slices with header poses.
+        interleave: of each stack; None, where it is not known, counts as the order of places.
     """
     rows = [np.flatnonzero(slices.stack_id == stack) for stack in np.unique(slices.stack_id)]
     center, normal, shift, turn = (np.zeros((len(slices), 3)) for _ in range(4))
@@ -109,7 +110,7 @@ def motion_shear(slices: Slices, interleave: Sequence[int | None]) -> MotionShea
         columns += _rigid(center, own)
     design = np.stack([column.ravel() for column in columns], axis=1)
     slope, estimate = _robust_fit(design, answers)
-    # the walk is that of the head about its middle: its turns shift slices that are far from there
+    # the walk is that of the head about its middle: rotations of the head shift slices that are far from there
     of_shift, of_turn = slope[:, :3], LEVER_MM * slope[:, 3:] + np.cross(center, slope[:, :3])
     variance = 0.0
     for own, order in zip(rows, interleave, strict=True):
@@ -128,7 +129,7 @@ def _strained(center: Array, tilt: Array, strain: Array) -> Array:
 
 
 def _rigid(center: Array, own: NDArray[np.intp]) -> list[Array]:
-    """The same for a shift along each axis, and a turn about each, of the slices of a stack."""
+    """Shifts and turns [K, 6] of the slices of a stack, for a shift of it along each axis and a turn about each."""
     columns = []
     for axis in np.eye(3):
         shifted, turned = np.zeros((len(center), 6)), np.zeros((len(center), 6))
@@ -141,7 +142,7 @@ def _rigid(center: Array, own: NDArray[np.intp]) -> list[Array]:
 
 
 def _robust_fit(design: Array, answers: Array) -> tuple[Array, float]:
-    """The first unknown of a robust fit, and how it depends on the answers [K, 6] of slices."""
+    """The first unknown of a robust fit, and its derivative by the answers [K, 6] of slices."""
     weight = np.ones(len(answers))
     for _ in range(N_ROUNDS):
         root = np.repeat(np.sqrt(weight), answers.shape[1])
@@ -153,13 +154,14 @@ def _robust_fit(design: Array, answers: Array) -> tuple[Array, float]:
 
 
 def _of_walk(states: Array, slope: Array, time: NDArray[np.intp]) -> float:
-    """Variance of the sum of slope times states, if the states [K, 3] are a random walk beneath noise of their own.
+    """Variance of the sum of slope times states, if the states [K, 3] are a random walk with noise of their own added.
 
-    The variance of two states' difference grows by that of a step with their distance in time, from twice the noise.
+    The variance of a step is the slope of the mean squared difference of two states over their distance in time; the
+    intercept is twice the variance of the noise.
     """
     pairs = [(time[lag:] - time[:-lag], ((states[lag:] - states[:-lag]) ** 2).mean(1)) for lag in LAGS]
     gap, change = (np.concatenate([pair[n] for pair in pairs]) for n in range(2))
-    if len(np.unique(gap)) < 2:  # two slices, whose noise cannot be told apart
+    if len(np.unique(gap)) < 2:  # with one distance in time, noise cannot be told from steps
         step = float((change / gap).mean()) if len(gap) else 0.0
     else:
         step = max(0.0, float(np.polyfit(gap, change, 1)[0]))

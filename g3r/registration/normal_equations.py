@@ -47,7 +47,7 @@ class NormalEquations:
 
 
 class SampledSlices:
-    """Data that stay the same while poses change: pixels, PSF nodes, the volume.
+    """Data that stay the same while poses change: pixels, PSF nodes and the volume.
 
     Args:
         slices: K slices.
@@ -64,7 +64,7 @@ class SampledSlices:
         self.operator = VoxelOperator(slices.planes, grid, index, (1, 1, psf_points))
         self.value = slices.value[index]
         self.volume = np.ascontiguousarray(volume, dtype=np.float32)
-        n_zeros = grid.shape[1] * grid.shape[2] + grid.shape[2] + 2  # the cell of what lies outside
+        n_zeros = grid.shape[1] * grid.shape[2] + grid.shape[2] + 2  # the cell of pixels outside
         self.flat = np.concatenate([self.volume.ravel(), np.zeros(n_zeros, np.float32)])
         self.uv_mm = np.ascontiguousarray(self.operator.uv_mm.T)
         self.start = np.searchsorted(self.operator.plane, np.arange(len(slices) + 1))
@@ -125,7 +125,7 @@ class SampledSlices:
 def _accumulate(
     flat, shape, start, uv, value, matrix, origin, node_mm, node_weight, gain, width, hessian, gradient, loss, moments
 ):
-    """The sums of `NormalEquations`, slice by slice; `acquisition.kernels` says why over runs of pixels."""
+    """The sums of `NormalEquations`, slice by slice, in runs of pixels (see `acquisition.kernels`)."""
     to_x, to_y, to_z = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
     outside = int(shape[0] * shape[1] * shape[2])
     for k in numba.prange(len(start) - 1):

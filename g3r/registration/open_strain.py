@@ -1,8 +1,8 @@
-"""The strain of the head that slices of two orientations leave open.
+"""Open strain: the strain of the head that slices of two orientations do not determine.
 
 Let n and m be the normals of two stacks and E a multiple of n m^T + m n^T. The motion x -> x + a E x of the head keeps
-every slice of either stack a rigid plane, to first order: E has no part within a slice, where one of its two factors is
-zero. Slices shift along the other normal and tilt.
+every slice of either stack a rigid plane, to first order: E has no component within a slice, since one of its two
+factors is zero there. Slices shift along the other normal and tilt.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from g3r.acquisition.planes import Slices
 
 MAX_CLOSED, MIN_OTHERS = 0.15, 0.5
-"""Singular values of the map from strains to what slices of all stacks see of them in plane: the least one of an open
-strain, and the next one. The first lets further stacks be 10 degrees from one of two orientations; the second asks for
-45 degrees between the two, since slices of one orientation leave more than one strain open."""
+"""Limits of the singular values of the map from strains to their in-plane parts in the slices of all stacks: the
+largest of an open strain, and the smallest of the next strain. The first lets further stacks be 10 degrees from one of
+two orientations; the second asks for 45 degrees between the two, since slices of one orientation leave more than one
+strain open."""
 
 MIN_LENGTH = 0.5
-"""Of the mean of a stack's unit normals. Where it is shorter its slices have no orientation in common, as those of a
-radial scan."""
+"""Least length of the mean of a stack's unit normals. If it is shorter, the slices have no orientation in common, as
+those of a radial scan."""
 
 
 def mean_normals(slices: Slices) -> NDArray[np.float64]:
@@ -63,7 +64,7 @@ def open_strain(normals: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def tilts(normals: NDArray[np.float64], strain: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors [K, 3] that keep rigid planes in a head that is strained, per unit of an open strain.
+    """Rotation vectors [K, 3] with which planes stay rigid in a strained head, per unit of an open strain.
 
     Args:
         normals: [K, 3] unit normals of the planes.

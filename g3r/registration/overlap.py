@@ -1,4 +1,4 @@
-"""What stacks saw in common: where they can prove each other's poses, and whether they do."""
+"""Overlap of stacks: where they saw the same, so that they check each other's poses, and whether they agree there."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from g3r.registration.unseen import sampled
 
 @dataclass(frozen=True, kw_only=True)
 class Overlap:
-    """Stacks against the volumes of the others, only where those saw something.
+    """Agreement of stacks with the volumes of the others, only where those saw something.
 
     Args:
         seen_share: [K] share of each slice's masked pixels that other stacks saw.
-        stack_share: of each stack's masked pixels.
+        stack_share: the same share of each stack's masked pixels.
         correlation: of each stack with the volume of the others over the pixels that they saw, outline included.
     """
 

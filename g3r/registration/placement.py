@@ -32,10 +32,10 @@ def refine_placement(
     rng: np.random.Generator,
     proposals: RigidPose | None = None,
 ) -> Placement:
-    """Try many motions for every slice of a stack, around the present ones, and choose segments.
+    """Try many motions around the present ones for every slice of a stack, and choose segments.
 
-    A wrongly placed segment can take the motion of any other segment, or a random one near it; nothing has
-    to be known about which segments are wrong.
+    A wrongly placed segment can take the motion of any other segment, or a random one near it; it need not be known
+    which segments are wrong.
 
     Args:
         sample: the stack.

@@ -27,7 +27,7 @@ def uniform_rotations(n: int) -> NDArray[np.float64]:
 
 
 def rotations_within(n_uniform: int, limit_deg: float) -> NDArray[np.float64]:
-    """Those of `uniform_rotations(n_uniform)` whose angle is below a limit."""
+    """The rotations of `uniform_rotations(n_uniform)` whose angle is below a limit."""
     rotation = uniform_rotations(n_uniform)
     return rotation[angle_deg(rotation, np.eye(3)) < limit_deg]
 

@@ -1,9 +1,9 @@
-"""Slices of a single stack registered to the prior volume that was made from them.
+"""Registration of the slices of a single stack to the prior volume that was made from them.
 
 A volume made of one stack repeats its errors, but the prior network has learned what heads look like: it
-smooths out jumps from slice to slice, and slices registered to it come nearer to each other. Volume and slices move in
-turn, so that moves may be made longer. How long the head is along the stack neither knows well: left alone, slices go
-apart there, move by move.
+smooths out jumps from slice to slice, and slices registered to it come nearer to each other. Volume and slices are
+found in turn, so moves may be made longer (over-relaxation). Neither determines how long the head is along the stack:
+without a constraint, slices drift apart there, move by move.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from g3r.registration.thresholds import MIN_PRIOR_LOSS_REMOVED
 logger = logging.getLogger(__name__)
 
 N_STEPS = 4
-"""Few on purpose: stacks without motion would drift by 0.1 mm each time."""
+"""Steps of registration, few on purpose: stacks without motion would drift by 0.1 mm each time."""
 
 
 def register_to_prior(
     slices: Slices, gain: NDArray[np.float64], prior: NDArray[np.float32], grid: VolumeGrid
 ) -> tuple[Slices, NDArray[np.float64], bool]:
-    """Move each slice a little towards where it fits the prior, and a little further.
+    """Move each slice towards where it fits the prior, and a little further.
 
     Args:
         slices: of one stack, in the intensities of the prior.
@@ -39,7 +39,7 @@ def register_to_prior(
         grid: its grid.
 
     Returns:
-        Slices, gains, and whether they were moved; the given ones where the loss fell too little.
+        Slices, gains, and whether they were moved; the given ones where too little of the loss was removed.
     """
     model = SampledSlices(slices, prior, grid, stride=max(1, len(slices.pixel_index) // 100_000))
     width = robust_width(model.residuals(slices.planes, gain), n_sigma=2)
@@ -54,11 +54,11 @@ def register_to_prior(
 
 
 def without_stretch(before: Slices, after: Slices) -> Slices:
-    """Slices moved as they were, but for what would stretch or squeeze their stack along its normal.
+    """The moved slices, without the part of their moves that stretches or squeezes the stack along its normal.
 
     Args:
-        before: slices of one stack at their poses before.
-        after: the same slices at their poses now.
+        before: slices of one stack before the moves.
+        after: the same slices after them.
     """
     move = before.planes.pose.inverse() @ after.planes.pose
     along_mm = move.translation_mm[:, 2]

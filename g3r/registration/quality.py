@@ -1,4 +1,4 @@
-"""Which stacks are reliably registered, and warnings about those that are not."""
+"""Reliability of the registration of each stack, and warnings about stacks that are not reliable."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from g3r.registration.stack_quality import StackQuality, is_mirrored, rounded_do
 from g3r.registration.thresholds import DOWNWEIGHTED_BELOW, MIN_CROSSING_DEG
 
 PARALLEL = "all stacks: their slices are nearly parallel in the head"
-"""How the warning about it begins."""
+"""Start of the warning about nearly parallel stacks."""
 
 LEFT_OUT = "left out of the volume"
-"""How a line about a stack that does not fit goes on after its name."""
+"""How the line about a stack that was left out goes on after its name."""
 
 
 def unknown_orientation_note(slices: Slices) -> str:
@@ -31,7 +31,7 @@ def unknown_orientation_note(slices: Slices) -> str:
 
 
 def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQuality]:
-    """The quality of each given stack, in their order; `n_stacks` counts those that are not among the slices, too."""
+    """The quality of each given stack, in their order; `n_stacks` counts stacks without slices, too."""
     found, left_out = [], dict(registration.left_out)
     present = np.unique(registration.slices.stack_id).tolist()
     for n in range(n_stacks):
@@ -65,11 +65,11 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
             handedness=None if registration.handedness is None else registration.handedness[place],
             **missing,
         )
-        # two stacks have no third that shows whether the head has sides: the verdict asks to look
+        # with two stacks no third shows whether the head is asymmetric: the verdict asks the user to look
         fails = bool(shortfalls(one)) or (is_mirrored(one) and len(present) > 2)
         found.append(one if held_out is None else replace(one, reliable=not fails))
     if registration.misfit_without is not None and all(found[n].reliable for n in present):
-        # one that failed is known to be wrong, and others may gain without a sound one as long as it stays
+        # a failed stack is known to be wrong, and while it stays, others may gain without a sound one
         for n, left in zip(present, registration.misfit_without, strict=True):
             one = replace(found[n], misfit_without=left)
             found[n] = replace(one, reliable=not shortfalls(one))
@@ -77,7 +77,7 @@ def stack_qualities(registration: Registration, n_stacks: int) -> list[StackQual
 
 
 def pose_warnings(registration: Registration, qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -> list[str]:
-    """A line for each stack that is not reliable.
+    """Warnings about stacks, a line each, such as for a stack that is not reliable.
 
     Args:
         registration: of the stacks.
@@ -89,7 +89,7 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
         if one.median_slice_ncc is None:
             lines.append(f"{stack.name}: no slice with enough masked pixels; the stack was not used")
         elif one.left_out:
-            # one that merely does not fit harms nothing any more: `left_out_notes`
+            # a stack that merely does not fit does no harm once it is left out: `left_out_notes`
             lines += [f"{stack.name}: {LEFT_OUT}, {misfit(one)}"] if is_mirrored(one) else []
         elif is_mirrored(one) and one.reliable:
             lines.append(
@@ -118,7 +118,7 @@ def pose_warnings(registration: Registration, qualities: Sequence[StackQuality],
 
 
 def left_out_notes(qualities: Sequence[StackQuality], stacks: Sequence[Stack]) -> list[str]:
-    """A line for each stack that was left out and is no mirror image, which would be a warning.
+    """A line for each stack that was left out, except mirror images, which get a warning.
 
     Args:
         qualities: of each stack.

@@ -1,4 +1,4 @@
-"""Motion segments of all stacks: each stack placed again and again in the volume of the others."""
+"""Search for the motion segments of all stacks: each stack is placed repeatedly in the volume of the others."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ RIGID_VOXEL_MM = 2.4
 
 
 def aligned_to(slices: Slices, motion: RigidPose, other: RigidPose) -> RigidPose:
-    """Another set of motions, brought near to the first by one common rigid motion.
+    """Another set of motions, aligned to the first by one common rigid motion.
 
-    The fit is robust: slices that the two place differently hardly count.
+    The fit is robust: slices that the two sets place differently hardly count.
 
     Args:
         slices: K slices.
@@ -161,7 +161,7 @@ def collapse_to_rigid(
     interleave: list[int],
     fill: TemplateFill | None = None,
 ) -> RigidPose:
-    """Motions [K] in which each stack has one for all its slices where that predicts them as well.
+    """Motions [K] with one motion for all slices of a stack where that predicts the stack as well.
 
     Args:
         slices: of two or more stacks.
@@ -188,7 +188,7 @@ def rigid_or_segments(
     min_cost_gain: float = MIN_COST_GAIN,
     min_correlation: float = -1.0,
 ) -> tuple[RigidPose, bool]:
-    """One motion for all slices of a stack where a volume predicts them as well by it; else its segments.
+    """One motion for all slices of a stack, if a volume predicts them as well with it; else its segments.
 
     Args:
         slices: of all stacks.
@@ -198,7 +198,7 @@ def rigid_or_segments(
         volume: [I, J, K] made without the stack.
         grid: its grid.
         min_cost_gain: by how much segments have to be cheaper.
-        min_correlation: of segments with the volume.
+        min_correlation: least correlation of segments with the volume.
 
     Returns:
         Motions [K], and whether they are all the same.

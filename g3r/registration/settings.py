@@ -1,4 +1,4 @@
-"""Which layers of registration run, and how long they search."""
+"""Settings of registration: which layers run, and how long they search."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ class RegistrationSettings:
     Args:
         template: initialisation by atlas templates; it also gives the standard orientation.
         network: initialisation by the pose network.
-        network_as_reserve: ... only where no atlas template is of the subject's size.
+        network_as_reserve: the pose network is used only if no atlas template is of the subject's size.
         stacks: initialisation by stacks registered to each other from many starts.
         segments: place motion segments again in the volume of the other stacks.
         n_candidates: random motions tried at once for a stack in the search.
-        attempts: at most this many searches with other random numbers while stacks do not predict each other.
+        attempts: at most this many searches, each with other random numbers, while stacks do not predict each other.
         n_rounds: alternations of volume and slices; 0 leaves the slices at their motion segments.
-        stray_searches: after the rounds, at most so many searches for slices that went astray, with more rounds after
-            each that found some.
+        stray_searches: after the rounds, at most this many searches for slices that went astray; more rounds follow
+            each search that found some.
         steps_per_round: Gauss-Newton steps of the slices in a round.
         finest_voxel_mm: voxel of the last rounds.
-        finest_voxel_pixels: the same at least, in units of what a pixel covers (the cube root of its area times the
-            thickness): in a volume of smaller voxels each slice finds itself, wherever it is.
-        max_pixels: masked pixels in use; larger subjects are thinned on coarse levels.
+        finest_voxel_pixels: lower bound of that voxel, in units of what a pixel covers (the cube root of its area times
+            the thickness): in a volume of smaller voxels each slice fits itself, wherever it is.
+        max_pixels: masked pixels in use with the finest voxel, at most; coarse levels use fewer.
         standard_orientation: move the result into the atlas frame; otherwise it stays in the scanner frame.
-        check_handedness: ask whether a stack is a mirror image of the others, where an atlas template fits.
-        leave_out_misfits: leave stacks out that do not fit the others, where most do, and register those anew.
+        check_handedness: test whether a stack is a mirror image of the others, where an atlas template fits.
+        leave_out_misfits: leave out stacks that do not fit the others, if most do, and register those anew.
         seed: of the random search.
     """
 

@@ -1,4 +1,4 @@
-"""How well slices fit a volume under many candidate motions at once, outline of the head included."""
+"""Similarity of slices and a volume under many candidate motions at once, outline of the head included."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.registration.similarity_kernels import model_sums
 
 PIXELS_PER_SLICE = 100
-"""Pixels of a slice that take part in a search; at its resolution neighbours are nearly alike."""
+"""Pixels of a slice that are used in a search; at its resolution neighbouring pixels are nearly alike."""
 
 GAIN_RANGE = (0.6, 1.6)
-"""Intensity factors of a slice that a candidate may be fitted with."""
+"""Range of the gain of a slice that is fitted for each candidate."""
 
 CORRELATION_AREA_MM2 = 80.0
-"""Area over which residuals are correlated at a search's resolution: one independent sample for each."""
+"""Area over which residuals are correlated at the resolution of a search, so that it holds one independent sample."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchPixels:
     """Thinned pixels of some slices as points of the world.
 
-    Pixels of a slice's bounding box outside its mask count with value 0: the outline of the head says at
+    Pixels of a slice's bounding box outside its mask count with value 0: the outline of the head tells at
     least as much about its orientation as the anatomy inside.
 
     Args:
@@ -34,7 +34,7 @@ class SearchPixels:
         value: [P].
         start: [K + 1] first pixel of each slice.
         area_mm2: [K] area of the bounding box of each slice.
-        center_mm: [3] mean of the masked pixels; of a stack that lacks slices, the middle of the head.
+        center_mm: [3] mean of the masked pixels; the middle of the head for a stack that lacks slices.
     """
 
     point_mm: NDArray[np.float64]
@@ -88,7 +88,7 @@ class SearchPixels:
         """
         index_from_world = np.linalg.inv(grid.affine)
         linear = index_from_world[:3, :3] @ motion.rotation
-        middle = self.point_mm.mean(0)  # near it, single precision is enough
+        middle = self.point_mm.mean(0)  # relative to it, single precision is enough
         translation = motion.translation_mm @ index_from_world[:3, :3].T + index_from_world[:3, 3] + linear @ middle
         point = np.ascontiguousarray((self.point_mm - middle).T, np.float32)
         n_cell = grid.shape[1] * grid.shape[2] + grid.shape[2] + 2
@@ -160,8 +160,8 @@ def slice_costs(
 ) -> NDArray[np.float64]:
     """Negative log likelihood [K, J] of slices k in a volume under motions j.
 
-    Student's form with the noise level of a slice that fits, so that a slice with signal loss counts less. The volume
-    is read at the nearest of voxels half the size.
+    Of Student's t form with the noise level of a slice that fits, so that a slice with signal loss counts less. The
+    volume is interpolated to half the voxel size and read at the nearest voxel.
 
     Args:
         pixels: of K slices.
@@ -176,7 +176,7 @@ def slice_costs(
 
 
 def halved_voxels(volume: NDArray[np.float32], grid: VolumeGrid) -> tuple[NDArray[np.float32], VolumeGrid]:
-    """A volume with a value between any two voxels, by linear interpolation; and its grid.
+    """A volume with a linearly interpolated value between any two voxels, and its grid.
 
     Args:
         volume: [I, J, K].

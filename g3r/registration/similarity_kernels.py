@@ -10,11 +10,11 @@ import numpy as np
 def model_sums(flat, shape, point, value, start, linear, translation, interpolate, out):
     """The sums m, mm and ym of `SearchPixels.moments`.
 
-    The volume is flat, followed by zeros in which points outside it lie: without a branch, and with indices that
-    cannot be negative (for which numba would look), both loops over the pixels become vector code.
+    The volume is flat and followed by zeros, which points outside it read. Without a branch, and with indices that
+    cannot be negative (numba would check for that), both loops over the pixels are vectorised.
 
-    `interpolate` is True for trilinear reading, and None for the nearest voxel: numba compiles each by itself, without
-    what the other needs. The second takes a third of the time, for one read of memory where the first needs eight.
+    `interpolate` is True for trilinear reading, and None for the nearest voxel: numba compiles each version by itself,
+    without the code of the other. The nearest voxel takes a third of the time: one read of memory instead of eight.
     """
     zero = np.float32(0)
     shift = np.float32(0.5) if interpolate is None else zero
@@ -24,7 +24,7 @@ def model_sums(flat, shape, point, value, start, linear, translation, interpolat
     to_i, to_j, to_k = np.uint64(shape[1] * shape[2]), np.uint64(shape[2]), np.uint64(1)
     longest = (start[1:] - start[:-1]).max()
     for j in numba.prange(len(linear)):
-        # as scalars: LLVM cannot know that nothing writes to the arrays inside the loops
+        # as scalars: LLVM cannot tell that nothing writes to the arrays inside the loops
         a_xx, a_xy, a_xz = linear[j, 0, 0], linear[j, 0, 1], linear[j, 0, 2]
         a_yx, a_yy, a_yz = linear[j, 1, 0], linear[j, 1, 1], linear[j, 1, 2]
         a_zx, a_zy, a_zz = linear[j, 2, 0], linear[j, 2, 1], linear[j, 2, 2]

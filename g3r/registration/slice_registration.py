@@ -20,19 +20,19 @@ GAIN_PRIOR_SIGMA = 0.3
 """Standard deviation of the prior on the logarithm of slice gains; keeps dark slices finite."""
 
 NEIGHBOURS = (-2, -1, 1, 2)
-"""Steps to the slices of a stack that count as neighbours."""
+"""Offsets of the slices of a stack that count as neighbours."""
 
 TIE_SHARE = 0.01
-"""Stiffness of the tie between neighbours, as a share of the median stiffness of a slice: a slice through the
-middle of the head hardly feels it, one of a few pixels at the edge follows its neighbours."""
+"""Stiffness of the tie between neighbours, as a share of the median stiffness of a slice: it hardly affects a slice
+through the middle of the head, while a slice of a few pixels at the edge follows its neighbours."""
 
 UNSEEN_NORMAL_TIE = 0.3
 """The same along the normal of a slice that no other stack sees: the volume there was made of the slice and its
-neighbours, and nothing else says how far they are apart."""
+neighbours, and nothing else determines how far they are apart."""
 
 TIE_REACH_MM = 3.0
 """Neighbours whose motion would move a slice further than this count less: after a jerk, and between the
-passes of an interleaved stack, neighbours are elsewhere for good reason."""
+passes of an interleaved stack, neighbours rightly lie elsewhere."""
 
 
 def register_slices(
@@ -141,7 +141,7 @@ class NeighbourTie:
         motion = slices.world_from_header()
         pose = slices.planes.pose
         information = np.einsum("kii->k", equations.hessian[:, 3:6, 3:6]) / 3
-        # a rotation counts by how far it moves the edge of the slice; slices of a few pixels have hardly any
+        # a rotation counts by how far it moves the edge of the slice; slices of a few pixels get a least radius
         half_mm = slices.planes.shape * slices.planes.spacing_mm / 2
         radius_mm = np.maximum(np.sqrt((half_mm**2).mean(1)), 10.0)
         rotation = np.zeros((n, 3, 3))
@@ -184,7 +184,7 @@ class NeighbourTie:
 
 
 def _objective(equations: NormalEquations, width: float) -> NDArray[np.float64]:
-    """Cauchy loss of each slice [K] as half a sum of squares where residuals are small."""
+    """Cauchy loss of each slice [K], scaled to half a sum of squares where residuals are small."""
     return 0.5 * width**2 * equations.loss * equations.moments[:, 0]
 
 

@@ -1,4 +1,4 @@
-"""Volume and slice poses in alternation: every slice its own rigid body, coarse to fine."""
+"""Volume and slice poses in alternation: every slice is a rigid body of its own, coarse to fine."""
 
 from __future__ import annotations
 
@@ -26,37 +26,38 @@ logger = logging.getLogger(__name__)
 
 
 MIN_ROUNDS = 3
-"""One with coarse voxels and two with the finest, whatever the deadline."""
+"""Rounds that run whatever the deadline: one with coarse voxels and two with the finest."""
 
 N_ROUNDS_IN_PLACE = 3
-"""Of gains and weights without poses: gains settle, and weights of tips of few pixels would fall on and on, since the
-volume is made without them."""
+"""Rounds of gains and weights at fixed poses. Gains settle in them; with more, the weights of tips of few pixels would
+fall on and on, since the volume is made without them."""
 
 GAIN_RANGE_IN_PLACE = (0.05, 20.0)
-"""Of slices whose poses are given: wide, so that one that lost its signal is seen to have done so."""
+"""Range of gains of slices whose poses are given: wide, so that the gain of a slice without signal shows the loss."""
 
 ROUNDS_AFTER_SEARCH = 3
-"""Where slices were astray, the others have not found their places either: one round gave six volumes in severe motion
-0.1 dB less in the mean than two, and 0.25 dB less than four (`fast`, by hand)."""
+"""Rounds after a search for strays. While slices were astray, the others did not find their places either: one round
+gave six volumes in severe motion 0.1 dB less in the mean than two, and 0.25 dB less than four (`fast`, by hand)."""
 
 FINEST_FROM = 0.4
 """Share of the rounds after which voxels are the finest."""
 
 OVER_RELAXATION = 1.8
-"""Moves of a round with the finest voxels are made this much longer (successive over-relaxation, Young 1954): found in
-turn, slices and volume end their way in steps that shrink by a fifth from round to round, all in one direction."""
+"""Factor by which the moves of a round with the finest voxels are made longer (successive over-relaxation, Young 1954).
+Without it, slices and volume, found in turn, converge in steps that shrink by a fifth from round to round, all in one
+direction."""
 
 CARRIED_ON_MM, CARRIED_ON_RAD = 1.0, 0.03
-"""Longest moves that are made longer: slices of others are on their way to another place."""
+"""Longest moves that are made longer: slices with longer moves are on their way to another place."""
 
 VOLUME_STEPS = 5
-"""Of conjugate gradients in each round, which goes on from the volume before: three more changed no pose by 0.05 mm."""
+"""Conjugate-gradient steps of each round, from the last volume on: three more changed no pose by 0.05 mm."""
 
 CONTINUED_VOXELS = 1.5
 """Standard deviation, in voxels, of the blur that continues a volume beyond the masks."""
 
 LEAST_SEEN = 1e-6
-"""Share of the highest blurred coverage below which a voxel is too far from all masks to be continued to."""
+"""Share of the highest blurred coverage below which a voxel is too far from all masks for a continued value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +78,7 @@ def refine_slices(
     deadline: Deadline | None = None,
     seen_share: NDArray[np.float64] | None = None,
 ) -> FittedSlices:
-    """Register every slice to the volume of all, which each round makes anew.
+    """Register every slice to the volume of all slices, which is made anew in each round.
 
     Args:
         slices: at poses right to a few millimetres.
@@ -109,7 +110,7 @@ def refine_slices(
 
 
 class _Rounds:
-    """Slices, gains and weights, and the volume of all, as they are after the last round.
+    """The state after the last round: slices, gains and weights, and the volume of all slices.
 
     Args:
         slices, settings, seen_share: see `refine_slices`.
@@ -127,12 +128,12 @@ class _Rounds:
         """One round.
 
         Args:
-            fraction: of the rounds that is done, from 0 to 1, which decides how fine this one is.
-            n_found: slices that were placed anew just before, for the history.
+            fraction: share of the rounds that is done, from 0 to 1, which decides how fine this one is.
+            n_found: number of slices that were placed anew just before, for the history.
         """
         settings, before = self.settings, self.slices
         # coarse to fine: the capture range is about a voxel of the volume's blur. Few coarse rounds, since blur moves
-        # what is round inwards, and slices follow it along their normal
+        # round surfaces inwards, and slices follow them along their normals
         voxel = settings.finest_voxel_mm * (2.4 if fraction < 0.1 else 1.6 if fraction < FINEST_FROM else 1.0)
         smoothness = 0.1 if fraction < 0.2 else 0.03 if fraction < 0.7 else 0.01
         if self.grid is None or not np.isclose(self.grid.spacing_mm[0], voxel):
@@ -159,11 +160,11 @@ class _Rounds:
 
 
 def carried_on(before: Slices, after: Slices, factor: float) -> Slices:
-    """Slices moved on in the direction in which they have just gone.
+    """Slices moved further in the direction of their last move.
 
     Args:
-        before: slices at their poses before.
-        after: the same slices at their poses now; those that went far or turned far stay there.
+        before: slices before the move.
+        after: the same slices after it; those that went far or turned far stay there.
         factor: length of the whole move over that made; 1 leaves all in place.
     """
     now = after.planes.pose
@@ -177,7 +178,7 @@ def carried_on(before: Slices, after: Slices, factor: float) -> Slices:
 def fitted_in_place(
     slices: Slices, settings: RegistrationSettings, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> FittedSlices:
-    """Gains, weights and correlations of slices that stay where they are, as `refine_slices` finds them.
+    """Gains, weights and correlations of slices at fixed poses, as `refine_slices` finds them.
 
     Slices of a single stack, which explain themselves, keep a gain and a weight of 1, as there.
 
@@ -237,11 +238,11 @@ def _volume_of(
 def continued_outwards(
     operator: VoxelOperator, value: NDArray[np.float32], weight: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """A blurred volume [I, J, K] that goes on beyond the masks as it is at their rim.
+    """A blurred volume [I, J, K] that continues beyond the masks with its values at their rim.
 
-    Zeros there would be taken for what lies outside: pixels of the rim would seem too bright, and their slices would
-    move inwards, where nothing is lost, since pixels outside the mask are not asked. Normalised convolution
-    (Knutsson and Westin 1993) says nothing of what was not seen.
+    Zeros there would count as what lies outside: pixels of the rim would seem too bright, and their slices would
+    move inwards at no cost, since pixels outside the mask are not compared. Normalised convolution (Knutsson and Westin
+    1993) takes no account of what was not seen.
     """
     bright = gaussian_filter(operator.adjoint(weight * value), CONTINUED_VOXELS, truncate=6.0)
     seen = gaussian_filter(operator.adjoint(weight), CONTINUED_VOXELS, truncate=6.0)
@@ -259,7 +260,7 @@ def correlation_with_all(
         gain: [K] intensity factors.
         weight: [K] slice weights.
         voxel_mm: of the volume.
-        max_pixels: about as many are looked at, at most.
+        max_pixels: number of pixels in use, about, at most.
     """
     grid, stride = grid_around(slices, voxel_mm), max(1, round(len(slices.pixel_index) / max_pixels))
     volume = _volume_of(slices, grid, gain, weight, None, 0.03, stride)

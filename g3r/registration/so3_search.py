@@ -14,17 +14,17 @@ from g3r.registration.pose_sampling import angle_deg, rotations_about, rotations
 from g3r.registration.similarity import StackSamples, correlation, slice_costs
 
 N_ORIENTATIONS = 4000
-"""Orientations that are tried; the nearest to any is about 10 degrees off."""
+"""Number of orientations that are tried; any orientation is within about 10 degrees of one of them."""
 
 N_FOLLOWED, DISTANCE_DEG = 4, 60.0
 N_FOLLOWED_OF_STACK, STACK_DISTANCE_DEG = 10, 35.0
 CORRELATION_MARGIN = 0.08
-"""Orientations that are followed further: at most this many, at least this far apart, and no worse than the
-best by more than this. One stack alone is more ambiguous than the whole head."""
+"""Limits for the orientations that are followed: their largest number, the least angle between two of them, and by how
+much their correlation may be below the best. One stack alone is more ambiguous than the whole head."""
 
 SEGMENT_REACH_DEG = 70.0
 SEGMENT_TRANSLATION_MM = 7.0
-"""How far a motion segment may be from its stack's orientation, and the lattice of translations tried."""
+"""Largest angle of a motion segment to its stack's orientation, and step of the lattice of translations."""
 
 
 def best_orientations(
@@ -33,7 +33,7 @@ def best_orientations(
     n_most: int = N_FOLLOWED,
     distance_deg: float = DISTANCE_DEG,
 ) -> list[NDArray[np.float64]]:
-    """The rotations with the highest correlation that are far apart from each other, best first.
+    """The rotations with the highest correlation that are far from each other, best first.
 
     Args:
         rotation: [J, 3, 3].

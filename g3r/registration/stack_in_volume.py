@@ -1,6 +1,6 @@
-"""A stack placed in a finished volume that it did not help to make, wherever that lies: whole first, then its slices.
+"""Placement of a stack in a finished volume that it did not help to make: the whole stack first, then its slices.
 
-The same three steps as everywhere in this room: an exhaustive search of orientations where the headers do not agree,
+The steps are those of registration: an exhaustive search of orientations where the headers do not agree,
 motion segments, and Levenberg-Marquardt for every slice, coarse to fine.
 """
 
@@ -32,7 +32,7 @@ SEARCH_ROUNDS = ((8.0, 4.0), (5.0, 3.0), (3.0, 2.0), (2.0, 1.5))
 """Random rotations (degrees) and translations (mm) of the rounds of motion segments."""
 
 BLUR_MM = (1.5, 0.7, 0.0)
-"""Standard deviations of the volume's blur while slices are registered; the capture range is about the first."""
+"""Standard deviations of the volume's blur while slices are registered; the capture range is about the first one."""
 
 N_STEPS = 8
 
@@ -56,7 +56,7 @@ def place_in_volume(
     motion, correlation = _searched(sample, coarse, coarse_grid, rng)
     slices = slices.with_motion(motion)
     gain = np.ones(len(slices))
-    # against zeros beyond what the volume shows, a slice that it shows in part would move inwards
+    # with zeros beyond what the volume shows, a slice that it shows only in part would move inwards
     continued = smooth_fill(volume, (volume != 0).astype(np.float32))
     for sigma_mm in BLUR_MM:
         blurred = gaussian_filter(continued, sigma_mm / grid.spacing_mm) if sigma_mm else continued
@@ -67,7 +67,7 @@ def place_in_volume(
 
 
 def _coarse(volume: NDArray[np.float32], grid: VolumeGrid) -> tuple[NDArray[np.float32], VolumeGrid]:
-    """The volume as blurred as thick slices are, in voxels of the search."""
+    """The volume blurred as thick slices are, in voxels of the search."""
     head = bounding_box(volume != 0)
     inside = grid.cropped(head)
     corners = inside.world(inside.corner_index)
@@ -79,7 +79,7 @@ def _coarse(volume: NDArray[np.float32], grid: VolumeGrid) -> tuple[NDArray[np.f
 def _searched(
     sample: StackSamples, volume: NDArray[np.float32], grid: VolumeGrid, rng: np.random.Generator
 ) -> tuple[RigidPose, float]:
-    """Motions [K] of a stack by the search, and their correlation: from the headers, then from any orientation."""
+    """Motions [K] of a stack by the search, and their correlation: starts at the headers, then at any orientation."""
     best: tuple[float, float, RigidPose] | None = None
     weight = volume.clip(0)
     target_mm = grid.world(np.argwhere(weight > 0)).T @ weight[weight > 0] / weight.sum()
@@ -102,7 +102,7 @@ def _searched(
 def _starts(
     sample: StackSamples, target_mm: NDArray[np.float64], volume: NDArray[np.float32], grid: VolumeGrid
 ) -> Iterator[RigidPose]:
-    """The headers as they are, the headers with the middles of both heads put together, and any orientation."""
+    """Motions to start from: the headers, the headers with the centres of both heads aligned, and any orientation."""
     still = RigidPose.identity(len(sample.slice_index))
     yield still
     yield RigidPose(still.rotation, still.translation_mm + target_mm - sample.pixels.center_mm)

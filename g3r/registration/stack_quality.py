@@ -1,4 +1,4 @@
-"""How well one stack is registered, and what is wrong with one that is not."""
+"""Quality of the registration of one stack, and its shortfalls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from g3r.registration.thresholds import (
 
 @dataclass(frozen=True)
 class StackQuality:
-    """How well the slices of one stack are registered.
+    """Quality of the registration of one stack.
 
     Args:
         reliable: whether every figure is in the range of registered stacks; None for a single stack, which
@@ -32,18 +32,18 @@ class StackQuality:
         held_out_correlation: with a volume of the other stacks; None for a single stack.
         median_slice_ncc: of its slices with the volume of all; None without slices.
         downweighted_share: share of slices with a weight below one half.
-        n_missing: slices that are missing between others.
-        longest_gap_mm: the longest span without a slice between others.
+        n_missing: number of missing slices between acquired ones.
+        longest_gap_mm: length of the longest gap between acquired slices.
         is_cut: whether the field of view cut the head.
         overlap_share: share of its pixels that other stacks saw; None for a single stack, and where no stack
             lacks slices.
         overlap_correlation: with the other stacks over those pixels.
         handedness: whether it shows the asymmetry of the head as the others do (`registration.handedness`); None where
-            that was not asked for or cannot be said.
-        misfit_without: how much of the misfit of the other stacks is left without it (`registration.intruder`); None
-            where that was not asked for, or less is left without another.
+            it was not computed or is unknown.
+        misfit_without: share of the misfit of the other stacks that is left without it (`registration.intruder`); None
+            where it was not computed, or less is left without another stack.
         left_out: whether the volume was made without it, since it does not fit the others (`registration.misfits`);
-            then the figures are those that it had beside them.
+            then the figures are those of the registration with it.
     """
 
     reliable: bool | None
@@ -70,12 +70,12 @@ def is_mirrored(one: StackQuality) -> bool:
 
 
 def rounded_down(value: float | None) -> str:
-    """With two decimals; "none" for None. What misses a lower limit by a hair is not to be read as if it reached it."""
+    """With two decimals, rounded down, so that a value just below a limit does not read as equal; "none" for None."""
     return "none" if value is None else str(Decimal(str(value)).quantize(Decimal("0.01"), ROUND_FLOOR))
 
 
 def shortfalls(one: StackQuality) -> list[str]:
-    """What is worse of a stack than of registered ones, each with what is good; empty where nothing is."""
+    """Figures of a stack that are worse than those of registered stacks, each with the good range; empty if none is."""
     found = []
     leeway = LEEWAY if _in_place(one) else 0.0
     least, least_overlap = MIN_HELD_OUT - leeway, MIN_OVERLAP_CORRELATION - leeway
@@ -86,7 +86,7 @@ def shortfalls(one: StackQuality) -> list[str]:
     if one.downweighted_share > MAX_DOWNWEIGHTED_SHARE:
         good = f"good is {MAX_DOWNWEIGHTED_SHARE:.0%} or fewer"
         found.append(f"{100 * one.downweighted_share:.3g}% of its slices fit badly; {good}")
-    # the template that stood for what others did not see agrees with any head
+    # the template that was used for what others did not see agrees with any head
     if one.overlap_share is not None and one.overlap_share < MIN_OVERLAP_SHARE:
         found.append(f"others saw {100 * one.overlap_share:.3g}% of it; good is {MIN_OVERLAP_SHARE:.0%} and above")
     if one.overlap_correlation is not None and one.overlap_correlation < least_overlap:
@@ -99,16 +99,16 @@ def shortfalls(one: StackQuality) -> list[str]:
 
 
 def _in_place(one: StackQuality) -> bool:
-    """Whether slices fit a volume that others made, too, as only those of stacks in place do."""
+    """Whether slices fit a volume that others helped to make as well as only those of stacks in place do."""
     seen_by_others = one.overlap_share is None or one.overlap_share >= IN_PLACE_SHARE
     return one.median_slice_ncc is not None and one.median_slice_ncc >= IN_PLACE_NCC and seen_by_others
 
 
 def unlike_others(qualities: Sequence[StackQuality]) -> list[int]:
-    """Places of stacks that passed every test of their own, but whose slices fit the volume less than the best ones do.
+    """Indices of stacks that passed every test of their own, but whose slices fit the volume less than the best do.
 
     Args:
-        qualities: of stacks; those that were left out, had no slices, or failed are not asked.
+        qualities: of stacks; those that were left out, had no slices, or failed are ignored.
     """
     ncc = [None if one.left_out else one.median_slice_ncc for one in qualities]
     best = max((one for one in ncc if one is not None), default=0.0)

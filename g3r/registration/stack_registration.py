@@ -1,9 +1,8 @@
 """Stack-to-stack registration: one stack after the other, from many starts.
 
-A volume is made of the stacks registered so far; the next stack is tried in many rotations about the centre
-of the head, the best few are refined by Gauss-Newton with the whole stack as one rigid body, and the best one
-is taken. One after the other, because the mean of unregistered stacks is a blur that draws all of them to its
-centre.
+A volume is made of the stacks registered so far. The next stack is tried in many rotations about the centre of the
+head, the best few are refined by Gauss-Newton with the whole stack as one rigid body, and the best one is taken. Stacks
+are added one by one, because the mean of unregistered stacks is a blur that draws all of them to its centre.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ def _register_one(moving: Slices, fixed: Slices) -> tuple[RigidPose, float]:
     starts = []
     for angles in itertools.product(SEARCH_ANGLES_DEG, repeat=3):
         rotation = rotation_matrix(np.deg2rad(angles))
-        # about the centre of the head; moved to the centre of the other stacks, or left where the header says
+        # about the centre of the head, which is moved to the centre of the other stacks or left at its header position
         for target in (fixed_center, moving_center):
             motion = RigidPose(rotation[None], (target - rotation @ moving_center)[None])
             pose = motion @ moving.planes.pose

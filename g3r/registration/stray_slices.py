@@ -1,9 +1,9 @@
-"""Slices that went astray, searched for again in the volume of all others.
+"""Search for slices that went astray, in the volume of all others.
 
-Where the head moves between most slices, some of them end in a wrong place, from which no gradient and no neighbour
-leads back. The weight of most falls to nothing, and what they saw is lost; thick slices draw the volume after them and
-are seen by their low correlation alone. The volume of the others is good by then. So they are tried in many places of
-it, and motion in time decides between those as in the search for motion segments.
+Where the head moves between most slices, some slices end in a wrong place, from which no gradient and no neighbour
+leads back. The weight of most of them falls to nothing, and what they saw is lost. Thick slices draw the volume after
+them and are recognised by their low correlation alone. The volume of the others is good by then. So strays are tried in
+many places of it, and motion in time decides between these as in the search for motion segments.
 """
 
 from __future__ import annotations
@@ -34,40 +34,40 @@ from g3r.registration.thresholds import DOWNWEIGHTED_BELOW
 logger = logging.getLogger(__name__)
 
 VOXEL_MM, PIXELS_OF_VOLUME = 2.0, 200_000
-"""Of the volume in which they are searched."""
+"""Voxel size and number of pixels of the volume in which strays are searched."""
 
 N_FIRST = 10_000
-"""Motions that are tried at first, around those of all slices that fit."""
+"""Motions that are tried first, around those of all slices that fit."""
 
 STEPS = ((12.0, 6.0), (6.0, 3.0), (3.0, 1.5), (1.5, 0.8))
 """Standard deviations of random rotations (degrees) and translations (mm), from step to step."""
 
 N_KEPT = (20, 10, 5, 3)
-"""The best motions of each step for a slice."""
+"""Number of best motions that are kept for a slice after each step."""
 
 N_EACH = 60
-"""Random motions around each of these in the next step."""
+"""Random motions around each kept motion in the next step."""
 
 MIN_SAMPLES = 10.0
-"""Independent samples in a slice that is searched: smaller ones fit in many places."""
+"""Least number of independent samples in a slice that is searched: smaller slices fit in many places."""
 
 MIN_GAIN = 5.0
 """Least fall of the cost (log odds) of a slice for another place to be taken: the best of so many random motions is
-better than one by about the logarithm of their number."""
+better than a single one by about the logarithm of their number."""
 
 UNLIKE = 2.0
-"""A slice whose correlation with the volume lacks so many times as much to 1 as that of the upper quartile is searched,
-too. Of 32 heads (`fast`, by hand) 20 were in severe motion, most of them in slices of 4.4 and 5 mm: the brain more than
-2 mm off fell in four of these (from 40 to 25, 27 to 13, 8 to 5 and 4 to 2 %), rose in two (from 11 to 15, 2 to 4), and
-changed by less than 1 % in all others, or by what else had been changed."""
+"""A slice is searched, too, if 1 minus its correlation with the volume is more than this times that of the upper
+quartile. Of 32 heads (`fast`, by hand) 20 were in severe motion, most of them in slices of 4.4 and 5 mm: the share of
+the brain more than 2 mm off fell in four of these (from 40 to 25, 27 to 13, 8 to 5 and 4 to 2 %), rose in two (from 11
+to 15, 2 to 4), and changed by less than 1 %, or because of other changes, in all others."""
 
 MAX_UNLIKE = 0.5
-"""Share of the slices of a stack that may be unlike the volume: where more are, it is the stack that fits less, and
-what is left makes no volume in which they could be found. In a round of two stacks 23 of 52 slices that were 0.13 mm
-off, most of one stack, had gone to 0.5 mm (`mild-64011-sta34` of docs/tradeoff.md, `accurate`)."""
+"""Largest share of the slices of a stack that may be unlike the volume. If more are, the whole stack fits less, and the
+rest makes no volume in which they could be found. In a round of two stacks, 23 of 52 slices that were 0.13 mm off, most
+of one stack, went to 0.5 mm off (`mild-64011-sta34` of docs/tradeoff.md, `accurate`)."""
 
 UNREACHABLE = 1e9
-"""Cost of another motion for a slice that fits where it is."""
+"""Cost of any other motion for a slice that fits where it is."""
 
 
 def find_strays(
@@ -77,7 +77,7 @@ def find_strays(
     ncc: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> tuple[Slices, int]:
-    """Better places for slices whose weight has fallen to nothing, or that are `UNLIKE` the volume, and are not dark.
+    """Better places for slices that have lost their weight or are `UNLIKE` the volume, and are not dark.
 
     Args:
         slices: K slices at their present poses.
@@ -87,7 +87,7 @@ def find_strays(
         rng: source of random motions.
 
     Returns:
-        The slices, and how many were moved. Whether they count is for the next weights to say.
+        The slices, and how many were moved. The next weights decide whether they count.
     """
     pixels = SearchPixels.of(slices.with_pose(slices.header_pose))
     n_samples = pixels.area_mm2 / CORRELATION_AREA_MM2
@@ -115,7 +115,7 @@ def find_strays(
 
 
 class _Search:
-    """Of the slices of one stack, in a volume of all that fit.
+    """Search for the slices of one stack in a volume of all slices that fit.
 
     Args:
         slices: of all stacks.

@@ -1,8 +1,8 @@
-"""What no other stack saw: the atlas template in place of the zeros of a volume made of the other stacks.
+"""The atlas template for what no other stack saw, in place of the zeros of a volume made of the other stacks.
 
-A volume of the other stacks is zero where they lack slices. That zero is no evidence: a slice that belongs there
-would fit better anywhere else, and hole goes to hole. The template, in the frame that the slices are in, predicts
-roughly what lies there.
+A volume of the other stacks is zero where they lack slices. A zero there is not evidence: a slice that belongs in the
+hole would fit better elsewhere, and holes would be registered to holes. The template, in the frame that the slices are
+in, predicts roughly what lies there.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from g3r.geometry import RigidPose, VolumeGrid
 from g3r.geometry.grid import on_grid
 
 FULL_COVERAGE = 0.3
-"""Share of the typical coverage of a voxel by pixels from which on the template does not count."""
+"""Share of the typical coverage of a voxel by pixels from which on the template has no weight."""
 
 SPAN_SLICES = 4
-"""Slices at either side of a missing span whose middles say how long it is; even, for interleaved stacks."""
+"""Slices on either side of a missing span whose mean places give its length; even, for interleaved stacks."""
 
 
 @dataclass(frozen=True)
 class TemplateFill:
-    """A head in the frame of the slices.
+    """An atlas template in the frame of the slices.
 
     Args:
         volume: [I, J, K] blurred as thick slices are.
@@ -38,7 +38,7 @@ class TemplateFill:
     center_mm: NDArray[np.float64]
 
     def grid_with(self, grid: VolumeGrid) -> VolumeGrid:
-        """A grid that covers another one and the whole head, with its voxels."""
+        """A grid with the voxels of another one that covers it and the whole head."""
         head = self.grid.world(np.argwhere(self.volume > 0))
         corners = grid.world(grid.corner_index)
         both = np.concatenate([head, corners])
@@ -64,7 +64,7 @@ class TemplateFill:
 
 
 def coverage_share(coverage: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How far each voxel [I, J, K] was seen, from 0 (not) to 1, from the pixels that were spread over it."""
+    """How far each voxel [I, J, K] was seen, from 0 (not) to 1, by its coverage with pixels."""
     some = coverage > 0.1 * coverage.max(initial=0)
     typical = float(np.median(coverage[some])) if some.any() else 1.0
     return np.minimum(coverage / np.float32(FULL_COVERAGE * typical), 1.0).astype(np.float32)
@@ -78,10 +78,10 @@ def sampled(volume: NDArray[np.float32], grid: VolumeGrid, point_mm: NDArray[np.
 
 
 def with_header_spans(header_pose: RigidPose, motion: RigidPose, slice_index: NDArray[np.int64]) -> RigidPose:
-    """Motions of a single stack whose missing spans are as long as the header says.
+    """Motions of a single stack with missing spans as long as the header says.
 
     Slices behind a span may turn and shift in plane against those before it. A jump along the normal would only
-    close or widen the hole: the template that asks for it is another head, and no other stack was asked.
+    close or widen the hole: it would fit the template, which is another head, and no other stack checks it.
 
     Args:
         header_pose: [K] of the slices of one stack, in the order of their numbers.

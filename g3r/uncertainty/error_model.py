@@ -23,11 +23,11 @@ MIN_ERROR, MAX_ERROR = 1e-4, 1.0
 """Bounds of the expected error, in normalised intensities: a ten-thousandth of the brightest tissue, and all of it."""
 
 RIDGE = 1e-4
-"""Keeps coefficients finite that a small sample does not determine."""
+"""Weight of the ridge penalty, which keeps coefficients finite that a small sample does not determine."""
 
 MIN_COEFFICIENT = {"log residual": 0.3}
-"""Coefficients are held at zero or above, this one at more: few of the subjects have wrong poses in of a
-calibration, and a model that learnt from the others to ignore misfit would not see a bad registration."""
+"""Lower bounds of coefficients; the others are held at zero or above. Few subjects of a calibration have wrong poses,
+and a model that learnt from the rest to ignore the residual would not notice a bad registration."""
 
 
 def terms(predictors: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
@@ -103,7 +103,7 @@ def fit_model(
     least = np.array([MIN_COEFFICIENT.get(name, 0.0) for name in names]) * spread
     start[1:] = least
     bounds = [(None, None), *[(float(bound), None) for bound in least]]
-    from scipy.optimize import minimize  # it takes a tenth of a second, and no reconstruction fits this model
+    from scipy.optimize import minimize  # the import takes a tenth of a second, and no reconstruction fits this model
 
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     slopes = found[1:] / spread

@@ -88,15 +88,15 @@ def estimate_uncertainty(
 ) -> Uncertainty:
     """The expected absolute error of every voxel of the mask.
 
-    A product of powers of predictors, with coefficients fitted to simulated subjects
-    (`python -m studies.uncertainty.calibration fit`). It is a mean over voxels that look alike to the pipeline, not a
-    bound: errors of single voxels scatter around it about as an exponential distribution does.
+    The model is a product of powers of predictors, with coefficients fitted to simulated subjects
+    (`python -m studies.uncertainty.calibration fit`). It gives a mean over voxels that look alike to the pipeline, not
+    a bound: errors of single voxels scatter around it about as an exponential distribution does.
 
     Args:
         given: the result.
         with_prior: whether a prior network was used: there is a calibration for each.
-        intensity: intensity of 1 in the fit; the map is multiplied by it.
-        reliable: whether the registration is; None where nothing checks it.
+        intensity: intensity in the files that is 1 in the fit; the map is multiplied by it.
+        reliable: whether the registration is reliable; None where nothing checks it.
     """
     name = WITH_PRIOR if with_prior else WITHOUT_PRIOR
     error = calibration()[name].expected(given.predictors())

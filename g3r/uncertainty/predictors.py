@@ -1,4 +1,4 @@
-"""Predictors of each voxel's error: what the pipeline knows without the truth, free of intensity scale.
+"""Predictors of each voxel's error: what is known without the truth, independent of the intensity scale.
 
 Intensities are normalised (the 99th percentile of V_coarse is 1), so that the same head with brighter pixels gives the
 same predictors.
@@ -22,10 +22,10 @@ from g3r.run.on_demand import torch
 
 RESIDUAL_VOXEL_MM = 1.6
 RESIDUAL_SMOOTHING_MM = 1.6
-"""Few noisy residuals have an unreliable mean: they are gathered on coarse voxels and smoothed."""
+"""Residuals are gathered on coarse voxels and smoothed, since the mean of a few noisy residuals is unreliable."""
 
 RESIDUAL_SUPPORT = 0.1
-"""Density (1 is one gapless stack) at which the local residual and that of the whole head count the same."""
+"""Density (1 is one gapless stack) at which the local residual and that of the whole head have the same weight."""
 
 EDGE_SIGMA_MM = 0.8
 TEXTURE_SIGMA_MM = 2.0
@@ -36,7 +36,7 @@ def mean_residual(fit: SliceFit, grid: VolumeGrid, cutoff_sigma: float = CUTOFF_
     """Mean absolute difference [I, J, K] of pixels and rendered slices around each voxel.
 
     Residuals are spread through the slices' PSF with the slice weights (the adjoint of the voxel operator), over the
-    same with ones. Where few pixels reach, the value goes to the mean of the head.
+    same with ones. Where few pixels reach, the value approaches the mean of the head.
 
     Args:
         fit: Gaussians and slices.
@@ -91,12 +91,12 @@ def gather_predictors(
     spacing = grid.spacing_mm
     box = bounding_box(mask, margin=int(np.ceil(4 * TEXTURE_SIGMA_MM / spacing.min())))
     inside = mask[box]
-    # outside of the head the volume is zero; that edge is no edge of the brain, so continue the head outwards
+    # outside the head the volume is zero; that edge is no edge of the brain, so the head is continued outwards
     image = _continued(np.asarray(volume[box], np.float32), inside)
     predictors: dict[str, NDArray[np.float64]] = {}
 
     def keep(name: str, values: NDArray[np.floating]) -> None:
-        # one after the other: fine voxels make every whole map a large one
+        # one after the other: with fine voxels, each whole map is large
         predictors[name] = values[inside].astype(np.float64)
 
     keep("unmeasured", 1 - confidence(density[box]))
@@ -111,7 +111,7 @@ def gather_predictors(
 
 
 def _local_deviation(image: NDArray[np.float32], sigma: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Root of the local mean square of what differs from the surroundings."""
+    """Root of the local mean square of the deviation from the surroundings."""
     detail = image - gaussian_filter(image, sigma)
     return np.sqrt(np.maximum(gaussian_filter(detail**2, sigma), 0))
 
@@ -119,7 +119,7 @@ def _local_deviation(image: NDArray[np.float32], sigma: NDArray[np.float64]) -> 
 def _depth_mm(inside: NDArray[np.bool_], spacing_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance of each voxel inside [n] to the nearest outside; beyond the edges of the array all is outside.
 
-    From the transform's indices: its own distances take six times their memory on the way.
+    It uses the transform's indices: to return distances, the transform takes six times their memory.
     """
     nearest = distance_transform_edt(
         np.pad(inside, 1), sampling=spacing_mm.tolist(), return_distances=False, return_indices=True
@@ -132,6 +132,6 @@ def _depth_mm(inside: NDArray[np.bool_], spacing_mm: NDArray[np.float64]) -> NDA
 
 
 def _continued(image: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The image with the nearest value of the mask everywhere outside of it."""
+    """The image with the nearest value of the mask everywhere outside the mask."""
     nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
     return image[tuple(nearest)]

@@ -1,10 +1,9 @@
 """Prior share: how far each voxel of a result depends on the prior, by the response of the fit to a change of it.
 
 If the prior had been wrong by some amount, how much of that would still be in the volume after the fit to the slices?
-Rendered pixels are linear in the amplitudes, so this can be asked of the finished fit: the
-amplitudes are changed at random, as another prior would have changed them, the slices stay as they are, and
-conjugate gradients take back what the slices contradict. What is left, as a share of what was put in, is the
-prior's share.
+Rendered pixels are linear in the amplitudes, so the finished fit can answer this: the amplitudes are changed at random,
+as another prior would have changed them, the slices stay as they are, and conjugate gradients remove what the slices
+contradict. The share of the change that remains is the prior share.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ from g3r.run.on_demand import torch
 N_PROBES = 2
 PROBE_VOXEL_MM = 1.6
 SMOOTHING_MM = 3.2
-"""Answers are compared on coarse voxels, in neighbourhoods that hold some dozen Gaussians."""
+"""Responses are compared on coarse voxels, in neighbourhoods that hold some dozen Gaussians."""
 
 ANSWER_ITERATIONS = 20
 ANSWER_DAMPING = 0.01
-"""Conjugate-gradient steps and pull towards the changed amplitudes that respond like the whole fit: checked by
-changing the prior volume itself and fitting again (tests/uncertainty/test_prior_share.py)."""
+"""Conjugate-gradient steps, and pull towards the changed amplitudes, with which the response is that of the whole fit:
+checked by changing the prior volume itself and fitting again (tests/uncertainty/test_prior_share.py)."""
 
 
 def estimate_prior_share(
@@ -46,13 +45,13 @@ def estimate_prior_share(
     cutoff_sigma: float = CUTOFF_SIGMA,
     projection_bytes: int = MAX_PROJECTION_BYTES,
 ) -> NDArray[np.float32]:
-    """For each voxel the share of the prior in the result, from 0 (the slices decide) to 1 (the prior alone).
+    """Prior share of each voxel of the result, from 0 (the slices decide) to 1 (the prior alone).
 
     With r the share of a change of the prior that the fit to the slices leaves in the result, and
-    c = 1 - exp(-M_rho) the confidence, the result is the larger of r and (1 - c)^2: Gaussians carry what the slices
-    determine a little beyond them, but a voxel that nothing measured depends on the prior in any case. The square
-    is how r falls with coverage where slices are evenly spaced. Shapes, poses, gains and slice weights are those of
-    the finished fit.
+    c = 1 - exp(-M_rho) the confidence, the result is the larger of r and (1 - c)^2: Gaussians continue what the slices
+    determine a little beyond them, where r is low, but a voxel that nothing measured depends on the prior in any case.
+    The square is how r falls with coverage where slices are evenly spaced. Shapes, poses, gains and slice weights are
+    those of the finished fit.
 
     Args:
         fit: of stage 2.

@@ -1,4 +1,4 @@
-"""How much of the brain no slice saw, in words that everyone is told: terminal, run.json and picture."""
+"""The part of the brain that no slice saw, and the sentence about it in terminal, run.json and picture."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 MENTIONED_ABOVE = 0.005
-"""Share of the brain from which on the unseen part is mentioned; slivers between thick slices are not."""
+"""Share of the brain from which on the unseen part is mentioned; slivers between thick slices are below."""
 DO_NOT_USE_ABOVE = 0.3
-"""Share of the brain from which on the volume shows more of other brains than may be called a reconstruction."""
+"""Share of the brain above which the volume shows too much of other brains to be called a reconstruction."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,13 +19,14 @@ class UnseenPart:
 
     Attributes:
         share: of the brain's volume, 0 to 1.
-        volume_ml: of it.
+        volume_ml: of the unseen part.
         shown: "estimate from other brains", "smooth continuation" (no template was used) or "blank".
-        extent_known: False where the only field of view cuts the head and no template says how large the head is; the
+        extent_known: False if the only field of view cuts the head and no template shows how large the head is; the
             share is then too small.
-        usable: False where the share is so large, or so little known, that the volume must not be used.
-        what: the volume shows, as in "of the brain".
-        share_by_areas: of the head, as the areas of its slices say where the only field of view cuts it; else None.
+        usable: False if the share is so large, or so uncertain, that the volume must not be used.
+        what: name of what the volume shows, as in "of the brain".
+        share_by_areas: unseen share of the head by the areas of its slices, if the only field of view cuts it; else
+            None.
     """
 
     share: float
@@ -48,17 +49,17 @@ class UnseenPart:
         has_template: bool = True,
         what: str = "brain",
     ) -> UnseenPart:
-        """Measure it.
+        """Measure the unseen part.
 
         Args:
             unseen: [I, J, K] voxels of the brain that no slice saw.
-            brain: [I, J, K] all of it.
+            brain: [I, J, K] all voxels of the brain.
             voxel_volume_mm3: of both.
             shown: what the volume shows there.
-            share_by_areas: that no slice saw, by the areas of the slices of a single stack whose field of view cuts the
-                head; None where there is no such stack.
-            has_template: whether an atlas template says how large the brain is.
-            what: the volume shows.
+            share_by_areas: unseen share by the areas of the slices, for a single stack whose field of view cuts the
+                head; else None.
+            has_template: whether an atlas template shows how large the brain is.
+            what: name of what the volume shows.
         """
         share = float(unseen.sum()) / max(int(brain.sum()), 1)
         extent_known = share_by_areas is None or has_template
