@@ -151,5 +151,6 @@ def test_a_dark_slice_of_a_stack_that_did_not_move_counts_for_little(still: list
     np.testing.assert_allclose(estimate.slices.world_from_header().rotvec_rad()[of_stack], 0, atol=1e-9)  # it is rigid
     assert estimate.weight[dark] < 0.2
     assert estimate.gain[dark] < 0.3
-    assert np.median(np.delete(estimate.weight, dark)) == 1.0
-    assert np.log(estimate.gain).mean() == pytest.approx(0, abs=1e-6)
+    others = np.delete(of_stack, len(of_stack) // 2)
+    assert (estimate.weight[others] == 1).mean() > 0.8
+    assert (estimate.gain[others] == 1).mean() > 0.8
