@@ -1,4 +1,4 @@
-"""Short trainings of variants of the prior network, in processes of their own, alike but for what is compared."""
+"""Short trainings of variants of the prior network, each in its own process, with the same settings otherwise."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Variant:
 
 
 def configuration() -> dict[str, Any]:
-    """The training that the variants differ from."""
+    """The configuration of the training from which the variants differ."""
     return dict(yaml.safe_load(CONFIG.read_text(encoding="utf-8")))
 
 
@@ -47,7 +47,7 @@ def epochs_of(steps: int, config: Mapping[str, Any], arguments: Sequence[str] = 
     Args:
         steps: of the optimiser.
         config: of the training.
-        arguments: that may change the size of an epoch, such as `--data.batch_size=2`.
+        arguments: further arguments, which may change the size of an epoch, such as `--data.batch_size=2`.
     """
     data = dict(config["data"]["init_args"])
     for argument in arguments:
@@ -70,10 +70,10 @@ def data_arguments(source: Path, cache: Path, val_subjects: int) -> list[str]:
 
 
 def train(variant: Variant, run: Path, n_epochs: int, arguments: Sequence[str]) -> tuple[Path | None, float]:
-    """Train a variant in a process of its own, going on where an earlier one stopped.
+    """Train a variant in its own process, resuming an earlier training.
 
     Returns:
-        Its last checkpoint, or None where the training failed (`train.log` says why), and wall seconds.
+        Its last checkpoint, or None if the training failed (`train.log` holds the reason), and wall seconds.
     """
     run.mkdir(parents=True, exist_ok=True)
     last = newest_checkpoint(run)
